@@ -1,0 +1,1 @@
+"""What every role shares: types, configuration, wire format, transport, clients, networks, schedules."""

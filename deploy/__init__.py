@@ -1,0 +1,1 @@
+"""Starts and watches processes; never imports a role's code."""

@@ -1,0 +1,1 @@
+"""Wires the roles' own objects together in one process: lockstep runs, sweeps and reports."""

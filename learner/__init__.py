@@ -1,0 +1,1 @@
+"""The learner role: error-driven learning, the four methods and the training loop."""
