@@ -1,0 +1,43 @@
+"""Every failure that a user can meet, and the exit status each one ends with.
+
+    CoopError
+    |- UsageError      a flag, file or grid that can't be right: exit status 2, before anything starts
+    |- RunError        a run that could not start or finish: exit status 1
+    |  |- JoinError    no learner answered, or it refused us
+    |  '- PeerLost     a role that this one needs stopped answering
+    '- BadMessage      bytes from the wire that are not a valid message (names the field)
+"""
+
+from __future__ import annotations
+
+
+class CoopError(Exception):
+    """Base of all errors whose text is meant for the user, in one line."""
+
+    exit_status = 1
+
+
+class UsageError(CoopError):
+    """A flag or file that can't be right; says the field, the value and what is allowed."""
+
+    exit_status = 2
+
+
+class RunError(CoopError):
+    """A run that could not start or could not finish."""
+
+
+class JoinError(RunError):
+    """No learner answered within the join time-out, or the learner refused this process."""
+
+
+class PeerLost(RunError):
+    """A role that this process needs has not answered for too long."""
+
+
+class BadMessage(CoopError):
+    """Bytes that are not a valid message; `field` names what is wrong."""
+
+    def __init__(self, field: str, problem: str) -> None:
+        super().__init__(f"{field}: {problem}")
+        self.field = field
