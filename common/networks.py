@@ -1,0 +1,132 @@
+"""Q-networks by name, and the flat buffer that holds all parameters of one of them."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from common.errors import UsageError
+from common.types import EnvSpec
+
+# (out channels, kernel, stride) of each convolution, then the width of the hidden linear layer.
+_CONV_NETWORKS: dict[str, tuple[tuple[tuple[int, int, int], ...], int]] = {
+    "nature": (((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512),  # Mnih et al. 2015
+    "nips2013": (((16, 8, 4), (32, 4, 2)), 256),  # Mnih et al. 2013
+}
+NETWORK_KINDS = ("mlp", *_CONV_NETWORKS)
+
+
+def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) -> nn.Sequential:
+    """A Q-network float32 [batch, *input] -> [batch, num_actions] with PyTorch's default initialisation.
+
+    kind: "mlp" (linear layers of the widths in `hidden`, ReLU between), "nature" or "nips2013" (`hidden` unused).
+    The parameters depend on `seed` alone and the global random state stays as it was.
+
+    Raises UsageError for an unknown kind, and for a convolutional kind where frames are not images or too small.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        if kind == "mlp":
+            return _mlp(spec, hidden)
+        if kind in _CONV_NETWORKS:
+            return _conv(kind, spec)
+    raise UsageError(f"network kind: {kind!r} is not one of {', '.join(NETWORK_KINDS)}")
+
+
+def _mlp(spec: EnvSpec, hidden: Sequence[int]) -> nn.Sequential:
+    layers: OrderedDict[str, nn.Module] = OrderedDict()
+    if len(spec.obs_shape) > 1:
+        layers["flatten"] = nn.Flatten()
+    width = math.prod(spec.obs_shape)
+    for i, size in enumerate(hidden, start=1):
+        layers[f"fc{i}"] = nn.Linear(width, size)
+        layers[f"relu{i}"] = nn.ReLU()
+        width = size
+    layers["out"] = nn.Linear(width, spec.num_actions)
+    return nn.Sequential(layers)
+
+
+def _conv(kind: str, spec: EnvSpec) -> nn.Sequential:
+    if len(spec.frame_shape) != 2:
+        raise UsageError(f"network kind: {kind!r} needs frames [height, width], {spec.env_id} has {spec.frame_shape}")
+    convs, width = _CONV_NETWORKS[kind]
+    channels, (height, breadth) = spec.stack, spec.frame_shape
+    layers: OrderedDict[str, nn.Module] = OrderedDict()
+    for i, (out, kernel, stride) in enumerate(convs, start=1):
+        layers[f"conv{i}"] = nn.Conv2d(channels, out, kernel, stride)
+        layers[f"relu{i}"] = nn.ReLU()
+        channels, height, breadth = out, (height - kernel) // stride + 1, (breadth - kernel) // stride + 1
+        if min(height, breadth) < 1:
+            raise UsageError(f"network kind: {kind!r} needs larger frames than {spec.frame_shape} of {spec.env_id}")
+    layers["flatten"] = nn.Flatten()
+    layers["fc1"] = nn.Linear(channels * height * breadth, width)
+    layers[f"relu{len(convs) + 1}"] = nn.ReLU()
+    layers["out"] = nn.Linear(width, spec.num_actions)
+    return nn.Sequential(layers)
+
+
+def preprocess(obs: Tensor, spec: EnvSpec) -> Tensor:
+    """The network's input for stored observations: <frame_dtype>[batch, *obs_shape] -> float32 on the same device.
+
+    uint8 images are scaled to [0, 1] and get a channel axis where nothing is stacked; float32 vectors pass through.
+    """
+    if spec.frame_dtype == "uint8":
+        obs = obs.to(torch.float32).mul_(1 / 255)
+    if spec.stack == 1 and len(spec.frame_shape) == 2:
+        obs = obs.unsqueeze(1)
+    return obs
+
+
+class FlatNetwork:
+    """A network whose parameters, and their gradients, are views of one flat buffer each.
+
+    flat: float32 nn.Parameter [P], what an optimizer holds, what is published and stored; `flat.grad` exists from
+        the start and is never replaced (zero it in place: `zero_grad(set_to_none=False)`).
+    module: the network; its named parameters view `flat`, their `.grad` views `flat.grad`.
+    gradients: name -> view of `flat.grad`, in the shape of the parameter.
+    layout: (name, shape) of each parameter in the order of the buffer.
+    """
+
+    def __init__(self, module: nn.Sequential) -> None:
+        parameters = list(module.named_parameters())
+        self.module = module
+        self.layout: list[tuple[str, tuple[int, ...]]] = [(name, tuple(p.shape)) for name, p in parameters]
+        self.flat = nn.Parameter(torch.cat([p.detach().reshape(-1) for _, p in parameters]))
+        self.flat.grad = torch.zeros_like(self.flat)
+        self.gradients: dict[str, Tensor] = {}
+        start = 0
+        for name, p in parameters:
+            span = slice(start, start + p.numel())
+            self.gradients[name] = self.flat.grad[span].view(p.shape)
+            p.data = self.flat.data[span].view(p.shape)
+            p.grad = self.gradients[name]
+            start = span.stop
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """The module's output for a preprocessed batch: float32 [batch, *input] -> [batch, num_actions]."""
+        output: Tensor = self.module(x)
+        return output
+
+    def load(self, flat: Tensor | NDArray[np.float32]) -> None:
+        """Overwrite all parameters in place from float32 [P]; raises ValueError for another size."""
+        # A copy, because arrays from the wire are read-only and PyTorch warns of viewing those.
+        source = flat if isinstance(flat, Tensor) else torch.tensor(flat)
+        if source.shape != self.flat.shape:
+            raise ValueError(f"flat parameters: got shape {tuple(source.shape)}, the network has {self.flat.numel()}")
+        self.flat.data.copy_(source)
+
+    def snapshot(self) -> NDArray[np.float32]:
+        """A copy of all parameters on the host: float32 [P]."""
+        array: NDArray[np.float32] = self.flat.detach().to("cpu", copy=True).numpy()
+        return array
+
+    def layout_digest(self) -> str:
+        """16 hex digits that two networks share exactly if their layouts are equal (checked at join)."""
+        return hashlib.sha256(repr(self.layout).encode()).hexdigest()[:16]
