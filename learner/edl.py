@@ -1,0 +1,138 @@
+"""Error-driven learning: gradients with the feedback B(i) = U (S + s I) V^T in the place of T(i) = U S V^T.
+
+For one sample, T(i) = d y / d a(i) is the [actions, n_i] Jacobian of the output with respect to layer i's
+pre-activation. Backpropagation sends delta(i) = T(i)^T e to layer i, EDL sends sigma(i) = B(i)^T e. With the
+orthogonal polar factor P(i) = U V^T,
+
+    B(i) = T(i) + s P(i),        P(i) = G(i)^(-1/2) T(i),        G(i) = T(i) T(i)^T,
+    sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e.
+
+Outside code calls `edl_gradients` and `feedback_matrices`. A learner keeps one `FeedbackRule` per network:
+
+    rule = FeedbackRule(network, feedback="transform")
+    tape = rule.forward(x)                      # tape.output: [batch, actions]; no autograd anywhere
+    rule.backward(tape, error, s, out)          # overwrites out[name], e.g. FlatNetwork.gradients
+
+With s = 0, or feedback "none", backward is plain backpropagation and costs one gradient.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from learner.backprop import Chain, Tape
+from learner.polar import polar
+
+FEEDBACKS = ("none", "transform", "weight-gradient", "random")
+
+
+class FeedbackRule:
+    """Forward and backward of one network under one feedback.
+
+    feedback: "none" (backpropagation), "transform" (the equations above), "weight-gradient" (backpropagation, then
+        U (S + s I) V^T of each weight gradient; biases plain) or "random" (fixed B(i), direct feedback alignment).
+    seed: draws the fixed matrices of "random", and nothing else.
+    polar_dtype: dtype of the passes that only the polar part needs; T(i)^T e is exact always. None: the network's.
+    """
+
+    def __init__(
+        self, network: nn.Module, feedback: str = "transform", seed: int = 0, polar_dtype: torch.dtype | None = None
+    ) -> None:
+        if feedback not in FEEDBACKS:
+            raise ValueError(f"feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
+        self.chain = Chain(network)
+        self.feedback = feedback
+        self._seed = seed
+        self._polar_dtype = polar_dtype
+        self._fixed: dict[int, Tensor] = {}
+
+    def forward(self, x: Tensor) -> Tape:
+        """Run the network on float x [batch, *input]."""
+        return self.chain.forward(x)
+
+    def backward(self, tape: Tape, error: Tensor, s: float, out: Mapping[str, Tensor]) -> None:
+        """Write one gradient per named parameter into `out`.
+
+        error: [batch, actions], the output error e with the batch mean already in it. s: the exploration rate.
+        """
+        chain = self.chain
+        with torch.no_grad():
+            if self.feedback == "random":
+                for index in chain.parametrised:
+                    chain.write(tape, index, self._aligned(tape, index, error), out)
+            elif self.feedback == "transform" and s != 0:
+                for index, t in self.transforms(tape):
+                    sigma = torch.einsum("ba,ban->bn", error, t + s * polar(t))
+                    chain.write(tape, index, sigma.view(_output_shape(tape, index)), out)
+            else:
+                chain.backward(tape, error, out)
+                if self.feedback == "weight-gradient" and s != 0:
+                    for g in out.values():
+                        if g.dim() > 1:
+                            g.add_(polar(g.flatten(1)).view(g.shape), alpha=s)
+
+    def transforms(self, tape: Tape) -> list[tuple[int, Tensor]]:
+        """(step, T(i) [batch, actions, n_i]) of each layer with parameters, the last one first."""
+        batch, actions = tape.output.shape
+        cotangent = torch.eye(actions, dtype=tape.output.dtype, device=tape.output.device).repeat(batch, 1)
+        found = []
+        first, *_ = parametrised = self.chain.parametrised
+        for index in range(len(self.chain.steps) - 1, first - 1, -1):
+            if index in parametrised:
+                found.append((index, cotangent.reshape(batch, actions, -1)))
+            if index > first:
+                cotangent = self.chain.pull(tape, index, cotangent)
+        return found
+
+    def _aligned(self, tape: Tape, index: int, error: Tensor) -> Tensor:
+        shape = _output_shape(tape, index)
+        if index == self.chain.parametrised[-1]:
+            return error.view(shape)
+        if index not in self._fixed:
+            generator = torch.Generator().manual_seed(self._seed * 1000 + index)
+            size = math.prod(shape[1:])
+            draw = torch.randn(error.shape[1], size, generator=generator) / math.sqrt(size)
+            self._fixed[index] = draw.to(error)
+        return (error @ self._fixed[index]).view(shape)
+
+
+def _output_shape(tape: Tape, index: int) -> torch.Size:
+    following = tape.saved[index + 1] if index + 1 < len(tape.saved) else tape.output
+    return following.shape
+
+
+def edl_gradients(
+    network: nn.Module,
+    obs: Tensor,
+    output_error: Tensor,
+    s: float,
+    feedback: str = "transform",
+    *,
+    seed: int = 0,
+    polar_dtype: torch.dtype | None = None,
+) -> dict[str, Tensor]:
+    """One gradient per named parameter of `network`, in the parameter's shape and dtype.
+
+    obs: float [batch, *input]. output_error: [batch, actions], e with the batch mean already in it. s: the
+    exploration rate. feedback, seed, polar_dtype: see FeedbackRule. Raises UnsupportedLayerError for a network that is
+    not a sequence of Linear, Conv2d, ReLU and Flatten.
+    """
+    rule = FeedbackRule(network, feedback, seed, polar_dtype)
+    out = {name: torch.empty_like(p) for name, p in network.named_parameters()}
+    rule.backward(rule.forward(obs), output_error, s, out)
+    return out
+
+
+def feedback_matrices(network: nn.Module, obs: Tensor, s: float) -> dict[str, Tensor]:
+    """B(i) = U (S + s I) V^T of each layer, by name in forward order: [batch, actions, n_i].
+
+    n_i counts layer i's pre-activations, in the order [channels, height, width] for a convolution.
+    """
+    rule = FeedbackRule(network)
+    with torch.no_grad():
+        found = rule.transforms(rule.forward(obs))
+        return {rule.chain.steps[i][0].rstrip("."): t + s * polar(t) for i, t in reversed(found)}
