@@ -1,0 +1,110 @@
+"""The replay ratio, kept by admitting or refusing inserts and samples, with the reason in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import ceil, isfinite
+
+from common.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class RateLimiter:
+    """Settings of the limiter; it keeps no state, so they may be replaced while a run goes on.
+
+    ratio: updates (batches drawn) per transition inserted after the first `start`.
+    start: transitions inserted before the first sample.
+    tolerance: steps that inserts and updates may be ahead of one another. At least half of what one update is
+        worth (1 / ratio steps) is always allowed: with less, neither could move.
+    total: transitions after which no more are admitted, and updates end at round(ratio * (total - start)).
+    capacity: of the table behind it, if it should be checked.
+    origin: (inserted, drawn) from where the ratio holds; `(start, 0)` if none, see `changed`.
+
+    Promise, with ahead = (inserted - origin inserted) - (drawn - origin drawn) / ratio in steps, and
+    slack = max(tolerance, 0.5 / ratio): from the origin on, -slack <= ahead <= slack + n where n is the number of
+    steps of the longest segment (a segment is admitted whole). And, while the table is not cleared, at least one
+    of insert and sample is admitted until the run is complete.
+    """
+
+    ratio: float
+    start: int
+    tolerance: float
+    total: int | None = None
+    capacity: int | None = None
+    origin: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for settings under which the run could not move or end."""
+        if not (isfinite(self.ratio) and self.ratio > 0):
+            raise UsageError(f"ratio: {self.ratio} updates per step, must be above 0")
+        if not (isfinite(self.tolerance) and self.tolerance >= 0):
+            raise UsageError(f"tolerance: {self.tolerance} steps, must be at least 0")
+        if self.start < 0:
+            raise UsageError(f"start: {self.start:,} transitions, must be at least 0")
+        if self.total is not None and self.start > self.total:
+            raise UsageError(f"start: {self.start:,} transitions, must be at most the total of {self.total:,}")
+        if self.capacity is not None and self.start > self.capacity:
+            raise UsageError(f"start: {self.start:,} transitions, must be at most the capacity of {self.capacity:,}")
+
+    @property
+    def draws_total(self) -> int | None:
+        """Batches that a complete run has drawn; None for a run without an end."""
+        if self.total is None:
+            return None
+        inserted, drawn = self.origin or (self.start, 0)
+        return drawn + max(0, round(self.ratio * (self.total - inserted)))
+
+    def why_not_insert(self, inserted: int, drawn: int) -> str | None:
+        """None if a segment is admitted, else the reason."""
+        if self.total is not None and inserted >= self.total:
+            return self._complete()
+        ahead = self._ahead(inserted, drawn)
+        if inserted < self.start or ahead <= self._slack:
+            return None
+        return f"inserts are {ahead:,.0f} steps ahead of updates"
+
+    def why_not_sample(self, inserted: int, drawn: int, size: int) -> str | None:
+        """None if a batch is admitted, else the reason. size: transitions held now."""
+        if inserted < self.start:
+            return f"waiting for {self.start:,} transitions, have {inserted:,}"
+        if size == 0:
+            return "waiting for transitions, the table is empty"
+        left = None if self.draws_total is None else self.draws_total - drawn
+        if self.total is not None and inserted >= self.total:
+            return None if left is None or left > 0 else self._complete()
+        ahead = self._ahead(inserted, drawn)
+        short = 1 / self.ratio - self._slack - ahead
+        if short <= 0 and (left is None or left > 0):
+            return None
+        updates = -ahead * self.ratio
+        if updates >= 0.5:
+            return f"updates are {updates:,.0f} ahead of inserts"
+        return f"the next update is due in {ceil(short):,} steps"
+
+    def changed(
+        self, inserted: int, drawn: int, *, ratio: float, tolerance: float | None = None, total: int | None = None
+    ) -> RateLimiter:
+        """Settings for a run that has come to (inserted, drawn), the new ratio holding from there on only.
+
+        Without it, a new ratio would hold for the past too, and updates would pause or rush to make up for it.
+        """
+        origin = (inserted, drawn) if inserted >= self.start else None
+        return replace(
+            self,
+            ratio=ratio,
+            tolerance=self.tolerance if tolerance is None else tolerance,
+            total=self.total if total is None else total,
+            origin=origin,
+        )
+
+    @property
+    def _slack(self) -> float:
+        return max(self.tolerance, 0.5 / self.ratio)
+
+    def _ahead(self, inserted: int, drawn: int) -> float:
+        """Steps that inserts are ahead of updates."""
+        origin_inserted, origin_drawn = self.origin or (self.start, 0)
+        return (inserted - origin_inserted) - (drawn - origin_drawn) / self.ratio
+
+    def _complete(self) -> str:
+        return f"run complete: {self.total:,} of {self.total:,} steps"

@@ -1,0 +1,49 @@
+"""What a table tells of itself: counts, reuse, and the memory that it will need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.types import EnvSpec
+
+REUSE_BUCKETS = 16
+# actions, rewards, terminated, param_version, ids, reuse; three counters of the frame's slot.
+ROW_BYTES = 4 + 4 + 1 + 8 + 8 + 4 + 3 * 4
+
+
+@dataclass(frozen=True, slots=True)
+class TableStats:
+    """Counts since the table began, and what it holds now.
+
+    inserted, evicted, evicted_unsampled: transitions (one that reservoir eviction never kept counts as evicted).
+    batches, sampled: sample calls and transitions drawn.
+    reuse_mean: draws per held transition. reuse_held, reuse_evicted: transitions by how often they had been drawn;
+    entry 0 counts those never drawn, entry b those drawn 2^(b-1) to 2^b - 1 times, the last one all above.
+    """
+
+    size: int
+    inserted: int
+    evicted: int
+    evicted_unsampled: int
+    batches: int
+    sampled: int
+    frames_held: int
+    bytes_held: int
+    reuse_mean: float
+    reuse_held: tuple[int, ...]
+    reuse_evicted: tuple[int, ...]
+
+
+def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
+    """Memory of a full table whose transitions add one frame each, with the frames' counters and uniform sampling."""
+    frame = int(np.prod(spec.frame_shape)) * np.dtype(spec.frame_dtype).itemsize
+    return capacity * (frame + ROW_BYTES + 2 * 4 * spec.stack)
+
+
+def reuse_histogram(reuse: NDArray[np.int32]) -> NDArray[np.intp]:
+    """Transitions by the bit length of their draws: int [REUSE_BUCKETS], the last entry open-ended."""
+    bit_length = np.frexp(reuse.astype(np.float64))[1]
+    return np.bincount(np.minimum(bit_length, REUSE_BUCKETS - 1), minlength=REUSE_BUCKETS)

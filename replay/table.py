@@ -1,0 +1,313 @@
+"""The table of transitions: exact capacity, each frame once, eviction and sampling by policy, state to the bit."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import UsageError
+from common.types import Array, Batch, EnvSpec, Segment
+from replay.frames import FrameStore, PinnedFrames, Slots
+from replay.selection import make_eviction, make_sampling
+from replay.stats import REUSE_BUCKETS, TableStats, reuse_histogram
+
+__all__ = ["Table", "TableSnapshot", "TableStats"]
+
+MAX_STREAMS = 4096
+COLUMNS = ("actions", "rewards", "terminated", "param_version", "ids", "reuse", "priorities")
+
+
+class Table:
+    """Transitions of one environment, at most `capacity` of them, over frames stored once each.
+
+    Plain and deterministic: all chance comes from `rng` (a Generator over PCG64, which the table's state includes).
+    Not safe for threads: one owner makes all calls.
+    """
+
+    def __init__(
+        self,
+        spec: EnvSpec,
+        capacity: int,
+        *,
+        eviction: str = "fifo",
+        sampling: str = "uniform",
+        rng: np.random.Generator,
+        priority_exponent: float = 0.6,
+        importance_exponent: float = 0.4,
+    ) -> None:
+        """Raises UsageError for a capacity below 1, exponents below 0 or a policy that does not exist."""
+        if capacity < 1:
+            raise UsageError(f"capacity: {capacity} transitions, must be at least 1")
+        for name, exponent in (("priority", priority_exponent), ("importance", importance_exponent)):
+            if not exponent >= 0:
+                raise UsageError(f"{name}_exponent: {exponent}, must be at least 0")
+        self.spec = spec
+        self.capacity = capacity
+        self.inserted = 0
+        self.batches = 0
+        self._settings = {
+            "spec": [spec.env_id, list(spec.frame_shape), spec.frame_dtype, spec.stack, spec.num_actions],
+            "capacity": capacity,
+            "eviction": eviction,
+            "sampling": sampling,
+            "priority_exponent": priority_exponent,
+            "importance_exponent": importance_exponent,
+        }
+        self._rng = rng
+        self._frames = FrameStore(spec.frame_shape, spec.frame_dtype)
+        self._slots = np.zeros((2, capacity, spec.stack), np.int32)  # of obs, of next_obs
+        self._actions = np.zeros(capacity, np.int32)
+        self._rewards = np.zeros(capacity, np.float32)
+        self._terminated = np.zeros(capacity, np.bool_)
+        self._param_version = np.zeros(capacity, np.int64)
+        self._ids = np.zeros(capacity, np.int64)
+        self._reuse = np.zeros(capacity, np.int32)
+        self._prioritized = "prioritized" in (eviction, sampling)
+        self._priorities = np.zeros(capacity if self._prioritized else 0)
+        self._max_priority = 1.0
+        self._row_of: dict[int, int] | None = {} if self._prioritized and eviction != "fifo" else None
+        self._eviction = make_eviction(eviction, rng, self._ids, self._priorities)
+        self._sampling = make_sampling(sampling, rng, capacity, priority_exponent, importance_exponent)
+        # Per stream: sequence of its last segment and the slots of that segment's last frames (-1: not stored).
+        self._tails: OrderedDict[tuple[int, int], tuple[int, Slots]] = OrderedDict()
+        self._sampled = 0
+        self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
+
+    def __len__(self) -> int:
+        return min(self.inserted, self.capacity)
+
+    def insert(self, segment: Segment) -> None:
+        """Add a segment that has been validated and is no duplicate, evicting what the policy chooses."""
+        size = len(self)
+        first = self.inserted
+        rows, kept = self._eviction.place(first, segment.steps)
+        index = np.concatenate((segment.obs_index[kept], segment.next_index[kept])).reshape(2, -1, self.spec.stack)
+        slots, dropped = self._store(segment, index)
+        replaced = rows if size == self.capacity else rows[rows < size]
+        self._reuse_evicted += reuse_histogram(self._reuse[replaced])
+        self._reuse_evicted[0] += segment.steps - len(rows)
+        old = self._slots.take(replaced, axis=1).reshape(-1)
+        if self._row_of is not None:
+            for number in self._ids[replaced].tolist():
+                del self._row_of[number]
+        self._slots[:, rows] = slots[index]
+        self._actions[rows] = segment.actions[kept]
+        self._rewards[rows] = segment.rewards[kept]
+        self._terminated[rows] = segment.terminated[kept]
+        self._param_version[rows] = segment.param_version[kept]
+        self._ids[rows] = np.arange(first, first + segment.steps)[kept]
+        self._reuse[rows] = 0
+        self._frames.drop(np.concatenate((old, dropped)))
+        self.inserted += segment.steps
+        if self._row_of is not None:
+            self._row_of.update(zip(self._ids[rows].tolist(), rows.tolist(), strict=True))
+        if self._prioritized:
+            self._set_priorities(rows, np.full(len(rows), self._max_priority))
+
+    def sample(self, batch_size: int) -> Batch:
+        """Draw transitions with replacement by the sampling policy. Raises ValueError while the table is empty."""
+        size = len(self)
+        if size == 0:
+            raise ValueError("an empty table has nothing to sample")
+        rows, weights = self._sampling.draw(batch_size, size)
+        distinct, index = self._frames.unique(self._slots.take(rows, axis=1).astype(np.intp))
+        np.add.at(self._reuse, rows, np.int32(1))
+        self.batches += 1
+        self._sampled += batch_size
+        ids = self._ids[rows]
+        return Batch(
+            frames=self._frames.read(distinct),
+            obs_index=index[0],
+            next_index=index[1],
+            actions=self._actions[rows],
+            rewards=self._rewards[rows],
+            terminated=self._terminated[rows],
+            weights=weights,
+            ids=ids,
+            param_version=self._param_version[rows],
+            age=self.inserted - 1 - ids,
+            reuse=self._reuse[rows],
+        )
+
+    def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.floating[Any]]) -> None:
+        """Give transitions new priorities (float [n], usually |TD error|); ids no longer held are ignored.
+
+        New transitions get the largest priority seen so far (1 at first). Where an id repeats, its last priority
+        counts. Without a prioritized policy nothing changes. Raises ValueError for a priority that is negative or
+        not finite, or lengths that differ.
+        """
+        given = np.asarray(priorities, np.float64)
+        if len(ids) != len(given) or not np.all(np.isfinite(given) & (given >= 0)):
+            raise ValueError("priorities: must be finite, at least 0, and one for each id")
+        if not self._prioritized:
+            return
+        if self._row_of is None:
+            rows = ids.astype(np.intp) % self.capacity
+        else:
+            rows = np.array([self._row_of.get(number, self.capacity) for number in ids.tolist()], np.intp)
+        held = np.flatnonzero(rows < len(self))
+        held = held[self._ids[rows[held]] == ids[held]]
+        if len(held):
+            self._max_priority = max(self._max_priority, float(given[held].max()))
+            self._set_priorities(rows[held], given[held])
+
+    def stats(self) -> TableStats:
+        """Counts and diagnostics, in time proportional to the transitions held."""
+        size = len(self)
+        reuse = self._reuse[:size]
+        row_bytes = (self._slots.nbytes + sum(self._column(name).nbytes for name in COLUMNS)) // self.capacity
+        return TableStats(
+            size=size,
+            inserted=self.inserted,
+            evicted=self.inserted - size,
+            evicted_unsampled=int(self._reuse_evicted[0]),
+            batches=self.batches,
+            sampled=self._sampled,
+            frames_held=self._frames.held,
+            bytes_held=self._frames.bytes_held + size * row_bytes,
+            reuse_mean=float(reuse.mean()) if size else 0.0,
+            reuse_held=tuple(reuse_histogram(reuse).tolist()),
+            reuse_evicted=tuple(self._reuse_evicted.tolist()),
+        )
+
+    def snapshot(self) -> TableSnapshot:
+        """Freeze the state as it is now, quickly: small arrays are copied, frames only held. Release it at the end."""
+        size = len(self)
+        tails = [tail for _, tail in self._tails.values()]
+        tail_slots = np.concatenate([*tails, np.empty(0, np.intp)])
+        stored = tail_slots >= 0
+        slots = self._slots[:, :size]
+        distinct, index = self._frames.unique(np.concatenate((slots.reshape(-1), tail_slots[stored])))
+        tail_index = np.full(len(tail_slots), -1, np.int32)
+        tail_index[stored] = index[slots.size :]
+        generator = self._rng.bit_generator.state
+        meta = {
+            "settings": self._settings,
+            "inserted": self.inserted,
+            "batches": self.batches,
+            "sampled": self._sampled,
+            "max_priority": self._max_priority,
+            "reuse_evicted": self._reuse_evicted.tolist(),
+            "streams": [[*key, sequence, len(tail)] for key, (sequence, tail) in self._tails.items()],
+            # 128 bits: text, since msgpack's integers end at 64.
+            "rng": {**generator, "state": {name: str(number) for name, number in generator["state"].items()}},
+        }
+        arrays = {name: self._column(name)[:size].copy() for name in COLUMNS}
+        arrays["slots"] = index[: slots.size].reshape(slots.shape)
+        arrays["tails"] = tail_index
+        return TableSnapshot(meta, arrays, self._frames.pin(distinct))
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Everything that `load_state` needs: msgpack-able scalars, and arrays of what is held (frames included)."""
+        with self.snapshot() as snapshot:
+            return snapshot.meta, {**snapshot.arrays, "frames": snapshot.frames.read(0, len(snapshot.frames))}
+
+    def load_state(self, meta: dict[str, Any], arrays: dict[str, Array]) -> None:
+        """Continue, to the bit, where `state` was taken; `arrays["frames"]` may be a memory map.
+
+        Raises UsageError where the state is of a table with other settings, ValueError where this one is not new.
+        """
+        if self.inserted:
+            raise ValueError("only a new table can take over a state")
+        for name, value in self._settings.items():
+            if meta["settings"][name] != value:
+                raise UsageError(f"{name}: {value!r}, but the saved table had {meta['settings'][name]!r}")
+        tails = arrays["tails"].astype(np.intp)
+        frames = arrays["frames"]
+        references = np.bincount(np.concatenate((arrays["slots"].reshape(-1), tails[tails >= 0])))
+        parts = [slice(start, start + 1024) for start in range(0, len(frames), 1024)]
+        slots = np.concatenate(
+            [np.empty(0, np.intp), *(self._frames.add(frames[part], references[part]) for part in parts)]
+        )
+        size = arrays["slots"].shape[1]
+        self._slots[:, :size] = slots[arrays["slots"]]
+        for name in COLUMNS:
+            self._column(name)[:size] = arrays[name]
+        start = 0
+        for incarnation, stream, sequence, length in meta["streams"]:
+            tail = tails[start : start + length]
+            self._tails[incarnation, stream] = sequence, np.where(tail >= 0, slots[tail], -1)
+            start += length
+        self.inserted = meta["inserted"]
+        self.batches = meta["batches"]
+        self._sampled = meta["sampled"]
+        self._max_priority = meta["max_priority"]
+        self._reuse_evicted[:] = meta["reuse_evicted"]
+        generator = meta["rng"]
+        self._rng.bit_generator.state = {
+            **generator,
+            "state": {name: int(digits) for name, digits in generator["state"].items()},
+        }
+        rows = np.arange(size)
+        if self._row_of is not None:
+            self._row_of.update(zip(self._ids[rows].tolist(), rows.tolist(), strict=True))
+        if self._prioritized:
+            self._set_priorities(rows, self._priorities[rows])
+
+    def _store(self, segment: Segment, index: NDArray[np.int32]) -> tuple[Slots, Slots]:
+        """Store the frames of a segment that `index` names, each once.
+
+        Returns (slots of all its frames, -1 where not stored; slots to drop once the transitions are in place).
+        The stream keeps a reference on its last frames, as many as the next segment is likely to carry.
+        """
+        count = len(segment.frames)
+        references = np.bincount(index.reshape(-1), minlength=count)
+        slots = np.full(count, -1, np.intp)
+        stream = (segment.incarnation, segment.stream)
+        sequence, previous = self._tails.pop(stream, (-1, slots[:0]))
+        shared = min(segment.carried, len(previous)) if sequence == segment.sequence - 1 else 0
+        slots[segment.carried - shared : segment.carried] = previous[len(previous) - shared :]
+        known = slots >= 0
+        tail = max(0, count - max(self.spec.stack, segment.carried))
+        references[tail:] += known[tail:] | (references[tail:] > 0)
+        wanted = references > 0
+        again = np.flatnonzero(wanted & known)
+        self._frames.hold(slots[again], references[again])
+        new = np.flatnonzero(wanted & ~known)
+        slots[new] = self._frames.add(segment.frames[_run(new)], references[new])
+        self._tails[stream] = segment.sequence, slots[tail:]
+        if len(self._tails) > MAX_STREAMS:
+            previous = np.concatenate((previous, self._tails.popitem(last=False)[1][1]))
+        return slots, previous[previous >= 0]
+
+    def _set_priorities(self, rows: Slots, priorities: NDArray[np.float64]) -> None:
+        self._priorities[rows] = priorities
+        self._eviction.prioritise(rows)
+        self._sampling.prioritise(rows, priorities)
+
+    def _column(self, name: str) -> Array:
+        column: Array = getattr(self, f"_{name}")
+        return column
+
+
+@dataclass(frozen=True, slots=True)
+class TableSnapshot:
+    """A table's state at one moment, while the table goes on: `meta` and `arrays` as in `state`, frames apart.
+
+    frames: read them in pieces of any size, between other calls on the table, and save them in order as the array
+    "frames". Leaving the `with` block releases them.
+    """
+
+    meta: dict[str, Any]
+    arrays: dict[str, Array]
+    frames: PinnedFrames
+
+    def __enter__(self) -> TableSnapshot:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.frames.release()
+
+
+def _run(indices: Slots) -> slice | Slots:
+    """Ascending indices as a slice where they have no gap, so that frames are copied once and not twice."""
+    if len(indices) and indices[-1] - indices[0] + 1 == len(indices):
+        return slice(int(indices[0]), int(indices[-1]) + 1)
+    return indices
