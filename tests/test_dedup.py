@@ -1,0 +1,68 @@
+"""Every sequence number is accepted once, in whatever order and however often it comes."""
+
+from __future__ import annotations
+
+import msgpack
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from replay.dedup import SeenWindow
+
+arrivals = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(0, 30)), max_size=200)
+
+
+@settings(max_examples=200, deadline=None)
+@given(arrivals=arrivals)
+def test_equals_a_set(arrivals: list[tuple[int, int, int]]) -> None:
+    window, seen = SeenWindow(), set()
+    for arrival in arrivals:
+        assert window.accept(*arrival) == (arrival not in seen)
+        seen.add(arrival)
+    streams = {arrival[:2] for arrival in seen}
+    highest = {stream: max(arrival[2] for arrival in seen if arrival[:2] == stream) for stream in streams}
+    assert window.missing() == sum(highest.values()) + len(highest) - len(seen)
+
+
+@settings(max_examples=100, deadline=None)
+@given(before=arrivals, after=arrivals)
+def test_restored_window_goes_on_alike(before: list[tuple[int, int, int]], after: list[tuple[int, int, int]]) -> None:
+    window = SeenWindow(max_streams=3, max_gaps=5)
+    for arrival in before:
+        window.accept(*arrival)
+    twin = SeenWindow(max_streams=3, max_gaps=5)
+    twin.load_state(msgpack.unpackb(msgpack.packb(window.state())))
+    for arrival in after:
+        assert twin.accept(*arrival) == window.accept(*arrival)
+        assert twin.state() == window.state()
+
+
+@pytest.mark.parametrize(
+    ("sequences", "accepted", "missing"),
+    [
+        ([0, 1, 2], [True, True, True], 0),
+        ([0, 0, 1, 0], [True, False, True, False], 0),
+        ([2, 0], [True, True], 1),
+        ([2, 0, 1, 1], [True, True, True, False], 0),
+        ([6, 0, 1, 2, 5], [True, False, False, True, True], 4),  # 0 and 1 were forgotten: only four gaps are kept
+        ([2, 7, 0, 6], [True, True, False, True], 5),  # 2 comes on top of two older gaps, which are forgotten
+        ([1 << 62, 0, (1 << 62) - 1], [True, False, True], (1 << 62) - 1),
+    ],
+)
+def test_gaps(sequences: list[int], accepted: list[bool], missing: int) -> None:
+    window = SeenWindow(max_gaps=4)
+    assert [window.accept(1 << 63, 0, sequence) for sequence in sequences] == accepted
+    assert window.missing() == missing
+
+
+def test_streams_used_least_recently_are_forgotten() -> None:
+    window = SeenWindow(max_streams=2)
+    assert window.accept(1, 0, 1)  # 0 is missing
+    assert window.accept(2, 0, 0)
+    assert not window.accept(1, 0, 1)
+    assert window.accept(3, 0, 0)  # drops stream 2
+    assert not window.accept(1, 0, 1)
+    assert window.accept(4, 0, 0)  # drops stream 3
+    assert window.accept(5, 0, 0)  # drops stream 1, and its missing 0 is lost
+    assert window.missing() == 1
+    assert len(window.state()["streams"]) == 2

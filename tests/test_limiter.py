@@ -1,0 +1,156 @@
+"""The limiter keeps the ratio, never wedges, and says why it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.errors import UsageError
+from replay.limiter import RateLimiter
+
+THOUSAND = RateLimiter(ratio=1.0, start=1000, tolerance=40, total=50_000)
+QUARTER = RateLimiter(ratio=0.25, start=100, tolerance=10, total=None)
+
+
+@pytest.mark.parametrize(
+    ("limiter", "inserted", "drawn", "reason"),
+    [
+        (THOUSAND, 0, 0, None),
+        (THOUSAND, 999, 0, None),
+        (THOUSAND, 1040, 0, None),
+        (THOUSAND, 1041, 0, "inserts are 41 steps ahead of updates"),
+        (THOUSAND, 9000, 2000, "inserts are 6,000 steps ahead of updates"),
+        (THOUSAND, 49_999, 48_999, None),
+        (THOUSAND, 50_000, 49_000, "run complete: 50,000 of 50,000 steps"),
+        (THOUSAND, 50_015, 100, "run complete: 50,000 of 50,000 steps"),
+        (QUARTER, 110, 0, None),
+        (QUARTER, 111, 0, "inserts are 11 steps ahead of updates"),
+        (QUARTER, 111, 1, None),
+    ],
+)
+def test_why_not_insert(limiter: RateLimiter, inserted: int, drawn: int, reason: str | None) -> None:
+    assert limiter.why_not_insert(inserted, drawn) == reason
+
+
+@pytest.mark.parametrize(
+    ("limiter", "inserted", "drawn", "reason"),
+    [
+        (THOUSAND, 312, 0, "waiting for 1,000 transitions, have 312"),
+        (THOUSAND, 1000, 0, None),
+        (THOUSAND, 1000, 39, None),
+        (THOUSAND, 1000, 40, "updates are 40 ahead of inserts"),
+        (THOUSAND, 1100, 152, "updates are 52 ahead of inserts"),
+        (THOUSAND, 50_000, 48_999, None),
+        (THOUSAND, 50_000, 49_000, "run complete: 50,000 of 50,000 steps"),
+        (THOUSAND, 49_990, 49_000, "updates are 10 ahead of inserts"),
+        (QUARTER, 100, 1, None),
+        (QUARTER, 100, 2, "updates are 2 ahead of inserts"),
+        (replace(QUARTER, tolerance=2), 100, 0, "the next update is due in 2 steps"),
+        (replace(QUARTER, tolerance=2), 102, 0, None),
+    ],
+)
+def test_why_not_sample(limiter: RateLimiter, inserted: int, drawn: int, reason: str | None) -> None:
+    assert limiter.why_not_sample(inserted, drawn, inserted) == reason
+
+
+def test_an_empty_table_is_not_sampled() -> None:
+    limiter = RateLimiter(1.0, start=0, tolerance=5, total=10)
+    assert limiter.why_not_sample(0, 0, 0) == "waiting for transitions, the table is empty"
+    assert limiter.why_not_insert(0, 0) is None
+
+
+@st.composite
+def limiters(draw: st.DrawFn) -> RateLimiter:
+    total = draw(st.integers(0, 400))
+    return RateLimiter(
+        ratio=draw(st.floats(0.01, 8)),
+        start=draw(st.integers(0, total)),
+        tolerance=draw(st.one_of(st.just(0.0), st.floats(0, 100))),
+        total=total,
+    )
+
+
+def check_kept(limiter: RateLimiter, inserted: int, drawn: int, longest: int) -> None:
+    """The promise of the class, in updates, with 1e-6 for rounding."""
+    if inserted < limiter.start:
+        return
+    first_inserted, first_drawn = limiter.origin or (limiter.start, 0)
+    slack = max(limiter.tolerance, 0.5 / limiter.ratio) * limiter.ratio
+    behind = limiter.ratio * (inserted - first_inserted) - (drawn - first_drawn)
+    assert -slack - 1e-6 <= behind <= slack + longest * limiter.ratio + 1e-6
+
+
+@settings(max_examples=300, deadline=None)
+@given(limiter=limiters(), steps=st.lists(st.integers(1, 64), min_size=1), order=st.randoms(use_true_random=False))
+def test_any_run_completes_within_tolerance(limiter: RateLimiter, steps: list[int], order: Random) -> None:
+    """Peers ask in any order, segments have any length; nothing is refused on both sides until the run is over."""
+    assert limiter.total is not None
+    inserted = drawn = turn = 0
+    while True:
+        insert = limiter.why_not_insert(inserted, drawn) is None
+        sample = limiter.why_not_sample(inserted, drawn, inserted) is None
+        if not (insert or sample):
+            break
+        if insert and (not sample or order.random() < 0.5):
+            inserted += steps[turn % len(steps)]
+            turn += 1
+        else:
+            drawn += 1
+        check_kept(limiter, inserted, drawn, max(steps))
+    assert inserted >= limiter.total
+    assert drawn == limiter.draws_total == round(limiter.ratio * (limiter.total - limiter.start))
+    assert "run complete" in (limiter.why_not_insert(inserted, drawn) or "")
+    assert inserted == 0 or "run complete" in (limiter.why_not_sample(inserted, drawn, inserted) or "")
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    limiter=limiters(),
+    ratio=st.floats(0.01, 8),
+    until=st.integers(0, 300),
+    length=st.integers(1, 64),
+    order=st.randoms(use_true_random=False),
+)
+def test_a_changed_ratio_holds_from_there_on(
+    limiter: RateLimiter, ratio: float, until: int, length: int, order: Random
+) -> None:
+    inserted = drawn = 0
+    for turn in range(10**6):
+        if turn == until:
+            limiter = limiter.changed(inserted, drawn, ratio=ratio)
+        insert = limiter.why_not_insert(inserted, drawn) is None
+        sample = limiter.why_not_sample(inserted, drawn, inserted) is None
+        if turn > until:
+            check_kept(limiter, inserted, drawn, length)
+        if not (insert or sample):
+            break
+        if insert and (not sample or order.random() < 0.5):
+            inserted += length
+        else:
+            drawn += 1
+    assert limiter.total is not None
+    assert inserted >= limiter.total
+    assert drawn == limiter.draws_total
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"ratio": 0.0}, "ratio"),
+        ({"ratio": float("nan")}, "ratio"),
+        ({"ratio": float("inf")}, "ratio"),
+        ({"tolerance": -1.0}, "tolerance"),
+        ({"tolerance": float("nan")}, "tolerance"),
+        ({"start": -1}, "start"),
+        ({"start": 101}, "start: 101 transitions, must be at most the total of 100"),
+        ({"start": 60, "capacity": 50}, "start: 60 transitions, must be at most the capacity of 50"),
+    ],
+)
+def test_bad_settings_are_refused(settings: dict[str, float], words: str) -> None:
+    good = RateLimiter(ratio=1.0, start=10, tolerance=5, total=100)
+    with pytest.raises(UsageError, match=words):
+        replace(good, **settings)  # type: ignore[arg-type]

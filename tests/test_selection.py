@@ -1,0 +1,117 @@
+"""Each policy against its definition: which row goes, which is drawn how often, and with what weight."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from replay.selection import Fifo, LowestPriority, Proportional, Reservoir, Rows, SumTree, Uniform
+
+
+def fill(place: Callable[[int, int], tuple[Rows, slice | Rows]], capacity: int, lengths: list[int]) -> list[int]:
+    """Ids in each row after segments of these lengths."""
+    ids, first = np.full(capacity, -1), 0
+    for length in lengths:
+        rows, kept = place(first, length)
+        assert len(set(rows.tolist())) == len(rows)
+        ids[rows] = np.arange(first, first + length)[kept]
+        first += length
+    return ids.tolist()
+
+
+@pytest.mark.parametrize(
+    ("lengths", "ids"),
+    [
+        ([2], [0, 1, -1, -1]),
+        ([3, 3], [4, 5, 2, 3]),
+        ([9], [8, 5, 6, 7]),
+        ([4, 4], [4, 5, 6, 7]),
+        ([1, 9], [8, 9, 6, 7]),
+    ],
+)
+def test_fifo_keeps_the_newest(lengths: list[int], ids: list[int]) -> None:
+    assert fill(Fifo(4).place, 4, lengths) == ids
+
+
+@pytest.mark.parametrize("lengths", [[40], [1] * 40, [3, 10, 27], [25, 15]])
+def test_reservoir_keeps_everything_with_equal_probability(lengths: list[int]) -> None:
+    """40 transitions, 10 places: each is held in a quarter of 4,000 runs (sd of the share: 0.007)."""
+    rng = np.random.default_rng(0)
+    held = np.zeros(40)
+    for _ in range(4000):
+        held[fill(Reservoir(10, rng).place, 10, lengths)] += 1
+    np.testing.assert_allclose(held / 4000, 0.25, atol=0.03)
+
+
+def test_lowest_priority_goes_first_and_among_equals_the_oldest() -> None:
+    ids, priorities = np.arange(5), np.array([3.0, 1.0, 2.0, 1.0, 5.0])
+    policy = LowestPriority(ids, priorities)
+    policy.prioritise(np.arange(5))
+    priorities[1] = 4.0  # raised: its old entry no longer counts
+    policy.prioritise(np.array([1]))
+    rows, kept = policy.place(5, 2)
+    assert rows.tolist() == [3, 2]
+    assert kept == slice(0, 2)
+
+
+def test_lowest_priority_heap_stays_small() -> None:
+    ids, priorities = np.arange(5), np.ones(5)
+    policy = LowestPriority(ids, priorities)
+    rng = np.random.default_rng(0)
+    for _ in range(2000):
+        rows = rng.integers(0, 5, 3)
+        priorities[rows] = rng.random(3)
+        policy.prioritise(rows)
+    assert len(policy._heap) <= 2 * 5 + 1024
+    assert policy.place(5, 1)[0].tolist() == [int(np.argmin(priorities))]
+
+
+def test_uniform_draws_every_row_alike() -> None:
+    rows, weights = Uniform(np.random.default_rng(0)).draw(100_000, 10)
+    np.testing.assert_allclose(np.bincount(rows) / 100_000, 0.1, atol=0.005)
+    assert weights.dtype == np.float32
+    assert (weights == 1).all()
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(1.0, 1.0), (0.6, 0.4), (0.0, 1.0)])
+def test_proportional_draws_and_weights(alpha: float, beta: float) -> None:
+    priorities = np.array([1.0, 4.0, 0.0, 2.0, 0.5])
+    policy = Proportional(8, np.random.default_rng(0), alpha, beta)
+    policy.prioritise(np.arange(5), priorities)
+    expected = np.maximum(priorities, 1e-6) ** alpha
+    expected /= expected.sum()
+    rows, weights = policy.draw(100_000, 5)
+    np.testing.assert_allclose(np.bincount(rows, minlength=5) / 100_000, expected, atol=0.005)
+    drawn = (5 * expected[rows]) ** -beta
+    np.testing.assert_allclose(weights, drawn / drawn.max(), rtol=1e-5)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    capacity=st.integers(1, 40),
+    updates=st.lists(st.tuples(st.integers(0, 39), st.floats(0, 1e6)), min_size=1, max_size=60),
+    fractions=st.lists(st.floats(0, 1, exclude_max=True), min_size=1, max_size=20),
+)
+def test_sum_tree_equals_running_sums(capacity: int, updates: list[tuple[int, float]], fractions: list[float]) -> None:
+    tree, values = SumTree(capacity), np.zeros(capacity)
+    rows = np.array([row % capacity for row, _ in updates])
+    given_values = np.array([value for _, value in updates])
+    values[rows] = given_values
+    tree.update(rows, given_values)
+    np.testing.assert_array_equal(tree.values(np.arange(capacity)), values)
+    assert tree.total == pytest.approx(values.sum())
+    again = SumTree(capacity)
+    again.update(np.arange(capacity), values)
+    np.testing.assert_array_equal(again._nodes, tree._nodes)
+    if tree.total > 0:
+        sums = np.array(fractions) * tree.total
+        found = tree.find(sums)
+        assert (values[found] > 0).all()
+        before = np.concatenate([[0.0], np.cumsum(values)])
+        margin = 1e-9 * tree.total
+        assert (before[found] - margin <= sums).all()
+        assert (sums <= before[found + 1] + margin).all()
