@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself uses
 from torch import Tensor, nn
+
+Parametrised = nn.Linear | nn.Conv2d
 
 
 class UnsupportedLayerError(ValueError):
@@ -17,105 +20,150 @@ class UnsupportedLayerError(ValueError):
 class Tape:
     """What one forward pass leaves behind for the backward passes.
 
-    output: [batch, actions]. saved: per step of the chain, the input of a Linear or Conv2d, the output of a ReLU,
-    the shape that a Flatten removed (as an empty view of its input).
+    output: [batch, actions]. inputs: the input of each step of the chain, [batch, *shape], images channels last.
     """
 
     output: Tensor
-    saved: list[Tensor]
+    inputs: list[Tensor]
+
+    def output_of(self, index: int) -> Tensor:
+        """The output of step `index`: [batch, *shape]; after a ReLU that follows, its shape and sign still hold."""
+        return self.inputs[index + 1] if index + 1 < len(self.inputs) else self.output
 
 
 class Chain:
-    """The steps of a network, checked once, with the three products that backpropagation is made of."""
+    """The steps of a network, checked once, and the products that backpropagation is made of.
+
+    names: prefix of the parameters' names of each step. parametrised: indices of the Linear and Conv2d steps.
+    """
 
     def __init__(self, network: nn.Module) -> None:
         """Raises UnsupportedLayerError for any other layer, and for options of a known one that are not handled."""
-        self.steps = list(_leaves(network, ""))
-        seen: set[int] = set()
-        for name, step in self.steps:
-            _check(name, step)
-            if isinstance(step, nn.Linear | nn.Conv2d) and id(step) in seen:
-                raise UnsupportedLayerError(f"layer {name!r} appears twice; shared layers are not handled")
-            seen.add(id(step))
+        leaves = list(_leaves(network, ""))
+        for name, step in leaves:
+            _check(name.rstrip("."), step)
+        self.names = [name for name, _ in leaves]
+        self._steps = [step for _, step in leaves]
+        # Module attribute look-ups cost as much as a small product, so the parameters are held here.
+        self._weights = [step.weight if isinstance(step, Parametrised) else None for step in self._steps]
+        self._biases = [step.bias if isinstance(step, Parametrised) else None for step in self._steps]
+        self.parametrised = [i for i, weight in enumerate(self._weights) if weight is not None]
+        if not self.parametrised or len({id(self._weights[i]) for i in self.parametrised}) < len(self.parametrised):
+            raise UnsupportedLayerError("the network must hold parameters, and no layer twice")
+
+    @property
+    def output_weight(self) -> Tensor | None:
+        """The weight [actions, n] of the last step, None where that is not Linear."""
+        return self._weights[-1] if isinstance(self._steps[-1], nn.Linear) else None
 
     def forward(self, x: Tensor) -> Tape:
-        """Run the network on x [batch, *input] and keep what `backward` needs."""
-        saved: list[Tensor] = []
+        """Run the network on x, float [batch, *input]."""
+        inputs: list[Tensor] = []
+        fresh = False  # whether x is ours to overwrite
         with torch.no_grad():
-            for _, step in self.steps:
-                y: Tensor = torch.relu(x) if isinstance(step, nn.ReLU) else step(x)
-                saved.append(y if isinstance(step, nn.ReLU) else x)
-                x = y
-        return Tape(x, saved)
+            for step, weight, bias in zip(self._steps, self._weights, self._biases, strict=True):
+                if isinstance(step, nn.Conv2d):
+                    x = x.contiguous(memory_format=torch.channels_last)
+                inputs.append(x)
+                if isinstance(step, nn.ReLU):
+                    x = x.relu_() if fresh else x.relu()
+                elif isinstance(step, nn.Linear):
+                    x = F.linear(x, weight, bias)  # type: ignore[arg-type]
+                elif isinstance(step, nn.Conv2d):
+                    x = F.conv2d(x, weight, bias, step.stride, step.padding, step.dilation, step.groups)  # type: ignore[arg-type]
+                else:
+                    x = x.flatten(1)
+                fresh = isinstance(step, Parametrised)
+        return Tape(x, inputs)
 
-    def pull(self, tape: Tape, index: int, cotangent: Tensor) -> Tensor:
-        """Send a cotangent of step `index`'s output to its input.
+    def walk(self, tape: Tape, cotangent: Tensor, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Tensor]]:
+        """Send cotangents of the output down to every pre-activation: (step, [b, k, *output of step]), last first.
 
-        cotangent: [rows, *output] with rows = batch * k, the k cotangents of a sample next to each other.
+        cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
+        share, and then stays 1 until a ReLU tells samples apart. dtype: what to compute in, the network's if None.
         """
-        step, kept = self.steps[index][1], tape.saved[index]
-        if isinstance(step, nn.Linear):
-            return cotangent @ step.weight.detach()
-        if isinstance(step, nn.Conv2d):
-            rows = kept.new_empty(1).expand(len(cotangent), *kept.shape[1:])
-            return _convolution_backward(step, cotangent, rows, (True, False, False))[0]
-        if isinstance(step, nn.ReLU):
-            per_sample = cotangent.view(len(kept), -1, *kept.shape[1:])
-            return (per_sample * (kept > 0).unsqueeze(1)).view(cotangent.shape)
-        return cotangent.reshape(len(cotangent), *kept.shape[1:])
+        k = cotangent.shape[1]
+        rows = cotangent.flatten(0, 1)
+        first = self.parametrised[0]
+        for index in range(len(self._steps) - 1, first - 1, -1):
+            step, weight, h = self._steps[index], self._weights[index], tape.inputs[index]
+            if weight is not None:
+                yield index, rows.view(-1, k, *rows.shape[1:])
+                if index == first:
+                    return
+                weight = weight if dtype is None else weight.to(dtype)
+            if isinstance(step, nn.Linear):
+                rows = rows @ weight  # type: ignore[operator]
+            elif isinstance(step, nn.Conv2d):
+                rows = _transposed(step, rows, weight, h)  # type: ignore[arg-type]
+            elif isinstance(step, nn.ReLU):
+                rows = _masked(rows, tape.output_of(index), k)
+            else:
+                rows = rows.view(-1, *h.shape[1:])
+                if rows.dim() == 4:
+                    rows = rows.contiguous(memory_format=torch.channels_last)
 
     def write(self, tape: Tape, index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
         """Write the gradients of step `index`'s parameters, given delta [batch, *output] at its pre-activation."""
-        name, step = self.steps[index]
-        h = tape.saved[index]
+        step, bias, name = self._steps[index], self._biases[index], self.names[index]
+        h = tape.inputs[index]
         if isinstance(step, nn.Linear):
-            torch.mm(delta.t(), h, out=out[f"{name}weight"])
-            if step.bias is not None:
-                torch.sum(delta, 0, out=out[f"{name}bias"])
+            torch.mm(delta.t(), h, out=out[name + "weight"])
+            if bias is not None:
+                torch.sum(delta, 0, out=out[name + "bias"])
         elif isinstance(step, nn.Conv2d):
-            _, weight, bias = _convolution_backward(step, delta, h, (False, True, step.bias is not None))
-            out[f"{name}weight"].copy_(weight)
-            if step.bias is not None:
-                out[f"{name}bias"].copy_(bias)
+            _, weight_grad, bias_grad = torch.ops.aten.convolution_backward(
+                delta, h, self._weights[index], [step.out_channels], step.stride, step.padding, step.dilation,
+                False, [0, 0], step.groups, [False, True, bias is not None],
+            )  # fmt: skip
+            out[name + "weight"].copy_(weight_grad)
+            if bias is not None:
+                out[name + "bias"].copy_(bias_grad)
 
     def backward(self, tape: Tape, error: Tensor, out: Mapping[str, Tensor]) -> None:
-        """Write the gradient of error . output into `out`: error [batch, actions], one tensor per named parameter."""
-        first = self.parametrised[0]
-        for index in range(len(self.steps) - 1, first - 1, -1):
-            self.write(tape, index, error, out)
-            if index > first:
-                error = self.pull(tape, index, error)
-
-    @property
-    def parametrised(self) -> list[int]:
-        """Indices of the steps that hold parameters, in order."""
-        return [i for i, (_, step) in enumerate(self.steps) if isinstance(step, nn.Linear | nn.Conv2d)]
+        """Write the gradient of (error . output) into `out`: error [batch, actions], one tensor per parameter name."""
+        with torch.no_grad():
+            for index, delta in self.walk(tape, error.unsqueeze(1)):
+                self.write(tape, index, delta.squeeze(1), out)
 
 
-def _leaves(module: nn.Module, prefix: str) -> list[tuple[str, nn.Module]]:
-    """(parameter-name prefix, layer) in order; nested Sequentials are walked through."""
+def _masked(rows: Tensor, activation: Tensor, k: int) -> Tensor:
+    """Cotangents [b * k, *shape] of a ReLU's output, whose value is `activation` [batch, *shape], at its input."""
+    if k == 1 and len(rows) == len(activation):
+        masked: Tensor = torch.ops.aten.threshold_backward(rows, activation, 0)
+        return masked
+    mask = activation.sign().to(rows.dtype).unsqueeze(1)  # a ReLU's output is never negative
+    per_sample = rows.view(-1, k, *rows.shape[1:])
+    told_apart: Tensor = per_sample * mask if len(mask) > len(per_sample) else per_sample.mul_(mask)
+    return told_apart.flatten(0, 1)
+
+
+def _transposed(conv: nn.Conv2d, rows: Tensor, weight: Tensor, h: Tensor) -> Tensor:
+    """Cotangents [rows, *output] of a convolution of h [batch, *input], at its input: [rows, *input]."""
+    spare = [
+        h.shape[2 + i] + 2 * int(conv.padding[i]) - conv.dilation[i] * (conv.kernel_size[i] - 1) - 1
+        - (rows.shape[2 + i] - 1) * conv.stride[i]
+        for i in (0, 1)
+    ]  # fmt: skip
+    padding = [int(p) for p in conv.padding]
+    return F.conv_transpose2d(rows, weight, None, conv.stride, padding, spare, conv.groups, conv.dilation)
+
+
+def _leaves(module: nn.Module, prefix: str) -> Iterator[tuple[str, nn.Module]]:
+    """(prefix of parameter names, layer) in order; nested Sequentials are walked through."""
     if not isinstance(module, nn.Sequential):
-        return [(prefix, module)]
-    return [leaf for name, child in module._modules.items() for leaf in _leaves(child, f"{prefix}{name}.")]
+        yield prefix, module
+        return
+    for name, child in module._modules.items():
+        if child is not None:
+            yield from _leaves(child, f"{prefix}{name}.")
 
 
 def _check(name: str, step: nn.Module) -> None:
-    kind = type(step).__name__
-    if not isinstance(step, nn.Linear | nn.Conv2d | nn.ReLU | nn.Flatten):
-        raise UnsupportedLayerError(
-            f"layer {name.rstrip('.')!r} is a {kind}; handled are Linear, Conv2d, ReLU and Flatten"
-        )
+    if type(step) not in (nn.Linear, nn.Conv2d, nn.ReLU, nn.Flatten):
+        kind = type(step).__name__
+        raise UnsupportedLayerError(f"layer {name!r} is a {kind}; handled are Linear, Conv2d, ReLU and Flatten")
     if isinstance(step, nn.Flatten) and (step.start_dim, step.end_dim) != (1, -1):
-        raise UnsupportedLayerError(f"layer {name.rstrip('.')!r}: Flatten must start at dimension 1 and end at -1")
+        raise UnsupportedLayerError(f"layer {name!r}: a Flatten must start at dimension 1 and end at -1")
     if isinstance(step, nn.Conv2d) and (step.padding_mode != "zeros" or isinstance(step.padding, str)):
-        raise UnsupportedLayerError(f"layer {name.rstrip('.')!r}: Conv2d padding must be zeros of a given size")
-
-
-def _convolution_backward(
-    conv: nn.Conv2d, delta: Tensor, h: Tensor, mask: tuple[bool, bool, bool]
-) -> tuple[Tensor, Tensor, Tensor]:
-    result: tuple[Tensor, Tensor, Tensor] = torch.ops.aten.convolution_backward(
-        delta, h, conv.weight.detach(), [conv.out_channels], conv.stride, conv.padding, conv.dilation,
-        False, [0, 0], conv.groups, list(mask),
-    )  # fmt: skip
-    return result
+        raise UnsupportedLayerError(f"layer {name!r}: a Conv2d must pad with zeros, by a given size")

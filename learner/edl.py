@@ -25,7 +25,8 @@ import torch
 from torch import Tensor, nn
 
 from learner.backprop import Chain, Tape
-from learner.polar import polar
+from learner.polar import polar_by_svd
+from learner.transforms import Transforms
 
 FEEDBACKS = ("none", "transform", "weight-gradient", "random")
 
@@ -59,50 +60,41 @@ class FeedbackRule:
 
         error: [batch, actions], the output error e with the batch mean already in it. s: the exploration rate.
         """
-        chain = self.chain
         with torch.no_grad():
             if self.feedback == "random":
-                for index in chain.parametrised:
-                    chain.write(tape, index, self._aligned(tape, index, error), out)
+                for index in self.chain.parametrised:
+                    self.chain.write(tape, index, self._aligned(tape, index, error), out)
             elif self.feedback == "transform" and s != 0:
-                for index, t in self.transforms(tape):
-                    sigma = torch.einsum("ba,ban->bn", error, t + s * polar(t))
-                    chain.write(tape, index, sigma.view(_output_shape(tape, index)), out)
+                self._transform(tape, error, s, out)
             else:
-                chain.backward(tape, error, out)
+                self.chain.backward(tape, error, out)
                 if self.feedback == "weight-gradient" and s != 0:
                     for g in out.values():
                         if g.dim() > 1:
-                            g.add_(polar(g.flatten(1)).view(g.shape), alpha=s)
+                            g.add_(polar_by_svd(g.flatten(1).unsqueeze(0)).view(g.shape), alpha=s)
 
-    def transforms(self, tape: Tape) -> list[tuple[int, Tensor]]:
-        """(step, T(i) [batch, actions, n_i]) of each layer with parameters, the last one first."""
-        batch, actions = tape.output.shape
-        cotangent = torch.eye(actions, dtype=tape.output.dtype, device=tape.output.device).repeat(batch, 1)
-        found = []
-        first, *_ = parametrised = self.chain.parametrised
-        for index in range(len(self.chain.steps) - 1, first - 1, -1):
-            if index in parametrised:
-                found.append((index, cotangent.reshape(batch, actions, -1)))
-            if index > first:
-                cotangent = self.chain.pull(tape, index, cotangent)
-        return found
+    def _transform(self, tape: Tape, error: Tensor, s: float, out: Mapping[str, Tensor]) -> None:
+        """sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e for every layer, then its gradients."""
+        transforms = Transforms(self.chain, tape, self._polar_dtype)
+        if self._polar_dtype is None:
+            for index, sigma in transforms.pull(error, 1.0, s):
+                self.chain.write(tape, index, sigma, out)
+        else:
+            polar_parts = dict(transforms.pull(error, 0.0, s))
+            for index, delta in self.chain.walk(tape, error.unsqueeze(1)):
+                self.chain.write(tape, index, delta.squeeze(1) + polar_parts[index], out)
 
     def _aligned(self, tape: Tape, index: int, error: Tensor) -> Tensor:
-        shape = _output_shape(tape, index)
+        """B(i)^T e with the fixed B(i) of layer `index`; the last layer's is the identity, as T(d) is."""
+        shape = tape.output_of(index).shape
         if index == self.chain.parametrised[-1]:
             return error.view(shape)
         if index not in self._fixed:
-            generator = torch.Generator().manual_seed(self._seed * 1000 + index)
             size = math.prod(shape[1:])
-            draw = torch.randn(error.shape[1], size, generator=generator) / math.sqrt(size)
+            generator = torch.Generator().manual_seed(self._seed * 1000 + index)
+            draw = torch.randn(error.shape[1], size, generator=generator, dtype=torch.float64) / math.sqrt(size)
             self._fixed[index] = draw.to(error)
         return (error @ self._fixed[index]).view(shape)
-
-
-def _output_shape(tape: Tape, index: int) -> torch.Size:
-    following = tape.saved[index + 1] if index + 1 < len(tape.saved) else tape.output
-    return following.shape
 
 
 def edl_gradients(
@@ -132,7 +124,7 @@ def feedback_matrices(network: nn.Module, obs: Tensor, s: float) -> dict[str, Te
 
     n_i counts layer i's pre-activations, in the order [channels, height, width] for a convolution.
     """
-    rule = FeedbackRule(network)
+    chain = Chain(network)
     with torch.no_grad():
-        found = rule.transforms(rule.forward(obs))
-        return {rule.chain.steps[i][0].rstrip("."): t + s * polar(t) for i, t in reversed(found)}
+        found = Transforms(chain, chain.forward(obs)).matrices(s)
+    return {chain.names[index].rstrip("."): b for index, b in reversed(found)}
