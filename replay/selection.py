@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -157,48 +158,48 @@ class Proportional:
 
 
 class SumTree:
-    """Sums of non-negative values in a complete binary tree: values are set and found by running sum in O(log n).
+    """Sums of non-negative values, sixteen to a node: values are set and found by running sum in O(log n).
 
-    Every inner node is always the sum of its two children, so the tree is a function of its leaves alone,
-    whatever the order of updates: a restored tree equals the saved one to the bit.
+    Every node is always the sum of its sixteen, added from left to right, so the tree is a function of its values
+    alone, whatever the order of updates: a restored tree equals the saved one to the bit.
     """
 
     def __init__(self, capacity: int) -> None:
-        self._depth = max(0, capacity - 1).bit_length()
-        self._leaves = 1 << self._depth
-        self._nodes = np.zeros(2 * self._leaves)  # the root is 1; the children of n are 2n and 2n + 1
+        self._levels: list[Floats] = []  # [groups, 16], from the values up; the last level has one group
+        groups = capacity
+        while not self._levels or groups > 1:
+            groups = -(-groups // 16)
+            self._levels.append(np.zeros((groups, 16)))
 
     @property
     def total(self) -> float:
         """Sum of all values."""
-        return float(self._nodes[1])
+        return float(self._levels[-1].cumsum()[-1])
 
     def values(self, rows: Rows) -> Floats:
         """Values at these rows."""
-        found: Floats = self._nodes[rows + self._leaves]
+        found: Floats = self._levels[0].reshape(-1)[rows]
         return found
 
     def update(self, rows: Rows, values: Floats) -> None:
         """Set values; where a row repeats, the last one counts."""
-        nodes = rows + self._leaves
-        self._nodes[nodes] = values
-        for _ in range(self._depth):
-            nodes = nodes >> 1
-            left = nodes << 1
-            self._nodes[nodes] = self._nodes[left] + self._nodes[left + 1]
+        self._levels[0].reshape(-1)[rows] = values
+        for below, above in pairwise(self._levels):
+            rows = rows >> 4
+            above.reshape(-1)[rows] = below[rows].cumsum(axis=1)[:, -1]
 
     def find(self, sums: Floats) -> Rows:
         """For each running sum in [0, total): the row whose value covers it, never one whose value is 0."""
-        nodes = np.ones(len(sums), np.intp)
-        rest = sums
-        for _ in range(self._depth):
-            left = nodes << 1
-            left_sum = self._nodes[left]
-            # Rounding may leave a rest past the end: then an empty right half must not be entered.
-            right = (rest >= left_sum) & (self._nodes[left + 1] > 0)
-            rest = np.where(right, rest - left_sum, rest)
-            nodes = left + right
-        return nodes - self._leaves
+        lines = np.arange(len(sums))
+        nodes = np.zeros(len(sums), np.intp)
+        for level in reversed(self._levels):
+            running = level[nodes].cumsum(axis=1)
+            # Rounding on the way may leave a sum at the end of its node, where nothing covers it.
+            sums = np.minimum(sums, np.nextafter(running[:, -1], 0))
+            child = np.count_nonzero(running <= sums[:, None], axis=1)
+            sums = sums - np.where(child > 0, running[lines, child - 1], 0)
+            nodes = nodes * 16 + child
+        return nodes
 
 
 EVICTIONS = ("fifo", "reservoir", "prioritized")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -16,7 +14,7 @@ from replay.frames import FrameStore, PinnedFrames, Slots
 from replay.selection import make_eviction, make_sampling
 from replay.stats import REUSE_BUCKETS, TableStats, reuse_histogram
 
-__all__ = ["Table", "TableSnapshot", "TableStats"]
+__all__ = ["Table", "TableStats"]
 
 MAX_STREAMS = 4096
 COLUMNS = ("actions", "rewards", "terminated", "param_version", "ids", "reuse", "priorities")
@@ -60,7 +58,7 @@ class Table:
         }
         self._rng = rng
         self._frames = FrameStore(spec.frame_shape, spec.frame_dtype)
-        self._slots = np.zeros((2, capacity, spec.stack), np.int32)  # of obs, of next_obs
+        self._slots = np.zeros((capacity, 2 * spec.stack), np.int32)  # of obs, then of next_obs
         self._actions = np.zeros(capacity, np.int32)
         self._rewards = np.zeros(capacity, np.float32)
         self._terminated = np.zeros(capacity, np.bool_)
@@ -86,16 +84,16 @@ class Table:
         size = len(self)
         first = self.inserted
         rows, kept = self._eviction.place(first, segment.steps)
-        index = np.concatenate((segment.obs_index[kept], segment.next_index[kept])).reshape(2, -1, self.spec.stack)
+        index = np.concatenate((segment.obs_index[kept], segment.next_index[kept]), axis=1)
         slots, dropped = self._store(segment, index)
         replaced = rows if size == self.capacity else rows[rows < size]
         self._reuse_evicted += reuse_histogram(self._reuse[replaced])
         self._reuse_evicted[0] += segment.steps - len(rows)
-        old = self._slots.take(replaced, axis=1).reshape(-1)
+        old = self._slots.take(replaced, axis=0).reshape(-1)
         if self._row_of is not None:
             for number in self._ids[replaced].tolist():
                 del self._row_of[number]
-        self._slots[:, rows] = slots[index]
+        self._slots[rows] = slots[index]
         self._actions[rows] = segment.actions[kept]
         self._rewards[rows] = segment.rewards[kept]
         self._terminated[rows] = segment.terminated[kept]
@@ -115,15 +113,16 @@ class Table:
         if size == 0:
             raise ValueError("an empty table has nothing to sample")
         rows, weights = self._sampling.draw(batch_size, size)
-        distinct, index = self._frames.unique(self._slots.take(rows, axis=1).astype(np.intp))
+        # Transition by transition: neighbouring frames are then read one after the other.
+        distinct, index = self._frames.unique(self._slots.take(rows, axis=0).astype(np.intp))
         np.add.at(self._reuse, rows, np.int32(1))
         self.batches += 1
         self._sampled += batch_size
         ids = self._ids[rows]
         return Batch(
             frames=self._frames.read(distinct),
-            obs_index=index[0],
-            next_index=index[1],
+            obs_index=np.ascontiguousarray(index[:, : self.spec.stack]),
+            next_index=np.ascontiguousarray(index[:, self.spec.stack :]),
             actions=self._actions[rows],
             rewards=self._rewards[rows],
             terminated=self._terminated[rows],
@@ -175,13 +174,17 @@ class Table:
             reuse_evicted=tuple(self._reuse_evicted.tolist()),
         )
 
-    def snapshot(self) -> TableSnapshot:
-        """Freeze the state as it is now, quickly: small arrays are copied, frames only held. Release it at the end."""
+    def snapshot(self) -> tuple[dict[str, Any], dict[str, Array], PinnedFrames]:
+        """Freeze the state as it is now while the table goes on: small arrays are copied, frames only held.
+
+        Returns `state`'s scalars and arrays, but the array "frames" apart: read it in pieces of any size, between
+        other calls on the table, and release it at the end (it is a context manager).
+        """
         size = len(self)
         tails = [tail for _, tail in self._tails.values()]
         tail_slots = np.concatenate([*tails, np.empty(0, np.intp)])
         stored = tail_slots >= 0
-        slots = self._slots[:, :size]
+        slots = self._slots[:size]
         distinct, index = self._frames.unique(np.concatenate((slots.reshape(-1), tail_slots[stored])))
         tail_index = np.full(len(tail_slots), -1, np.int32)
         tail_index[stored] = index[slots.size :]
@@ -200,12 +203,13 @@ class Table:
         arrays = {name: self._column(name)[:size].copy() for name in COLUMNS}
         arrays["slots"] = index[: slots.size].reshape(slots.shape)
         arrays["tails"] = tail_index
-        return TableSnapshot(meta, arrays, self._frames.pin(distinct))
+        return meta, arrays, self._frames.pin(distinct)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Everything that `load_state` needs: msgpack-able scalars, and arrays of what is held (frames included)."""
-        with self.snapshot() as snapshot:
-            return snapshot.meta, {**snapshot.arrays, "frames": snapshot.frames.read(0, len(snapshot.frames))}
+        meta, arrays, frames = self.snapshot()
+        with frames:
+            return meta, {**arrays, "frames": frames.read(0, len(frames))}
 
     def load_state(self, meta: dict[str, Any], arrays: dict[str, Array]) -> None:
         """Continue, to the bit, where `state` was taken; `arrays["frames"]` may be a memory map.
@@ -224,8 +228,8 @@ class Table:
         slots = np.concatenate(
             [np.empty(0, np.intp), *(self._frames.add(frames[part], references[part]) for part in parts)]
         )
-        size = arrays["slots"].shape[1]
-        self._slots[:, :size] = slots[arrays["slots"]]
+        size = len(arrays["slots"])
+        self._slots[:size] = slots[arrays["slots"]]
         for name in COLUMNS:
             self._column(name)[:size] = arrays[name]
         start = 0
@@ -283,27 +287,6 @@ class Table:
     def _column(self, name: str) -> Array:
         column: Array = getattr(self, f"_{name}")
         return column
-
-
-@dataclass(frozen=True, slots=True)
-class TableSnapshot:
-    """A table's state at one moment, while the table goes on: `meta` and `arrays` as in `state`, frames apart.
-
-    frames: read them in pieces of any size, between other calls on the table, and save them in order as the array
-    "frames". Leaving the `with` block releases them.
-    """
-
-    meta: dict[str, Any]
-    arrays: dict[str, Array]
-    frames: PinnedFrames
-
-    def __enter__(self) -> TableSnapshot:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.frames.release()
 
 
 def _run(indices: Slots) -> slice | Slots:

@@ -149,7 +149,7 @@ def held_ids(table: Table) -> list[int]:
 def check_references(table: Table, pinned: Array | None = None) -> None:
     """Every slot has exactly the references of the transitions, streams and snapshots that name it."""
     named: list[Array] = [tail[tail >= 0] for _, tail in table._tails.values()]
-    named += [table._slots[:, : len(table)].reshape(-1), *([] if pinned is None else [pinned])]
+    named += [table._slots[: len(table)].reshape(-1), *([] if pinned is None else [pinned])]
     references = table._frames.references
     expected = np.bincount(np.concatenate(named).astype(np.intp), minlength=len(references))
     np.testing.assert_array_equal(references, expected)
@@ -279,18 +279,19 @@ def test_snapshot_stays_while_the_table_goes_on(
 ) -> None:
     *_, (table, _, streams) = play(case, steps)
     _, then = table.state()
-    with table.snapshot() as snapshot:
-        check_references(table, snapshot.frames._slots)
+    _, arrays, frames = table.snapshot()
+    with frames:
+        check_references(table, frames._slots)
         for event, count in tail:
             if event == "sample" and len(table):
                 table.sample(count)
             else:
                 table.insert(streams[0].segment(count))
-        half = len(snapshot.frames) // 2
-        frames = np.concatenate([snapshot.frames.read(0, half), snapshot.frames.read(half, len(snapshot.frames))])
-        for name, array in {**snapshot.arrays, "frames": frames}.items():
+        half = len(frames) // 2
+        copied = np.concatenate([frames.read(0, half), frames.read(half, len(frames))])
+        for name, array in {**arrays, "frames": copied}.items():
             np.testing.assert_array_equal(array, then[name], err_msg=name)
-        check_references(table, snapshot.frames._slots)
+        check_references(table, frames._slots)
     check_references(table)
 
 
