@@ -32,6 +32,11 @@ class SeenWindow:
         self._streams: OrderedDict[tuple[int, int], _Stream] = OrderedDict()
         self._forgotten = 0
 
+    def seen(self, incarnation: int, stream: int, sequence: int) -> bool:
+        """True where `accept` would refuse; records nothing."""
+        seen = self._streams.get((incarnation, stream))
+        return seen is not None and sequence <= seen.highest and sequence not in seen.gaps
+
     def accept(self, incarnation: int, stream: int, sequence: int) -> bool:
         """Record a sequence number (>= 0); False where it was seen before."""
         seen = self._streams.setdefault((incarnation, stream), _Stream())

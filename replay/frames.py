@@ -147,3 +147,10 @@ class PinnedFrames:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.release()
+
+
+def as_slice(indices: Slots) -> slice | Slots:
+    """Ascending indices as a slice where they have no gap, so that frames are copied once and not twice."""
+    if len(indices) and indices[-1] - indices[0] + 1 == len(indices):
+        return slice(int(indices[0]), int(indices[-1]) + 1)
+    return indices

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from common.errors import UsageError
 from common.types import Array, Batch, EnvSpec, Segment
-from replay.frames import FrameStore, PinnedFrames, Slots
+from replay.frames import FrameStore, PinnedFrames, Slots, as_slice
 from replay.selection import make_eviction, make_sampling
 from replay.stats import REUSE_BUCKETS, TableStats, reuse_histogram
 
@@ -78,6 +78,16 @@ class Table:
 
     def __len__(self) -> int:
         return min(self.inserted, self.capacity)
+
+    @property
+    def evicted(self) -> int:
+        """Transitions inserted and no longer held."""
+        return self.inserted - len(self)
+
+    @property
+    def evicted_unsampled(self) -> int:
+        """Transitions evicted, or never kept, that no batch had held."""
+        return int(self._reuse_evicted[0])
 
     def insert(self, segment: Segment) -> None:
         """Add a segment that has been validated and is no duplicate, evicting what the policy chooses."""
@@ -163,8 +173,8 @@ class Table:
         return TableStats(
             size=size,
             inserted=self.inserted,
-            evicted=self.inserted - size,
-            evicted_unsampled=int(self._reuse_evicted[0]),
+            evicted=self.evicted,
+            evicted_unsampled=self.evicted_unsampled,
             batches=self.batches,
             sampled=self._sampled,
             frames_held=self._frames.held,
@@ -273,7 +283,7 @@ class Table:
         again = np.flatnonzero(wanted & known)
         self._frames.hold(slots[again], references[again])
         new = np.flatnonzero(wanted & ~known)
-        slots[new] = self._frames.add(segment.frames[_run(new)], references[new])
+        slots[new] = self._frames.add(segment.frames[as_slice(new)], references[new])
         self._tails[stream] = segment.sequence, slots[tail:]
         if len(self._tails) > MAX_STREAMS:
             previous = np.concatenate((previous, self._tails.popitem(last=False)[1][1]))
@@ -287,10 +297,3 @@ class Table:
     def _column(self, name: str) -> Array:
         column: Array = getattr(self, f"_{name}")
         return column
-
-
-def _run(indices: Slots) -> slice | Slots:
-    """Ascending indices as a slice where they have no gap, so that frames are copied once and not twice."""
-    if len(indices) and indices[-1] - indices[0] + 1 == len(indices):
-        return slice(int(indices[0]), int(indices[-1]) + 1)
-    return indices

@@ -17,6 +17,7 @@ arrivals = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(
 def test_equals_a_set(arrivals: list[tuple[int, int, int]]) -> None:
     window, seen = SeenWindow(), set()
     for arrival in arrivals:
+        assert window.seen(*arrival) == (arrival in seen)
         assert window.accept(*arrival) == (arrival not in seen)
         seen.add(arrival)
     streams = {arrival[:2] for arrival in seen}
@@ -33,7 +34,8 @@ def test_restored_window_goes_on_alike(before: list[tuple[int, int, int]], after
     twin = SeenWindow(max_streams=3, max_gaps=5)
     twin.load_state(msgpack.unpackb(msgpack.packb(window.state())))
     for arrival in after:
-        assert twin.accept(*arrival) == window.accept(*arrival)
+        known = window.seen(*arrival)
+        assert twin.accept(*arrival) == window.accept(*arrival) == (not known)
         assert twin.state() == window.state()
 
 
