@@ -1,4 +1,4 @@
-"""The frames of a round of segments: one growing row of frames a stream, and which of them make its observation."""
+"""The frames of a round of segments: a growing row of frames for each stream, and which of them make an observation."""
 
 from __future__ import annotations
 
@@ -9,79 +9,108 @@ from numpy.typing import NDArray
 
 from common.types import Array, EnvSpec
 
+Rows = NDArray[np.int32]
+
 
 class FrameBlock:
     """Frames <frame_dtype>[envs, capacity, *frame_shape], filled from the front, each stream at its own pace.
 
-    `current`: int32 [envs, stack], the rows of the frames that make each stream's observation, oldest first; they
-    never decrease, and the last one is the stream's newest frame.
+    A step costs one copy of one frame a stream. Indices are made at the end of the round: a stack that continues
+    is the last `stack` rows pushed, so only restarts have to be remembered.
     """
 
-    def __init__(self, spec: EnvSpec, num_envs: int, steps: int) -> None:
+    def __init__(self, spec: EnvSpec, num_envs: int, max_steps: int) -> None:
         self._spec, self._num_envs = spec, num_envs
-        self._capacity = steps + 4 * spec.stack  # room for some restarts; grows where that is not enough
-        self._frames = self._allocate()
-        self._streams = np.arange(num_envs)
-        self._used = np.zeros(num_envs, np.int32)
-        self._most = 0  # at least max(used), kept without looking at the array
-        self.current = np.zeros((num_envs, spec.stack), np.int32)
+        self._capacity = max_steps + 4 * spec.stack  # room for some restarts; grows where that is not enough
+        self._allocate()
+        # Row numbers, in `_free` and `_pushed`, count through all streams: stream * capacity + row.
+        self._free = np.arange(num_envs) * self._capacity
+        self._pushed = np.empty((max_steps, num_envs), np.int64)
+        self._steps = 0
+        self._most = 0  # at least the longest stream's rows, known without looking at arrays
+        self._current: Rows = np.zeros((spec.stack, num_envs), np.int32)  # stacks at the start of the round
+        self._restarts: list[tuple[int, int, list[int]]] = []  # steps before it, stream, rows of the new stack
 
-    def push(self, obs: Array) -> NDArray[np.int32]:
-        """Store the newest frame of every stream's observation, which continues the last; the new `current`.
-
-        obs: <frame_dtype>[envs, *obs_shape].
-        """
-        self._reserve(1)
-        self._frames[self._streams, self._used] = obs[:, -1] if self._spec.stack > 1 else obs
-        current = np.empty_like(self.current)
-        current[:, :-1] = self.current[:, 1:]
-        current[:, -1] = self._used
-        self._used += 1
-        self.current = current
-        return current
+    def push(self, obs: Array) -> None:
+        """Store the newest frame of each stream's observation <frame_dtype>[envs, *obs_shape], which continues."""
+        if self._most == self._capacity:
+            self._reserve(1)
+        self._flat[self._free] = obs[:, -1] if self._spec.stack > 1 else obs
+        self._pushed[self._steps] = self._free
+        self._free += 1
+        self._most += 1
+        self._steps += 1
 
     def restart(self, streams: Iterable[int], obs: Array) -> None:
-        """Store the whole observations of streams that do not continue; frames equal to their neighbour once.
+        """Store the whole observations of streams that do not continue; frames equal to the one before only once.
 
         obs: <frame_dtype>[envs, *obs_shape].
         """
-        self._reserve(self._spec.stack)
-        stacks = obs.reshape(self._num_envs, self._spec.stack, *self._spec.frame_shape)
-        self.current = self.current.copy()
+        stack = self._spec.stack
+        if self._most + stack > self._capacity:
+            self._reserve(stack)
+        self._most += stack
         for stream in streams:
-            row = int(self._used[stream]) - 1
-            for place, frame in enumerate(stacks[stream]):
-                if place == 0 or not np.array_equal(frame, stacks[stream, place - 1]):
-                    row += 1
-                    self._frames[stream, row] = frame
-                self.current[stream, place] = row
-            self._used[stream] = row + 1
+            row, rows, before = int(self._free[stream]) - 1, [], None
+            for frame in obs[stream] if stack > 1 else obs[stream : stream + 1]:
+                if (content := frame.tobytes()) != before:
+                    row, before = row + 1, content
+                    self._flat[row] = frame
+                rows.append(row - stream * self._capacity)
+            self._free[stream] = row + 1
+            self._restarts.append((self._steps, stream, rows))
 
-    def cut(self) -> tuple[list[Array], list[int]]:
-        """End the round: each stream's frames, and how many of the last ones begin its next round.
+    def cut(self) -> tuple[list[Array], Rows, Rows, list[int]]:
+        """End the round and begin the next one with the frames of the current observations.
 
-        The next round begins with the frames of the current observation, in rows from 0.
+        Returns:
+            frames: a stream's <frame_dtype>[n_frames, *frame_shape]; obs_index, next_index: int32 [envs, steps, stack];
+            carried: how many of each stream's last frames begin its next round.
         """
-        first = self.current[:, 0]
-        carried = (self._used - first).tolist()
-        full, used = self._frames, self._used.tolist()
-        self._frames = self._allocate()
+        obs_index, next_index = self._indices()
+        used = (self._free - np.arange(self._num_envs) * self._capacity).tolist()
+        frames = [frames[:count] for frames, count in zip(self._frames, used, strict=True)]
+        first = obs_index[:, -1, 0]
+        carried = (used - first).tolist()
+        self._allocate()
         for stream, count in enumerate(carried):
-            self._frames[stream, :count] = full[stream, used[stream] - count : used[stream]]
-        self.current = self.current - first[:, None]
-        self._used = self._used - first
+            self._frames[stream, :count] = frames[stream][-count:]
+        self._current = (obs_index[:, -1] - first[:, None]).T
+        self._free = np.arange(self._num_envs) * self._capacity + carried
         self._most = max(carried)
-        return [frames[:count] for frames, count in zip(full, used, strict=True)], carried
+        self._steps = 0
+        self._restarts = []
+        return frames, obs_index[:, :-1], next_index, carried
+
+    def _indices(self) -> tuple[Rows, Rows]:
+        """int32 [envs, steps + 1, stack], what each step starts from and the next one would; [envs, steps, stack]."""
+        stack = self._spec.stack
+        pushed = self._pushed[: self._steps] - np.arange(self._num_envs) * self._capacity
+        rows = np.concatenate([self._current, pushed.astype(np.int32)])
+        windows = np.lib.stride_tricks.sliding_window_view(rows, stack, axis=0).swapaxes(0, 1)
+        obs_index, next_index = windows.copy(), windows[:, 1:].copy()
+        for steps, stream, stacked in self._restarts:
+            # After `later` more steps the stack still begins with the new stack's frames from `later` on.
+            for later in range(min(stack, self._steps + 1 - steps)):
+                obs_index[stream, steps + later, : stack - later] = stacked[later:]
+                next_index[stream, steps + later : steps + later + 1, : stack - later - 1] = stacked[later + 1 :]
+        return obs_index, next_index
 
     def _reserve(self, count: int) -> None:
         """Make room for `count` more frames in every stream."""
-        if self._most + count > self._capacity:
-            self._most = int(self._used.max())
-            if self._most + count > self._capacity:
-                self._capacity += self._capacity // 2 + count
-                old, self._frames = self._frames, self._allocate()
-                self._frames[:, : self._most] = old[:, : self._most]
-        self._most += count
+        streams = np.arange(self._num_envs)
+        self._most = int((self._free - streams * self._capacity).max())
+        if self._most + count <= self._capacity:
+            return
+        old, before = self._frames, self._capacity
+        self._capacity += before // 2 + count
+        self._allocate()
+        self._frames[:, :before] = old
+        shift = streams * (self._capacity - before)
+        self._free += shift
+        self._pushed[: self._steps] += shift
 
-    def _allocate(self) -> Array:
-        return np.empty((self._num_envs, self._capacity, *self._spec.frame_shape), self._spec.frame_dtype)
+    def _allocate(self) -> None:
+        shape = (self._num_envs * self._capacity, *self._spec.frame_shape)
+        self._flat: Array = np.empty(shape, self._spec.frame_dtype)
+        self._frames = self._flat.reshape(self._num_envs, self._capacity, *self._spec.frame_shape)

@@ -23,8 +23,6 @@ class SegmentAssembler:
     def __init__(self, spec: EnvSpec, num_envs: int, incarnation: int, segment_steps: int) -> None:
         self._num_envs, self._incarnation, self._length = num_envs, incarnation, segment_steps
         self._frames = FrameBlock(spec, num_envs, segment_steps)
-        self._obs_index = np.empty((segment_steps, num_envs, spec.stack), np.int32)
-        self._next_index = np.empty_like(self._obs_index)
         self._actions = np.empty((segment_steps, num_envs), np.int32)
         self._rewards = np.empty((segment_steps, num_envs), np.float32)
         self._terminated = np.empty((segment_steps, num_envs), np.bool_)
@@ -46,11 +44,10 @@ class SegmentAssembler:
         actions: int32 [envs]. param_version: of the parameters that chose them.
         episode_ends: by stream, the episodes that this step ended; their `step_in_segment` is set here.
         """
-        now, frames = self._steps, self._frames
-        self._obs_index[now] = frames.current
-        self._next_index[now] = frames.push(steps.next_obs)
+        now = self._steps
+        self._frames.push(steps.next_obs)
         if np.count_nonzero(steps.restarted):
-            frames.restart(np.flatnonzero(steps.restarted).tolist(), steps.obs)
+            self._frames.restart(np.flatnonzero(steps.restarted).tolist(), steps.obs)
         self._actions[now] = actions
         self._rewards[now] = steps.rewards
         self._terminated[now] = steps.terminated
@@ -65,10 +62,9 @@ class SegmentAssembler:
         steps, self._steps = self._steps, 0
         if not steps:
             return []
-        blocks, carried = self._frames.cut()
-        obs_index, next_index, actions, rewards, terminated = (
-            np.array(column[:steps].swapaxes(0, 1), order="C")
-            for column in (self._obs_index, self._next_index, self._actions, self._rewards, self._terminated)
+        frames, obs_index, next_index, carried = self._frames.cut()
+        actions, rewards, terminated = (
+            np.array(column[:steps].T, order="C") for column in (self._actions, self._rewards, self._terminated)
         )
         versions = self._versions[:steps].copy()
         segments = [
@@ -76,7 +72,7 @@ class SegmentAssembler:
                 incarnation=self._incarnation,
                 stream=stream,
                 sequence=self._sequence,
-                frames=blocks[stream],
+                frames=frames[stream],
                 obs_index=obs_index[stream],
                 next_index=next_index[stream],
                 actions=actions[stream],
