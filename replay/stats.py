@@ -1,13 +1,15 @@
-"""What a table tells of itself: counts, reuse, and the memory that it will need."""
+"""What a table tells of itself: counts, reuse, its state at one moment, and the memory that it will need."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import EnvSpec
+from common.types import Array, EnvSpec
+from replay.frames import PinnedFrames
 
 REUSE_BUCKETS = 16
 # actions, rewards, terminated, param_version, ids, reuse; three counters of the frame's slot.
@@ -35,6 +37,18 @@ class TableStats:
     reuse_mean: float
     reuse_held: tuple[int, ...]
     reuse_evicted: tuple[int, ...]
+
+
+class TableSnapshot(NamedTuple):
+    """A table's state at one moment, while the table goes on.
+
+    meta, arrays: as in `Table.state`, but for the array "frames". frames: its content, to be read in pieces of any
+    size between other calls on the table, and to be released at the end (it is a context manager).
+    """
+
+    meta: dict[str, Any]
+    arrays: dict[str, Array]
+    frames: PinnedFrames
 
 
 def estimated_bytes(spec: EnvSpec, capacity: int) -> int:

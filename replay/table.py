@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from common.errors import UsageError
 from common.types import Array, Batch, EnvSpec, Segment
-from replay.frames import FrameStore, PinnedFrames, Slots, as_slice
+from replay.frames import FrameStore, Slots, as_slice
 from replay.selection import make_eviction, make_sampling
-from replay.stats import REUSE_BUCKETS, TableStats, reuse_histogram
+from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
 
-__all__ = ["Table", "TableStats"]
+__all__ = ["Table", "TableSnapshot", "TableStats"]
 
 MAX_STREAMS = 4096
 COLUMNS = ("actions", "rewards", "terminated", "param_version", "ids", "reuse", "priorities")
@@ -184,12 +184,8 @@ class Table:
             reuse_evicted=tuple(self._reuse_evicted.tolist()),
         )
 
-    def snapshot(self) -> tuple[dict[str, Any], dict[str, Array], PinnedFrames]:
-        """Freeze the state as it is now while the table goes on: small arrays are copied, frames only held.
-
-        Returns `state`'s scalars and arrays, but the array "frames" apart: read it in pieces of any size, between
-        other calls on the table, and release it at the end (it is a context manager).
-        """
+    def snapshot(self) -> TableSnapshot:
+        """Freeze the state as it is now while the table goes on: small arrays are copied, frames only held."""
         size = len(self)
         tails = [tail for _, tail in self._tails.values()]
         tail_slots = np.concatenate([*tails, np.empty(0, np.intp)])
@@ -213,7 +209,7 @@ class Table:
         arrays = {name: self._column(name)[:size].copy() for name in COLUMNS}
         arrays["slots"] = index[: slots.size].reshape(slots.shape)
         arrays["tails"] = tail_index
-        return meta, arrays, self._frames.pin(distinct)
+        return TableSnapshot(meta, arrays, self._frames.pin(distinct))
 
     def state(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Everything that `load_state` needs: msgpack-able scalars, and arrays of what is held (frames included)."""
@@ -284,7 +280,7 @@ class Table:
         self._frames.hold(slots[again], references[again])
         new = np.flatnonzero(wanted & ~known)
         slots[new] = self._frames.add(segment.frames[as_slice(new)], references[new])
-        self._tails[stream] = segment.sequence, slots[tail:]
+        self._tails[stream] = segment.sequence, slots[tail:].copy()
         if len(self._tails) > MAX_STREAMS:
             previous = np.concatenate((previous, self._tails.popitem(last=False)[1][1]))
         return slots, previous[previous >= 0]

@@ -1,0 +1,141 @@
+"""Single cases of the table: sharing of frames, bounds, diagnostics, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from table_reference import Stream, check_references, make_spec
+
+from common.errors import UsageError
+from common.types import Segment
+from replay import table as table_module
+from replay.stats import estimated_bytes
+from replay.table import Table
+
+
+@pytest.mark.parametrize("stack", [1, 4])
+def test_each_frame_is_held_once(stack: int) -> None:
+    """Through segment borders and eviction, with every segment delivered, only frames in use are held."""
+    streams = [Stream(make_spec(stack), number, np.random.default_rng(number), 20) for number in range(3)]
+    table = Table(make_spec(stack), 50, rng=np.random.default_rng(0))
+    sent: list[set[tuple[int, int]]] = []
+    for turn in range(60):
+        stream = streams[turn % 3]
+        segment = stream.segment(5)
+        table.insert(segment)
+        sent += [
+            {(stream.number, stream.sent[place]) for place in (*now, *following)}
+            for now, following in zip(segment.obs_index.tolist(), segment.next_index.tolist(), strict=True)
+        ]
+        last = {(one.number, name) for one in streams for name in one.sent[-stack:]}
+        assert table.stats().frames_held == len(set().union(last, *sent[-50:]))
+
+
+def test_n_step_transitions_carry_more_than_a_stack() -> None:
+    """A segment whose observations reach further back than one stack still shares what the stream kept."""
+    table = Table(make_spec(2), 100, rng=np.random.default_rng(0))
+    names = np.arange(40)
+    for sequence in range(4):
+        window = names[6 * sequence : 6 * sequence + 10]  # 4 carried frames, then 6 new ones
+        start = np.arange(6)[:, None] + np.arange(2)
+        table.insert(
+            Segment(
+                incarnation=1,
+                stream=0,
+                sequence=sequence,
+                frames=np.broadcast_to(window[:, None, None], (10, 2, 3)).astype(np.float32),
+                obs_index=start.astype(np.int32),
+                next_index=(start + 3).astype(np.int32),
+                actions=np.zeros(6, np.int32),
+                rewards=np.zeros(6, np.float32),
+                terminated=np.zeros(6, np.bool_),
+                param_version=np.zeros(6, np.int64),
+                carried=4 if sequence else 0,
+            )
+        )
+    # The first border shares one stack of two, as no more was expected then; the others share all four.
+    assert table.stats().frames_held == 10 + 8 + 6 + 6
+    batch = table.sample(200)
+    first = batch.frames[batch.obs_index][:, :, 0, 0]
+    np.testing.assert_array_equal(batch.frames[batch.next_index][:, :, 0, 0], first + 3)
+
+
+def test_streams_used_least_recently_give_their_frames_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table_module, "MAX_STREAMS", 3)
+    table = Table(make_spec(2), 4, rng=np.random.default_rng(0))
+    for number in range(10):
+        table.insert(Stream(make_spec(2), number, np.random.default_rng(0), 50).segment(4))
+        check_references(table)
+    assert [stream for _, stream in table._tails] == [7, 8, 9]
+    assert table.stats().frames_held == 5 + 2 * 2
+
+
+def test_a_batch_has_each_frame_once() -> None:
+    table = Table(make_spec(4), 10, rng=np.random.default_rng(0))
+    table.insert(Stream(make_spec(4), 0, np.random.default_rng(0), 50).segment(10))
+    for _ in range(3):
+        batch = table.sample(64)
+        assert len(np.unique(batch.frames, axis=0)) == len(batch.frames) <= 11 + 3
+        assert (batch.obs_index.dtype.name, batch.obs_index.shape) == ("int32", (64, 4))
+        assert (batch.next_index.dtype.name, batch.next_index.shape) == ("int32", (64, 4))
+        assert batch.obs_index.flags.c_contiguous
+        assert batch.next_index.flags.c_contiguous
+        np.testing.assert_array_equal(batch.weights, np.ones(64, np.float32))
+
+
+def test_reuse_histograms() -> None:
+    table = Table(make_spec(1), 2, rng=np.random.default_rng(0))
+    stream = Stream(make_spec(1), 0, np.random.default_rng(0), 50)
+    table.insert(stream.segment(2))
+    draws = np.bincount(table.sample(7).ids, minlength=2)
+    stats = table.stats()
+    assert (stats.batches, stats.sampled, stats.reuse_mean) == (1, 7, 3.5)
+    assert stats.reuse_held == tuple(np.bincount([int(n).bit_length() for n in draws], minlength=16))
+    table.insert(stream.segment(1))
+    assert table.stats().reuse_evicted[int(draws[0]).bit_length()] == 1
+    table.insert(stream.segment(2))
+    assert table.stats().evicted_unsampled == 1
+
+
+def test_estimate_covers_a_full_table() -> None:
+    spec = make_spec(4, "uint8", (84, 84))
+    table = Table(spec, 500, rng=np.random.default_rng(0))
+    stream = Stream(spec, 0, np.random.default_rng(0), 10**9)
+    for _ in range(20):
+        table.insert(stream.segment(50))
+    assert table.stats().bytes_held <= 1.05 * estimated_bytes(spec, 500)
+    assert estimated_bytes(spec, 10**6) < 7300 * 10**6
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"capacity": 0}, "capacity: 0"),
+        ({"eviction": "lifo"}, "eviction: 'lifo' is not one of fifo"),
+        ({"sampling": "best"}, "sampling: 'best' is not one of uniform"),
+        ({"priority_exponent": -1.0}, "priority_exponent"),
+        ({"importance_exponent": float("nan")}, "importance_exponent"),
+    ],
+)
+def test_bad_settings_are_refused(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        Table(make_spec(1), **{"capacity": 10, "rng": np.random.default_rng(0), **settings})
+
+
+def test_misuse_is_refused() -> None:
+    table = Table(make_spec(1), 10, sampling="prioritized", rng=np.random.default_rng(0))
+    with pytest.raises(ValueError, match="empty"):
+        table.sample(1)
+    table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(10))
+    for bad in (-1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="priorities"):
+            table.update_priorities(np.array([1, 2]), np.array([1.0, bad]))
+    with pytest.raises(ValueError, match="priorities"):
+        table.update_priorities(np.array([1, 2]), np.array([1.0]))
+    meta, arrays = table.state()
+    with pytest.raises(ValueError, match="new table"):
+        table.load_state(meta, arrays)
+    with pytest.raises(UsageError, match="capacity: 11, but the saved table had 10"):
+        Table(make_spec(1), 11, sampling="prioritized", rng=np.random.default_rng(0)).load_state(meta, arrays)
