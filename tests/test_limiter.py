@@ -137,6 +137,13 @@ def test_a_changed_ratio_holds_from_there_on(
     assert drawn == limiter.draws_total
 
 
+def test_a_raised_start_does_not_wedge() -> None:
+    limiter = replace(THOUSAND.changed(2000, 1000, ratio=0.5), start=3000)
+    for inserted in (2000, 2500, 2999):
+        assert limiter.why_not_insert(inserted, 1000) is None
+        assert limiter.why_not_sample(inserted, 1000, inserted) == f"waiting for 3,000 transitions, have {inserted:,}"
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

@@ -116,3 +116,17 @@ def test_sum_tree_equals_running_sums(capacity: int, updates: list[tuple[int, fl
         margin = 1e-9 * tree.total
         assert (before[found] - margin <= sums).all()
         assert (sums <= before[found + 1] + margin).all()
+
+
+def test_sum_tree_at_the_seams() -> None:
+    """Sums at the border of two values, where rounding decides, never find a value of 0 or a row that isn't there."""
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        values = rng.random(200) * (rng.random(200) < 0.5)
+        tree = SumTree(200)
+        tree.update(np.arange(200), values)
+        seams = np.concatenate([level.cumsum(axis=-1).reshape(-1) for level in tree._levels])
+        sums = np.concatenate([np.nextafter(seams, 0), seams, np.nextafter(seams, np.inf)])
+        found = tree.find(sums[sums < tree.total])
+        assert found.max() < 200
+        assert (values[found] > 0).all()

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from table_reference import Stream, check_references, make_spec
+from table_reference import Copies, Stream, check_references, make_spec
 
 from common.errors import UsageError
 from common.types import Segment
 from replay import table as table_module
-from replay.stats import estimated_bytes
+from replay.stats import estimated_bytes, reuse_histogram
 from replay.table import Table
 
 
@@ -97,6 +97,37 @@ def test_reuse_histograms() -> None:
     assert table.stats().reuse_evicted[int(draws[0]).bit_length()] == 1
     table.insert(stream.segment(2))
     assert table.stats().evicted_unsampled == 1
+
+
+def test_the_last_bucket_is_open() -> None:
+    histogram = reuse_histogram(np.array([0, 1, 2, 3, 4, 2**14, 2**15, 2**31 - 1], np.int32))
+    assert histogram.tolist() == [1, 1, 2, 1, *[0] * 11, 3]
+
+
+@pytest.mark.parametrize("eviction", ["fifo", "reservoir", "prioritized"])
+def test_priorities_of_evicted_transitions_are_ignored(eviction: str) -> None:
+    table = Table(make_spec(1), 4, eviction=eviction, sampling="prioritized", rng=np.random.default_rng(0))
+    stream = Stream(make_spec(1), 0, np.random.default_rng(0), 50)
+    table.insert(stream.segment(40))
+    held = set(table.sample(100).ids.tolist())
+    gone = np.array(sorted(set(range(-4, 50)) - held))
+    table.update_priorities(gone, np.full(len(gone), 1e9))
+    assert table._priorities.tolist() == [1.0] * 4
+    table.insert(stream.segment(1))
+    assert table._priorities.tolist() == [1.0] * 4
+
+
+def test_frames_survive_growth() -> None:
+    """More frames than the store begins with: those written before it grew are still the same."""
+    table = Table(make_spec(2), 3000, rng=np.random.default_rng(0))
+    stream = Stream(make_spec(2), 0, np.random.default_rng(0), 50)
+    copies = Copies(3000, "fifo")
+    for _ in range(40):
+        segment = stream.segment(100)
+        table.insert(segment)
+        copies.insert(segment, np.random.default_rng(0))
+        check_references(table)
+    copies.check(table.sample(1000))
 
 
 def test_estimate_covers_a_full_table() -> None:
