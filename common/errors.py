@@ -1,11 +1,11 @@
 """Every failure that a user can meet, and the exit status each one ends with.
 
-    CoopError
-    |- UsageError      a flag, file or grid that can't be right: exit status 2, before anything starts
-    |- RunError        a run that could not start or finish: exit status 1
-    |  |- JoinError    no learner answered, or it refused us
-    |  '- PeerLost     a role that this one needs stopped answering
-    '- BadMessage      bytes from the wire that are not a valid message (names the field)
+CoopError
+|- UsageError      a flag, file or grid that can't be right: exit status 2, before anything starts
+|- RunError        a run that could not start or finish: exit status 1
+|  |- JoinError    no learner answered, or it refused us
+|  '- PeerLost     a role that this one needs stopped answering
+'- BadMessage      bytes from the wire that are not a valid message (names the field)
 """
 
 from __future__ import annotations

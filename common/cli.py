@@ -1,0 +1,65 @@
+"""Command lines by tyro; whatever is wrong with them comes out as one line."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import tyro
+
+from common.config import RunConfig, load_tables, resolve
+from common.errors import UsageError
+
+T = TypeVar("T")
+_FRAME = re.compile(r"[╭╮╰╯│─]+")
+
+
+def parse(
+    kind: type[T], program: str, description: str, default: T | None = None, args: Sequence[str] | None = None
+) -> T:
+    """Parse flags into a dataclass.
+
+    Raises:
+        UsageError: an unknown flag or a value of the wrong type.
+    """
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(kind, prog=program, description=description, default=default, args=args)
+    except SystemExit as exit_:
+        if exit_.code in (0, None):
+            raise
+        raise UsageError(_one_line(complaint.getvalue())) from None
+
+
+def base_config(args: Sequence[str] | None = None) -> RunConfig:
+    """The config that `--preset`, `--config` and `--method` name; the other flags override it.
+
+    Raises:
+        UsageError: an unknown preset, a bad file, or both given.
+    """
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    early.add_argument("--preset")
+    early.add_argument("--config", type=Path)
+    early.add_argument("--method")
+    try:
+        known, _ = early.parse_known_args(sys.argv[1:] if args is None else args)
+    except argparse.ArgumentError as error:
+        raise UsageError(str(error)) from error
+    if known.preset and known.config:
+        raise UsageError("--preset and --config: give one of them")
+    preset = known.preset or (None if known.config else "cartpole")
+    return resolve(load_tables(preset, known.config), known.method)
+
+
+def _one_line(box: str) -> str:
+    """The statement inside the box that tyro draws around an error, without the help below its rule."""
+    body = box.split("\n", 1)[1] if box.startswith("╭") else box
+    statement = body.split("│ ─", 1)[0]
+    return re.sub(r"\s+", " ", _FRAME.sub(" ", statement)).strip() or "bad command line"

@@ -1,0 +1,187 @@
+"""Clients of the replay service: acked inserts in a bounded window, and prefetched draws.
+
+Neither has a thread of its own: Zenoh works in the background, and the caller settles what has come back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+from common import messages
+from common.errors import BadMessage
+from common.lifecycle import Stop
+from common.messages import BatchReader, Drawn
+from common.transport import NoAnswer, Node, Pending
+from common.types import Batch, EnvSpec, Segment
+
+REPLAY_SHARD = "0"
+
+
+def replay_key(node: Node, what: str) -> str:
+    """Key of one of the replay service's queryables: insert, sample, stats or snapshot."""
+    return node.key("replay", REPLAY_SHARD, what)
+
+
+class Backoff:
+    """Pauses that double from `first` to `longest` seconds, until `reset`."""
+
+    def __init__(self, first: float = 0.02, longest: float = 1.0) -> None:
+        self._first = self._next = first
+        self._longest = longest
+
+    def pause(self, stop: Stop) -> bool:
+        """Sleep; True if the stop came."""
+        pause, self._next = self._next, min(self._longest, 2 * self._next)
+        return stop.wait(pause)
+
+    def reset(self) -> None:
+        """Begin with the shortest pause again."""
+        self._next = self._first
+
+
+@dataclass(slots=True)
+class _Sent:
+    payload: bytearray
+    steps: int
+    pending: Pending
+
+
+class InsertClient:
+    """Sends segments until each is acknowledged, at most `window` of them at a time.
+
+    acked: transitions acknowledged. inserted: the table's count of accepted transitions, as last told.
+    waiting: why nothing moves, in words; empty while it does.
+    """
+
+    def __init__(self, node: Node, stop: Stop, window: int) -> None:
+        self.acked = 0
+        self.inserted = 0
+        self.waiting = ""
+        self._node = node
+        self._stop = stop
+        self._window = window
+        self._key = replay_key(node, "insert")
+        self._outstanding: deque[_Sent] = deque()
+        self._backoff = Backoff()
+
+    def submit(self, segment: Segment) -> bool:
+        """Send a segment, waiting for a place in the window; False if the stop came first.
+
+        Raises:
+            Refused: the replay service found a segment bad.
+        """
+        self._settle_ready()
+        while len(self._outstanding) >= self._window:
+            if not self._settle(self._outstanding[0]):
+                return False
+            self._outstanding.popleft()
+        payload = messages.encode_segment(self._node.run, segment)
+        self._outstanding.append(_Sent(payload, segment.steps, self._node.begin(self._key, payload)))
+        return True
+
+    def drain(self) -> bool:
+        """Wait until everything sent is acknowledged; False if the stop came first."""
+        while self._outstanding:
+            if not self._settle(self._outstanding[0]):
+                return False
+            self._outstanding.popleft()
+        return True
+
+    def _settle_ready(self) -> None:
+        """Take the acknowledgements that are there, without waiting."""
+        while self._outstanding:
+            sent = self._outstanding[0]
+            try:
+                message = sent.pending.ready()
+            except NoAnswer:
+                return  # the next full window will send it again
+            if message is None:
+                return
+            if not self._accept(message, sent):
+                sent.pending = self._node.begin(self._key, sent.payload)
+                return
+            self._outstanding.popleft()
+
+    def _settle(self, sent: _Sent) -> bool:
+        """Wait for one acknowledgement, sending again as often as it takes; False if the stop came first."""
+        while True:
+            try:
+                if self._accept(sent.pending.wait(), sent):
+                    self._backoff.reset()
+                    self.waiting = ""
+                    return True
+            except NoAnswer:
+                self.waiting = "the replay service does not answer"
+            if self._backoff.pause(self._stop):
+                return False
+            sent.pending = self._node.begin(self._key, sent.payload)
+
+    def _accept(self, message: messages.Message, sent: _Sent) -> bool:
+        if message.kind == "retry":
+            self.waiting = messages.decode_retry(message)
+            return False
+        self.inserted = max(self.inserted, messages.decode_ack(message))
+        self.acked += sent.steps
+        return True
+
+
+class SampleClient:
+    """Draws batches, keeping `prefetch` requests under way.
+
+    waiting: why no batch comes, in words; empty while they do.
+    """
+
+    def __init__(self, node: Node, stop: Stop, incarnation: int, spec: EnvSpec, batch_size: int, prefetch: int) -> None:
+        self.waiting = ""
+        self._node = node
+        self._stop = stop
+        self._incarnation = incarnation
+        self._batch_size = batch_size
+        self._prefetch = prefetch
+        self._read = BatchReader(spec)
+        self._key = replay_key(node, "sample")
+        self._outstanding: deque[tuple[int, Pending]] = deque()
+        self._next = 0
+        self._episodes = 0
+        self._backoff = Backoff()
+
+    def next(self) -> tuple[Batch, Drawn] | None:
+        """The next batch and the episodes that are new since the last one; None if there is none for now.
+
+        Raises:
+            Refused: the replay service found a request bad.
+            BadMessage: its answer is not a batch.
+        """
+        while len(self._outstanding) < self._prefetch:
+            self._outstanding.append((self._next, self._request(self._next)))
+            self._next += 1
+        sequence, pending = self._outstanding[0]
+        try:
+            message = pending.wait()
+        except NoAnswer:
+            self.waiting = "the replay service does not answer"
+            self._backoff.pause(self._stop)
+        else:
+            if message.kind != "retry":
+                self._outstanding.popleft()
+                return self._accept(message, sequence)
+            self.waiting = messages.decode_retry(message)
+            self._backoff.pause(self._stop)
+        self._outstanding[0] = (sequence, self._request(sequence))
+        return None
+
+    def _request(self, sequence: int) -> Pending:
+        request = messages.encode_sample(self._node.run, self._incarnation, sequence, self._batch_size, self._episodes)
+        return self._node.begin(self._key, request)
+
+    def _accept(self, message: messages.Message, sequence: int) -> tuple[Batch, Drawn]:
+        batch, drawn = self._read(message)
+        if drawn.sequence != sequence:
+            raise BadMessage("fields.sequence", f"{drawn.sequence} instead of {sequence}")
+        self._backoff.reset()
+        self.waiting = ""
+        fresh = drawn.episodes[max(0, self._episodes - drawn.first_episode) :]
+        drawn = replace(drawn, first_episode=self._episodes, episodes=fresh)
+        self._episodes += len(fresh)
+        return batch, drawn

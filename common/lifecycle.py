@@ -1,0 +1,64 @@
+"""How a process of a run starts, is asked to stop, and ends: signals, exit status, the message of its last line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from types import FrameType
+
+from common.errors import CoopError
+
+SUPERVISED = "COOP_SUPERVISED"  # set by a supervisor whose death must end this process
+
+
+class Stop:
+    """A request to stop, with its reason; set by a signal, by a message or by the code itself."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+        self._parent = os.getppid() if os.environ.get(SUPERVISED) else None
+        self.reason = ""
+        self.failed = False
+
+    def set(self, reason: str, failed: bool = False) -> None:
+        """Ask for the stop; the first reason stays. `failed`: the process must end with exit status 1."""
+        if not self._event.is_set():
+            self.reason, self.failed = reason, failed
+        self._event.set()
+
+    def is_set(self) -> bool:
+        """True once somebody asked, or once the supervisor of this process is gone."""
+        if self._parent is not None and os.getppid() != self._parent:
+            self.set("the supervisor is gone")
+        return self._event.is_set()
+
+    def wait(self, seconds: float) -> bool:
+        """Sleep, unless the stop comes first; True if it has come."""
+        self._event.wait(seconds)
+        return self.is_set()
+
+    def on_signals(self) -> None:
+        """Let SIGINT and SIGTERM ask for a clean stop; a second SIGINT interrupts at once."""
+
+        def handle(number: int, frame: FrameType | None) -> None:
+            if number == signal.SIGINT and self.is_set():
+                raise KeyboardInterrupt
+            self.set("interrupted")
+
+        signal.signal(signal.SIGINT, handle)
+        signal.signal(signal.SIGTERM, handle)
+
+
+def run_main(program: str, main: Callable[[], None]) -> None:
+    """Run a command's body; a failure that the user can meet ends in one line and its exit status."""
+    try:
+        main()
+    except CoopError as error:
+        print(f"{program}: error: {error}", file=sys.stderr, flush=True)
+        sys.exit(error.exit_status)
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr, flush=True)
+        sys.exit(130)

@@ -1,0 +1,289 @@
+"""Zenoh as this system uses it: one session per process, queries that are answered, puts where the latest value wins.
+
+A `Node` is one process's place in a run. Everything that must not be lost is a query (`ask`, `begin`) answered by a
+`serve` loop in a thread of its own; weights, role and status are `publish`ed and read as `latest`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import secrets
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+
+from common import messages, wire
+from common.errors import BadMessage, RunError, UsageError
+from common.lifecycle import Stop
+from common.wire import Message
+
+ASK_TIMEOUT = 5.0  # seconds
+
+_QUIET = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "adminspace/enabled": True,
+    "connect/timeout_ms": 0,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+    "listen/exit_on_failure": True,
+    "transport/link/rx/buffer_size": 4 << 20,
+    "transport/link/tx/queue/size/data": 16,
+    "transport/shared_memory/enabled": False,
+}
+
+
+class NoAnswer(RunError):
+    """Nobody answered a query in time; asking again is the caller's choice."""
+
+
+class Refused(RunError):
+    """The peer found our message bad, and said why."""
+
+
+def new_incarnation() -> int:
+    """A random id that a process draws at its start: 63 bits."""
+    return secrets.randbits(63)
+
+
+def open_session(
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    zenoh_config: Path | None = None,
+    shared_memory: bool = False,
+) -> zenoh.Session:
+    """Open a peer session with explicit endpoints, no scouting and quick reconnection.
+
+    Raises:
+        UsageError: a Zenoh config file or an endpoint that can't be read.
+        RunError: an endpoint that can't be listened on, for example because its port is in use.
+    """
+    zenoh.init_log_from_env_or("off")
+    try:
+        config = zenoh.Config.from_file(str(zenoh_config)) if zenoh_config else zenoh.Config()
+        for key, value in _QUIET.items():
+            config.insert_json5(key, json.dumps(value))
+        config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
+        config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+        config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+    except zenoh.ZError as error:
+        raise UsageError(f"zenoh configuration: {_first_line(error)}") from error
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise RunError(f"can't listen on {', '.join(listen) or 'any endpoint'}: {_first_line(error)}") from error
+
+
+def locators(session: zenoh.Session) -> list[str]:
+    """The endpoints that this session really listens on (a port of 0 resolved)."""
+    for reply in session.get(f"@/{session.zid()}/peer", timeout=2.0):
+        if reply.ok is not None:
+            return [str(locator) for locator in json.loads(reply.ok.payload.to_string())["locators"]]
+    return []
+
+
+class Pending:
+    """A query under way."""
+
+    def __init__(self, handler: Any) -> None:  # noqa: ANN401 (zenoh's handler of replies)
+        self._handler = handler
+
+    def ready(self) -> Message | None:
+        """The answer if it is there, else None; raises as `wait`."""
+        try:
+            reply = self._handler.try_recv()
+        except zenoh.ZError as error:
+            raise NoAnswer("no answer") from error
+        return None if reply is None else _answer(reply)
+
+    def wait(self) -> Message:
+        """Wait for the answer.
+
+        Raises:
+            NoAnswer: nobody serves this key, or the time-out passed.
+            Refused: the peer found the message bad.
+        """
+        try:
+            return _answer(self._handler.recv())
+        except zenoh.ZError as error:
+            raise NoAnswer("no answer") from error
+
+
+class Node:
+    """One process's place in a run.
+
+    Args:
+        run: name of the run, the prefix of every key.
+        role: "learner", "replay", "actor" or "watch".
+        incarnation: the random id drawn at start.
+    """
+
+    def __init__(self, session: zenoh.Session, run: str, role: str, incarnation: int) -> None:
+        self.session = session
+        self.run = run
+        self.bad_messages = 0
+        self._name = f"{role}/{incarnation:x}"
+        self._threads: list[threading.Thread] = []
+        self._closing = False
+        self._timers: list[threading.Timer] = []
+        self._status = session.declare_publisher(self.key("metrics", self._name))
+        self._token = session.liveliness().declare_token(self.key("alive", self._name))
+
+    def key(self, *parts: str) -> str:
+        """A key of this run."""
+        return "/".join(("coop", self.run, *parts))
+
+    def begin(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Pending:
+        """Send a query and return at once."""
+        handler = self.session.get(
+            key,
+            handler=zenoh.handlers.FifoChannel(2),
+            payload=payload,
+            timeout=timeout,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        return Pending(handler)
+
+    def ask(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Message:
+        """Send a query and wait for its answer; raises as `Pending.wait`."""
+        return self.begin(key, payload, timeout).wait()
+
+    def serve(self, key: str, answer: Callable[[Message], bytearray], depth: int = 64) -> None:
+        """Answer the queries on `key`, one after the other, in a thread of its own, until the session closes.
+
+        A message that does not decode, names another run, or that `answer` refuses with BadMessage gets an error
+        reply, is counted, and changes nothing.
+        """
+        queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(depth), complete=True)
+        thread = threading.Thread(target=self._serve, args=(queryable, key, answer), name=f"serve {key}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _serve(self, queryable: Any, key: str, answer: Callable[[Message], bytearray]) -> None:  # noqa: ANN401
+        while not self._closing:
+            try:
+                query = queryable.recv()
+            except zenoh.ZError:
+                return  # the session was closed
+            with query:
+                try:
+                    reply = answer(self.read(query.payload))
+                except BadMessage as error:
+                    self.bad_messages += 1
+                    with contextlib.suppress(zenoh.ZError):
+                        query.reply_err(messages.encode_error(self.run, error))
+                    continue
+                with contextlib.suppress(zenoh.ZError):  # the asker may be gone, and will ask again if it is not
+                    query.reply(key, reply, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def read(self, payload: zenoh.ZBytes | None) -> Message:
+        """Decode a payload of this run; raises BadMessage."""
+        message = wire.decode(b"" if payload is None else payload.to_bytes())
+        if message.run != self.run:
+            raise BadMessage("run", f"{message.run!r}; this is run {self.run!r}")
+        return message
+
+    def publish(self, key: str, payload: bytearray) -> None:
+        """Broadcast a value of which only the latest matters; never blocks."""
+        self.session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
+
+    def announce(self, key: str, payload: bytearray) -> None:
+        """Broadcast a value that should reach everybody who listens; may block for a moment."""
+        self.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def publish_status(self, status: dict[str, Any]) -> None:
+        """Tell displays what this process does."""
+        self._status.put(wire.encode("status", self.run, status))
+
+    def latest(self, key: str) -> Latest:
+        """Follow a key of which only the latest value matters."""
+        return Latest(self, self.session.declare_subscriber(key, zenoh.handlers.RingChannel(1)))
+
+    def alive(self) -> dict[str, int]:
+        """How many processes of each role are connected to this one."""
+        counts: dict[str, int] = {}
+        for reply in self.session.liveliness().get(self.key("alive", "**"), timeout=1.0):
+            if reply.ok is not None:
+                role = str(reply.ok.key_expr).split("/")[-2]
+                counts[role] = counts.get(role, 0) + 1
+        return counts
+
+    def follow_stop(self, stop: Stop, patience: float) -> None:
+        """Stop when the learner says so, or when it has been gone for `patience` seconds."""
+        timers = self._timers
+
+        def stopped(sample: zenoh.Sample) -> None:
+            with contextlib.suppress(BadMessage):
+                stop.set(str(self.read(sample.payload).fields.get("reason", "stopped")))
+
+        def learner(sample: zenoh.Sample) -> None:
+            while timers:
+                timers.pop().cancel()
+            if sample.kind == zenoh.SampleKind.DELETE and not self._closing:
+                text = f"the learner of run {self.run!r} has been gone for {patience:g} s"
+                timers.append(threading.Timer(patience, stop.set, (text, True)))
+                timers[0].daemon = True
+                timers[0].start()
+
+        self.session.declare_subscriber(self.key("stop"), stopped)
+        self.session.liveliness().declare_subscriber(self.key("alive", "learner", "*"), learner, history=True)
+
+    def close(self) -> None:
+        """Close the session and wait for the serving threads."""
+        self._closing = True
+        self.session.close()
+        for timer in self._timers:
+            timer.cancel()
+            timer.join()
+        for thread in self._threads:
+            thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Latest:
+    """The newest value of a broadcast key."""
+
+    def __init__(self, node: Node, subscriber: Any) -> None:  # noqa: ANN401 (zenoh's subscriber)
+        self._node = node
+        self._subscriber = subscriber
+
+    def take(self) -> Message | None:
+        """The newest value that has not been taken yet; None if there is none or it is not a valid message."""
+        sample = self._subscriber.try_recv()
+        if sample is None:
+            return None
+        try:
+            return self._node.read(sample.payload)
+        except BadMessage:
+            self._node.bad_messages += 1
+            return None
+
+
+def _answer(reply: zenoh.Reply) -> Message:
+    if reply.ok is not None:
+        return wire.decode(reply.ok.payload.to_bytes())
+    error = reply.err
+    assert error is not None
+    raw = error.payload.to_bytes()
+    try:
+        problem = messages.decode_error(wire.decode(raw))
+    except BadMessage:
+        raise NoAnswer(raw.decode(errors="replace") or "no answer") from None
+    raise Refused(problem)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0].split(" at ")[0]

@@ -1,0 +1,132 @@
+"""The wire format: `[u32 magic][u32 header length][msgpack header][raw little-endian arrays, 64-byte aligned]`.
+
+Decoding views the arrays in place and allocates nothing that the sender names: every length is checked against the
+bytes that arrived. What the fields of each kind of message mean is `common.messages`' concern.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from common.errors import BadMessage
+from common.types import Array
+
+PROTOCOL = 1
+MAGIC = 0x434F4F50  # "COOP"
+ALIGNMENT = 64
+MAX_HEADER = 1 << 20
+MAX_PAYLOAD = 1 << 30
+MAX_ARRAYS = 64
+MAX_DIMENSIONS = 8
+DTYPES = frozenset({"uint8", "bool", "int32", "int64", "uint64", "float32", "float64"})
+
+_PREFIX = struct.Struct("<II")
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One decoded message; `arrays` are read-only views of the received bytes."""
+
+    kind: str
+    run: str
+    fields: Mapping[str, Any]
+    arrays: Mapping[str, Array]
+
+
+def encode(kind: str, run: str, fields: Mapping[str, Any], arrays: Mapping[str, Array] | None = None) -> bytearray:
+    """Build one message; each array is copied once, into its place."""
+    arrays = arrays or {}
+    table: list[tuple[str, str, tuple[int, ...], int]] = []
+    offset = 0
+    for name, array in arrays.items():
+        offset = _aligned(offset)
+        table.append((name, array.dtype.name, array.shape, offset))
+        offset += array.nbytes
+    header = msgpack.packb(
+        {"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": table}, use_bin_type=True
+    )
+    start = _aligned(_PREFIX.size + len(header))
+    payload = bytearray(start + offset)
+    _PREFIX.pack_into(payload, 0, MAGIC, len(header))
+    payload[_PREFIX.size : _PREFIX.size + len(header)] = header
+    for (_, dtype, shape, at), array in zip(table, arrays.values(), strict=True):
+        if array.nbytes:
+            place = np.frombuffer(payload, dtype=np.dtype(dtype).newbyteorder("<"), count=array.size, offset=start + at)
+            np.copyto(place.reshape(shape), array)
+    return payload
+
+
+def decode(payload: bytes) -> Message:
+    """View a message.
+
+    Raises:
+        BadMessage: anything that is not a whole, well-formed message of this protocol; names the field.
+    """
+    header, start = _header(payload)
+    arrays: dict[str, Array] = {}
+    for entry in header["arrays"]:
+        name, array = _view(payload, start, entry)
+        if name in arrays:
+            raise BadMessage(f"arrays.{name}", "appears twice")
+        arrays[name] = array
+    return Message(header["kind"], header["run"], header["fields"], arrays)
+
+
+def _aligned(offset: int) -> int:
+    return -(-offset // ALIGNMENT) * ALIGNMENT
+
+
+def _header(payload: bytes) -> tuple[dict[str, Any], int]:
+    if not _PREFIX.size <= len(payload) <= MAX_PAYLOAD:
+        raise BadMessage("payload", f"{len(payload)} bytes; allowed: {_PREFIX.size} to {MAX_PAYLOAD}")
+    magic, length = _PREFIX.unpack_from(payload)
+    if magic != MAGIC:
+        raise BadMessage("magic", f"{magic:#x} instead of {MAGIC:#x}")
+    if length > min(MAX_HEADER, len(payload) - _PREFIX.size):
+        raise BadMessage("header length", f"{length} bytes in a payload of {len(payload)}; at most {MAX_HEADER}")
+    try:
+        header = msgpack.unpackb(payload[_PREFIX.size : _PREFIX.size + length], raw=False, strict_map_key=True)
+    except (ValueError, msgpack.UnpackException, RecursionError) as error:
+        raise BadMessage("header", f"not msgpack ({type(error).__name__})") from error
+    if not isinstance(header, dict) or header.keys() != {"protocol", "kind", "run", "fields", "arrays"}:
+        raise BadMessage("header", "must hold exactly protocol, kind, run, fields, arrays")
+    if header["protocol"] != PROTOCOL:
+        raise BadMessage("protocol", f"version {header['protocol']!r}; this process speaks {PROTOCOL}")
+    for name, kind in (("kind", str), ("run", str), ("fields", dict), ("arrays", list)):
+        if not isinstance(header[name], kind):
+            raise BadMessage(name, f"must be a {kind.__name__}")
+    if len(header["arrays"]) > MAX_ARRAYS:
+        raise BadMessage("arrays", f"{len(header['arrays'])} of them; at most {MAX_ARRAYS}")
+    return header, _aligned(_PREFIX.size + length)
+
+
+def _view(payload: bytes, start: int, entry: Any) -> tuple[str, Array]:  # noqa: ANN401 (whatever the peer sent)
+    if not isinstance(entry, list) or len(entry) != 4:
+        raise BadMessage("arrays", "each entry is [name, dtype, shape, offset]")
+    name, dtype, shape, offset = entry
+    if not isinstance(name, str) or not isinstance(dtype, str) or dtype not in DTYPES:
+        raise BadMessage("arrays", f"dtype {dtype!r}; allowed: {', '.join(sorted(DTYPES))}")
+    if not isinstance(shape, list) or len(shape) > MAX_DIMENSIONS or not all(map(_is_length, shape)):
+        raise BadMessage(f"arrays.{name}", f"shape {shape!r}")
+    size = math.prod(shape)
+    if not _is_length(offset) or offset % ALIGNMENT:
+        raise BadMessage(f"arrays.{name}", f"offset {offset!r}; a multiple of {ALIGNMENT}")
+    kind = np.dtype(dtype)
+    if size and start + offset + size * kind.itemsize > len(payload):
+        raise BadMessage(
+            f"arrays.{name}", f"{dtype}{shape} at {offset} reaches beyond the payload's {len(payload)} bytes"
+        )
+    if not size:
+        return name, np.empty(shape, kind)
+    return name, np.frombuffer(payload, kind.newbyteorder("<"), size, start + offset).reshape(shape)
+
+
+def _is_length(value: Any) -> bool:  # noqa: ANN401 (whatever the peer sent)
+    return type(value) is int and 0 <= value <= MAX_PAYLOAD

@@ -1,0 +1,205 @@
+"""Algorithm 1's learner: two networks, one of them acting and trained, and the swap of their roles.
+
+The four methods differ by config only:
+
+    method   second network   target             feedback
+    dqn      copy of first    copied every C     none
+    edql     copy of first    copied every C     transform | weight-gradient | random
+    g-coop   independent      the other network  none
+    coop     independent      the other network  transform | weight-gradient | random
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from common import schedules
+from common.config import RunConfig
+from common.errors import UsageError
+from common.networks import FlatNetwork, build_network, preprocess
+from common.types import Array, Batch, EnvSpec
+from learner.edl import FeedbackRule
+from learner.optimizers import make_optimizer
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateResult:
+    """What one update measured.
+
+    td_errors: float32 [batch], e of the taken actions before clipping and weighting.
+    s: the exploration rate used. swapped: the roles changed after this update.
+    """
+
+    td_errors: Tensor
+    s: float
+    swapped: bool
+
+
+class Agent:
+    """Both networks with their optimizers, the acting role and the update.
+
+    Args:
+        config: the run; `spec`: its environment.
+
+    Attributes:
+        acting: 0 or 1, index of the network that acts and is trained.
+        updates: updates done.
+        networks: the two networks. versions: updates done when each was changed last.
+    """
+
+    def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
+        """Raises UsageError for a device that is not there or weight decays that do not fit the layers."""
+        settings = config.learner
+        self.config = config
+        self.spec = spec
+        self.device = _device(settings.device)
+        self.networks = [make_network(config, spec, number).to(self.device) for number in (0, 1)]
+        self.acting = 0
+        self.updates = 0
+        self.versions = [0, 0]
+        trained = self.networks if config.two_networks else self.networks[:1]
+        self.optimizers = [make_optimizer(settings, network.flat) for network in trained]
+        self._rules = [FeedbackRule(network.module, config.feedback, config.seed) for network in self.networks]
+        self._noise = np.random.default_rng([config.seed, 2])
+        self._decay = _decay_vector(settings.weight_decay, self.networks[0])
+
+    def update(self, batch: Batch) -> UpdateResult:
+        """Train the acting network on one batch, towards targets of the other one; then swap if it is time.
+
+        e[a] = y[a] - (r + gamma (1 - terminated) Q_target(x', u*)), u* the target's best action, or the acting
+        network's with `double`.
+        """
+        settings, acting = self.config.learner, self.acting
+        network, rule = self.networks[acting], self._rules[acting]
+        s = self._draw_s()
+        with torch.no_grad():
+            obs, next_obs, actions, targets, weights = self._tensors(batch)
+            values = self._next_values(next_obs)
+            targets.addcmul_(values, self._discounts(batch))
+            tape = rule.forward(obs)
+            errors = tape.output.gather(1, actions).squeeze(1).sub_(targets)
+            scaled = errors.clamp(-1.0, 1.0) if settings.loss == "huber" else errors
+            output_error = torch.zeros_like(tape.output)
+            output_error.scatter_(1, actions, (scaled * weights).unsqueeze(1))
+            rule.backward(tape, output_error, s, network.gradients)
+            if self._decay is not None:
+                network.gradient.addcmul_(self._decay, network.flat)
+        self._step(acting)
+        return UpdateResult(errors, s, self._count())
+
+    def swap(self) -> None:
+        """Change the acting role; for the one-network methods, copy the network to its target."""
+        if self.config.two_networks:
+            self.acting = 1 - self.acting
+        else:
+            self.networks[1].load(self.networks[0].flat.detach())
+            self.versions[1] = self.updates
+
+    def exploration_rate(self) -> float:
+        """The rate that s is now drawn from; 0 for the gradient methods."""
+        return 0.0 if self.config.feedback == "none" else schedules.exploration_rate(self.config.edl, self.updates)
+
+    def q_values(self, obs: Array) -> tuple[Tensor, Tensor]:
+        """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
+        with torch.no_grad():
+            x = preprocess(torch.as_tensor(obs, device=self.device), self.spec)
+            return self.networks[0](x), self.networks[1](x)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `load_state` needs; loads with weights_only."""
+        generator = self._noise.bit_generator.state
+        return {
+            "networks": [network.flat.detach().cpu().clone() for network in self.networks],
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+            "acting": self.acting,
+            "updates": self.updates,
+            "versions": list(self.versions),
+            "noise": {**generator, "state": {name: str(value) for name, value in generator["state"].items()}},
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue where `state` was taken."""
+        for network, flat in zip(self.networks, state["networks"], strict=True):
+            network.load(flat)
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(saved)
+        self.acting, self.updates, self.versions = state["acting"], state["updates"], list(state["versions"])
+        noise = state["noise"]
+        self._noise.bit_generator.state = {
+            **noise,
+            "state": {name: int(value) for name, value in noise["state"].items()},
+        }
+
+    def _draw_s(self) -> float:
+        s = self.exploration_rate()
+        return s * float(self._noise.standard_normal()) if self.config.edl.noise == "normal" and s else s
+
+    def _tensors(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Inputs of the networks, actions int64 [batch, 1], a copy of the rewards, weights with the batch mean."""
+        frames = torch.as_tensor(batch.frames, device=self.device)
+        index = torch.as_tensor(np.stack((batch.obs_index, batch.next_index)), device=self.device)
+        both = frames[index.long()].view(2, len(batch), *self.spec.obs_shape)
+        actions = torch.as_tensor(batch.actions, device=self.device).long().unsqueeze(1)
+        rewards = torch.tensor(batch.rewards, device=self.device)
+        weights = torch.tensor(batch.weights, device=self.device).div_(len(batch))
+        return preprocess(both[0], self.spec), preprocess(both[1], self.spec), actions, rewards, weights
+
+    def _discounts(self, batch: Batch) -> Tensor:
+        return torch.as_tensor(
+            self.config.learner.gamma * (1.0 - batch.terminated.astype(np.float32)), device=self.device
+        ).float()
+
+    def _next_values(self, next_obs: Tensor) -> Tensor:
+        values = self.networks[1 - self.acting](next_obs)
+        if not self.config.learner.double:
+            return values.amax(1)
+        return values.gather(1, self.networks[self.acting](next_obs).argmax(1, keepdim=True)).squeeze(1)
+
+    def _step(self, acting: int) -> None:
+        optimizer = self.optimizers[acting]
+        progress = self.updates / max(1, self.config.planned_updates)
+        for group in optimizer.param_groups:
+            group["lr"] = schedules.learning_rate(self.config.learner, progress)
+        optimizer.step()
+
+    def _count(self) -> bool:
+        self.updates += 1
+        self.versions[self.acting] = self.updates
+        settings = self.config.learner
+        due = settings.swap_by == "updates" and self.updates % settings.swap_every == 0
+        if due:
+            self.swap()
+        return due
+
+
+def make_network(config: RunConfig, spec: EnvSpec, number: int) -> FlatNetwork:
+    """Network 0 or 1 of a run as it starts; the same one for both where the method has one and a copy."""
+    seed = int(np.random.SeedSequence([config.seed, number if config.two_networks else 0]).generate_state(1)[0])
+    return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed))
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(f"learner.device = {name!r}: {str(error).splitlines()[0]}") from error
+    return device
+
+
+def _decay_vector(decay: tuple[float, ...], network: FlatNetwork) -> Tensor | None:
+    """lambda(i) of every parameter, float32 [P]; biases share their layer's."""
+    if not any(decay):
+        return None
+    layers = list(dict.fromkeys(name.rsplit(".", 1)[0] for name, _ in network.layout))
+    if len(decay) not in (1, len(layers)):
+        raise UsageError(f"learner.weight_decay = {decay}: give one value, or one for each of {len(layers)} layers")
+    by_layer = dict(zip(layers, decay * len(layers) if len(decay) == 1 else decay, strict=True))
+    return torch.cat(
+        [torch.full((int(np.prod(shape)),), by_layer[name.rsplit(".", 1)[0]]) for name, shape in network.layout]
+    ).to(network.flat.device)

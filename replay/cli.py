@@ -1,0 +1,51 @@
+"""`coop-replay`: the replay service of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from common import cli
+from common.errors import PeerLost
+from common.joining import join
+from common.lifecycle import Stop, run_main
+from common.messages import Join
+from common.options import RoleOptions
+from common.transport import Node, locators, new_incarnation, open_session
+from replay.core import ReplayCore
+from replay.service import ReplayService
+
+
+@dataclass(frozen=True)
+class ReplayOptions(RoleOptions):
+    """Flags of `coop-replay`."""
+
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
+    """Endpoints to listen on; port 0 takes a free one."""
+    run_dir: Path = Path("runs/replay")
+    """Where snapshots are written, under checkpoints/."""
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop-replay", _run)
+
+
+def _run() -> None:
+    options = cli.parse(
+        ReplayOptions, "coop-replay", "Serve the replay table of a run; the rest comes from its learner."
+    )
+    stop = Stop()
+    stop.on_signals()
+    incarnation = new_incarnation()
+    session = open_session(options.listen, options.connect, options.zenoh_config, options.shared_memory)
+    with Node(session, options.run, "replay", incarnation) as node:
+        node.follow_stop(stop, options.patience)
+        request = Join("replay", incarnation, locators(session))
+        joined = join(node, stop, request, options.connect, options.join_timeout)
+        if joined is not None:
+            service = ReplayService(node, ReplayCore(joined.config, joined.spec), joined.spec, options.run_dir)
+            service.start()
+            service.run(stop)
+    if stop.failed:
+        raise PeerLost(stop.reason)

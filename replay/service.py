@@ -1,0 +1,138 @@
+"""The replay service: Zenoh queries in front of a `ReplayCore`.
+
+Inserts, draws and questions come in on queues of their own, each with its thread; one lock guards the core. A request
+that the limiter does not admit waits for it, but never longer than `HOLD` seconds: then the reply says retry, and why.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from common import messages
+from common.clients import replay_key
+from common.lifecycle import Stop
+from common.messages import ReplayStats, SegmentReader
+from common.transport import Node
+from common.types import EnvSpec
+from common.wire import Message
+from replay.core import ReplayCore, Wait
+from replay.storage import save_snapshot
+
+HOLD = 1.0  # seconds
+STATUS_EVERY = 0.5  # seconds
+INSERT_QUEUE = 256
+
+T = TypeVar("T")
+
+
+class _Gate:
+    """Where requests of one sort wait for the limiter. The deadline runs from the moment the gate closed, so that
+    requests queued behind the first do not wait for one another.
+    """
+
+    def __init__(self) -> None:
+        self.closed_at: float | None = None
+
+
+class ReplayService:
+    """Serves one core on one node until the session closes.
+
+    Args:
+        snapshots: folder under which a snapshot's relative path is written.
+    """
+
+    def __init__(self, node: Node, core: ReplayCore, spec: EnvSpec, snapshots: Path) -> None:
+        self._node = node
+        self._core = core
+        self._snapshots = snapshots
+        self._read_segment = SegmentReader(spec)
+        self._changed = threading.Condition()
+        self._inserts = _Gate()
+        self._draws = _Gate()
+        self._closing = False
+
+    def start(self) -> None:
+        """Begin to answer."""
+        node = self._node
+        node.serve(replay_key(node, "insert"), self._insert, depth=INSERT_QUEUE)
+        node.serve(replay_key(node, "sample"), self._sample)
+        node.serve(replay_key(node, "stats"), self._stats)
+        node.serve(replay_key(node, "snapshot"), self._snapshot)
+
+    def run(self, stop: Stop) -> None:
+        """Tell displays what goes on, until the stop."""
+        while not stop.wait(STATUS_EVERY):
+            stats = self.stats()
+            self._node.publish_status(
+                {
+                    "size": stats.size,
+                    "inserted": stats.inserted,
+                    "drawn": stats.drawn,
+                    "inserts_wait_for": stats.inserts_wait_for,
+                    "samples_wait_for": stats.samples_wait_for,
+                    "bad_messages": stats.bad_messages,
+                }
+            )
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+
+    def stats(self) -> ReplayStats:
+        """The counters, taken at one moment."""
+        with self._changed:
+            core, table = self._core, self._core.table
+            return ReplayStats(
+                size=len(table),
+                inserted=table.inserted,
+                drawn=core.drawn,
+                evicted=table.evicted,
+                evicted_unsampled=table.evicted_unsampled,
+                duplicates=core.duplicates,
+                lost=core.lost,
+                episodes=core.episodes_booked,
+                bad_messages=self._node.bad_messages,
+                inserts_wait_for=core.inserts_wait_for,
+                samples_wait_for=core.samples_wait_for,
+            )
+
+    def _insert(self, message: Message) -> bytearray:
+        segment = self._read_segment(message)
+        outcome = self._admit(self._inserts, lambda: self._core.insert(segment))
+        if isinstance(outcome, Wait):
+            return messages.encode_retry(self._node.run, outcome.reason)
+        return messages.encode_ack(self._node.run, outcome)
+
+    def _sample(self, message: Message) -> bytearray:
+        request = messages.decode_sample(message)
+        outcome = self._admit(self._draws, lambda: self._core.draw(*request))
+        if isinstance(outcome, Wait):
+            return messages.encode_retry(self._node.run, outcome.reason)
+        return messages.encode_batch(self._node.run, *outcome)
+
+    def _admit(self, gate: _Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
+        """Try, and try again whenever the core has changed, until the gate's deadline."""
+        with self._changed:
+            while isinstance(outcome := attempt(), Wait):
+                now = time.monotonic()
+                gate.closed_at = gate.closed_at or now
+                left = gate.closed_at + HOLD - now
+                if left <= 0 or self._closing:
+                    return outcome
+                self._changed.wait(left)
+            gate.closed_at = None
+            self._changed.notify_all()
+            return outcome
+
+    def _stats(self, message: Message) -> bytearray:
+        messages.decode_question("stats", message)
+        return messages.encode_stats(self._node.run, self.stats())
+
+    def _snapshot(self, message: Message) -> bytearray:
+        folder = messages.decode_snapshot(message)
+        path = self._snapshots / folder / "replay"
+        save_snapshot(self._core, self._changed, path)
+        return messages.encode_ack(self._node.run, self._core.table.inserted)
