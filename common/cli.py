@@ -31,7 +31,9 @@ def parse(
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(kind, prog=program, description=description, default=default, args=args)
+            if default is None:
+                return tyro.cli(kind, prog=program, description=description, args=args)
+            return tyro.cli(kind, prog=program, description=description, args=args, default=default)
     except SystemExit as exit_:
         if exit_.code in (0, None):
             raise

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 
-from common import messages
+from common import experience, messages
 from common.errors import BadMessage
+from common.experience import BatchReader, Drawn
 from common.lifecycle import Stop
-from common.messages import BatchReader, Drawn
 from common.transport import NoAnswer, Node, Pending
 from common.types import Batch, EnvSpec, Segment
+from common.wire import Message
 
 REPLAY_SHARD = "0"
 
@@ -76,7 +77,7 @@ class InsertClient:
             if not self._settle(self._outstanding[0]):
                 return False
             self._outstanding.popleft()
-        payload = messages.encode_segment(self._node.run, segment)
+        payload = experience.encode_segment(self._node.run, segment)
         self._outstanding.append(_Sent(payload, segment.steps, self._node.begin(self._key, payload)))
         return True
 
@@ -117,7 +118,7 @@ class InsertClient:
                 return False
             sent.pending = self._node.begin(self._key, sent.payload)
 
-    def _accept(self, message: messages.Message, sent: _Sent) -> bool:
+    def _accept(self, message: Message, sent: _Sent) -> bool:
         if message.kind == "retry":
             self.waiting = messages.decode_retry(message)
             return False
@@ -172,10 +173,12 @@ class SampleClient:
         return None
 
     def _request(self, sequence: int) -> Pending:
-        request = messages.encode_sample(self._node.run, self._incarnation, sequence, self._batch_size, self._episodes)
+        request = experience.encode_sample(
+            self._node.run, self._incarnation, sequence, self._batch_size, self._episodes
+        )
         return self._node.begin(self._key, request)
 
-    def _accept(self, message: messages.Message, sequence: int) -> tuple[Batch, Drawn]:
+    def _accept(self, message: Message, sequence: int) -> tuple[Batch, Drawn]:
         batch, drawn = self._read(message)
         if drawn.sequence != sequence:
             raise BadMessage("fields.sequence", f"{drawn.sequence} instead of {sequence}")

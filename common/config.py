@@ -151,6 +151,11 @@ class RunConfig:
     actor: ActorSettings = field(default_factory=ActorSettings)
 
     @property
+    def planned_updates(self) -> int:
+        """Updates of a run that goes through all its steps: the ratio holds from the first `start` steps on."""
+        return round(self.replay.ratio * (self.total_steps - self.replay.start))
+
+    @property
     def two_networks(self) -> bool:
         """True for the cooperative methods, false where the second network is a copy of the first."""
         return self.method in ("g-coop", "coop")

@@ -1,4 +1,4 @@
-"""How a replay service or an actor becomes part of a run: it asks the learner, and learns everything from the answer."""
+"""How a replay service or an actor becomes part of a run: it asks the learner for everything."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every kind of message: its schema, how it is built and how it is read back.
+"""Messages that steer a run: their schemas, how they are built and how they are read back.
 
 join / joined        a role asks the learner for the run
 insert / ack         a segment for the table, and its receipt
@@ -13,23 +13,20 @@ error                the answer to a bad message: the field and the problem
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, dataclass
 from dataclasses import fields as dataclass_fields
 from typing import Any
-
-import numpy as np
 
 from common import wire
 from common.config import RunConfig, to_tables, validated
 from common.errors import BadMessage, UsageError
-from common.schema import Int, ListOf, Real, Row, Schema, Table, Text
-from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
+from common.schema import Int, ListOf, Row, Rule, Schema, Table, Text
+from common.types import Array, EnvSpec
 from common.wire import Message
 
-MAX_SEGMENT_STEPS = 4096
 ROLES = ("learner", "replay", "actor")
 
-_INCARNATION = Int(0, 2**63 - 1)
+INCARNATION = Int(0, 2**63 - 1)
 _ENDPOINTS = ListOf(Text(256), 16)
 
 
@@ -56,32 +53,6 @@ class Joined:
     layout: str
     index: int
     replay_endpoints: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeRecord:
-    """A finished episode as the replay service books it, in order of acceptance.
-
-    env_step: transitions accepted up to the episode's last step.
-    """
-
-    env_step: int
-    actor: int
-    stream: int
-    end: EpisodeEnd
-
-
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """What the table says beside a batch: its counters, and the episodes from number `first_episode` on."""
-
-    sequence: int
-    inserted: int
-    size: int
-    evicted: int
-    evicted_unsampled: int
-    first_episode: int
-    episodes: tuple[EpisodeRecord, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,22 +84,15 @@ class ReplayStats:
     samples_wait_for: str
 
 
-_JOIN = Schema("join", {"role": Text(16), "incarnation": _INCARNATION, "endpoints": _ENDPOINTS}, {})
+_JOIN = Schema("join", {"role": Text(16), "incarnation": INCARNATION, "endpoints": _ENDPOINTS}, {})
 _JOINED = Schema(
     "joined",
     {"config": Table(), "spec": Table(), "layout": Text(64), "index": Int(), "replay_endpoints": _ENDPOINTS},
     {},
 )
-_EPISODE_END = Row((Int(0, MAX_SEGMENT_STEPS - 1), Real(), Int(1), Real(), Real(), Real(), Int(-1)))
-_EPISODE_RECORD = Row((Int(), Int(), Int(), _EPISODE_END))
 _ACK = Schema("ack", {"inserted": Int()}, {})
 _RETRY = Schema("retry", {"reason": Text()}, {})
 _ERROR = Schema("error", {"field": Text(), "problem": Text(4096)}, {})
-_SAMPLE = Schema(
-    "sample",
-    {"incarnation": _INCARNATION, "sequence": Int(), "batch_size": Int(1, 65_536), "episodes_from": Int()},
-    {},
-)
 _ROLE = Schema("role", {"acting": Int(1, 2), "versions": Row((Int(), Int())), "updates": Int()}, {})
 _STATS = Schema(
     "stats",
@@ -137,23 +101,6 @@ _STATS = Schema(
 )
 _SNAPSHOT = Schema("snapshot", {"folder": Text(256)}, {})
 _FOLDER = re.compile(r"checkpoints/[0-9]{1,12}")
-_DRAWN_FIELDS = {
-    "sequence": Int(),
-    "inserted": Int(),
-    "size": Int(),
-    "evicted": Int(),
-    "evicted_unsampled": Int(),
-    "first_episode": Int(),
-    "episodes": ListOf(_EPISODE_RECORD, 100_000),
-}
-_SEGMENT_FIELDS = {
-    "incarnation": _INCARNATION,
-    "stream": Int(0, 65_535),
-    "sequence": Int(),
-    "carried": Int(0, 1024),
-    "acked": Int(),
-    "episodes": ListOf(_EPISODE_END, MAX_SEGMENT_STEPS),
-}
 
 
 def encode_join(run: str, join: Join) -> bytearray:
@@ -195,7 +142,12 @@ def decode_joined(message: Message) -> Joined:
 
 def _spec(table: dict[str, Any]) -> EnvSpec:
     shape = table.get("frame_shape")
-    rules = {"env_id": Text(256), "frame_dtype": Text(16), "stack": Int(1, 64), "num_actions": Int(1, 100_000)}
+    rules: dict[str, Rule] = {
+        "env_id": Text(256),
+        "frame_dtype": Text(16),
+        "stack": Int(1, 64),
+        "num_actions": Int(1, 100_000),
+    }
     if table.keys() != {*rules, "frame_shape"} or ListOf(Int(1, 65_536), 4).problem(shape):
         raise BadMessage("fields.spec", "not an environment specification")
     for name, rule in rules.items():
@@ -204,72 +156,6 @@ def _spec(table: dict[str, Any]) -> EnvSpec:
     if table["frame_dtype"] not in ("uint8", "float32"):
         raise BadMessage("fields.spec.frame_dtype", f"{table['frame_dtype']!r}; uint8 or float32")
     return EnvSpec(**{**table, "frame_shape": tuple(table["frame_shape"])})
-
-
-def encode_segment(run: str, segment: Segment) -> bytearray:
-    """Build an insert request."""
-    fields = {
-        "incarnation": segment.incarnation,
-        "stream": segment.stream,
-        "sequence": segment.sequence,
-        "carried": segment.carried,
-        "acked": segment.acked,
-        "episodes": [astuple(end) for end in segment.episodes],
-    }
-    arrays = {name: getattr(segment, name) for name in _SEGMENT_ARRAYS}
-    return wire.encode("insert", run, fields, arrays)
-
-
-_SEGMENT_ARRAYS = ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version")
-
-
-class SegmentReader:
-    """Reads insert requests for one environment."""
-
-    def __init__(self, spec: EnvSpec) -> None:
-        self._spec = spec
-        self._schema = Schema(
-            "insert",
-            _SEGMENT_FIELDS,
-            {
-                "frames": (spec.frame_dtype, ("frames", *spec.frame_shape)),
-                "obs_index": ("int32", ("steps", spec.stack)),
-                "next_index": ("int32", ("steps", spec.stack)),
-                "actions": ("int32", ("steps",)),
-                "rewards": ("float32", ("steps",)),
-                "terminated": ("bool", ("steps",)),
-                "param_version": ("int64", ("steps",)),
-            },
-        )
-
-    def __call__(self, message: Message) -> Segment:
-        """Read one; raises BadMessage for anything the table could not take."""
-        lengths = self._schema.check(message)
-        fields, arrays = message.fields, message.arrays
-        steps, frames = lengths["steps"], lengths["frames"]
-        if not 1 <= steps <= MAX_SEGMENT_STEPS:
-            raise BadMessage("arrays.actions", f"{steps} steps; allowed: 1 to {MAX_SEGMENT_STEPS}")
-        for name in ("obs_index", "next_index"):
-            _within(f"arrays.{name}", arrays[name], 0, frames - 1)
-        _within("arrays.actions", arrays["actions"], 0, self._spec.num_actions - 1)
-        _within("arrays.param_version", arrays["param_version"], 0, 2**62)
-        if not np.isfinite(arrays["rewards"]).all():
-            raise BadMessage("arrays.rewards", "not finite")
-        if arrays["frames"].dtype == np.float32 and not np.isfinite(arrays["frames"]).all():
-            raise BadMessage("arrays.frames", "not finite")
-        if arrays["terminated"].view(np.uint8).max() > 1:
-            raise BadMessage("arrays.terminated", "not boolean")
-        if fields["carried"] > frames:
-            raise BadMessage("fields.carried", f"{fields['carried']} of {frames} frames")
-        episodes = tuple(EpisodeEnd(*row) for row in fields["episodes"])
-        if any(end.step_in_segment >= steps for end in episodes):
-            raise BadMessage("fields.episodes", "an episode ends beyond the segment")
-        return Segment(**{**fields, "episodes": episodes}, **arrays)
-
-
-def _within(field: str, array: Array, low: int, high: int) -> None:
-    if array.min() < low or array.max() > high:
-        raise BadMessage(field, f"values from {array.min()} to {array.max()}; allowed: {low} to {high}")
 
 
 def encode_ack(run: str, inserted: int) -> bytearray:
@@ -303,71 +189,6 @@ def decode_error(message: Message) -> str:
     """Read what a peer found wrong; raises BadMessage."""
     _ERROR.check(message)
     return str(message.fields["problem"])
-
-
-def encode_sample(run: str, incarnation: int, sequence: int, batch_size: int, episodes_from: int) -> bytearray:
-    """Build a draw request; a repeated (incarnation, sequence) gets the same batch again."""
-    fields = {
-        "incarnation": incarnation,
-        "sequence": sequence,
-        "batch_size": batch_size,
-        "episodes_from": episodes_from,
-    }
-    return wire.encode("sample", run, fields)
-
-
-def decode_sample(message: Message) -> tuple[int, int, int, int]:
-    """Read (incarnation, sequence, batch_size, episodes_from); raises BadMessage."""
-    _SAMPLE.check(message)
-    fields = message.fields
-    return fields["incarnation"], fields["sequence"], fields["batch_size"], fields["episodes_from"]
-
-
-_BATCH_ARRAYS = (*_SEGMENT_ARRAYS, "weights", "ids", "age", "reuse")
-
-
-def encode_batch(run: str, batch: Batch, drawn: Drawn) -> bytearray:
-    """Build the answer to a draw."""
-    fields = {name: getattr(drawn, name) for name in _DRAWN_FIELDS}
-    fields["episodes"] = [astuple(record) for record in drawn.episodes]
-    return wire.encode("batch", run, fields, {name: getattr(batch, name) for name in _BATCH_ARRAYS})
-
-
-class BatchReader:
-    """Reads batches of one environment."""
-
-    def __init__(self, spec: EnvSpec) -> None:
-        row = ("batch",)
-        self._schema = Schema(
-            "batch",
-            _DRAWN_FIELDS,
-            {
-                "frames": (spec.frame_dtype, ("frames", *spec.frame_shape)),
-                "obs_index": ("int32", ("batch", spec.stack)),
-                "next_index": ("int32", ("batch", spec.stack)),
-                "actions": ("int32", row),
-                "rewards": ("float32", row),
-                "terminated": ("bool", row),
-                "param_version": ("int64", row),
-                "weights": ("float32", row),
-                "ids": ("int64", row),
-                "age": ("int64", row),
-                "reuse": ("int32", row),
-            },
-        )
-        self._spec = spec
-
-    def __call__(self, message: Message) -> tuple[Batch, Drawn]:
-        """Read one; raises BadMessage."""
-        lengths = self._schema.check(message)
-        for name in ("obs_index", "next_index"):
-            _within(f"arrays.{name}", message.arrays[name], 0, lengths["frames"] - 1)
-        _within("arrays.actions", message.arrays["actions"], 0, self._spec.num_actions - 1)
-        fields = dict(message.fields)
-        fields["episodes"] = tuple(
-            EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in fields["episodes"]
-        )
-        return Batch(**message.arrays), Drawn(**fields)
 
 
 def encode_weights(run: str, network: int, version: int, flat: Array) -> bytearray:

@@ -90,6 +90,7 @@ class FlatNetwork:
     flat: float32 nn.Parameter [P], what an optimizer holds, what is published and stored; `flat.grad` exists from
         the start and is never replaced (zero it in place: `zero_grad(set_to_none=False)`).
     module: the network; its named parameters view `flat`, their `.grad` views `flat.grad`.
+    gradient: `flat.grad`.
     gradients: name -> view of `flat.grad`, in the shape of the parameter.
     layout: (name, shape) of each parameter in the order of the buffer.
     """
@@ -99,12 +100,12 @@ class FlatNetwork:
         self.module = module
         self.layout: list[tuple[str, tuple[int, ...]]] = [(name, tuple(p.shape)) for name, p in parameters]
         self.flat = nn.Parameter(torch.cat([p.detach().reshape(-1) for _, p in parameters]))
-        self.flat.grad = torch.zeros_like(self.flat)
+        self.gradient = self.flat.grad = torch.zeros_like(self.flat)
         self.gradients: dict[str, Tensor] = {}
         start = 0
         for name, p in parameters:
             span = slice(start, start + p.numel())
-            self.gradients[name] = self.flat.grad[span].view(p.shape)
+            self.gradients[name] = self.gradient[span].view(p.shape)
             p.data = self.flat.data[span].view(p.shape)
             p.grad = self.gradients[name]
             start = span.stop

@@ -1,9 +1,16 @@
-"""The flags that the roles share."""
+"""The flags that the commands share."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+import time
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TypeVar
+
+from common import cli
+from common.config import RunConfig, validated
+from common.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -22,3 +29,50 @@ class RoleOptions:
     """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
     shared_memory: bool = False
     """Carry messages between processes of one machine in shared memory."""
+
+
+@dataclass(frozen=True)
+class RunOptions(RunConfig):
+    """The fields of a run's config, and where they come from and go to."""
+
+    preset: str | None = None
+    """Settings that come with the package (cartpole if neither this nor --config is given)."""
+    config: Path | None = None
+    """A TOML file with the fields below, for example the config.toml of another run."""
+    run_dir: Path | None = None
+    """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
+    zenoh_config: Path | None = None
+    """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
+    shared_memory: bool = False
+    """Carry messages between processes of one machine in shared memory."""
+
+    def run_config(self) -> RunConfig:
+        """The checked config of the run; raises UsageError."""
+        return validated(RunConfig(**{field.name: getattr(self, field.name) for field in fields(RunConfig)}))
+
+    def directory(self) -> Path:
+        """The run directory.
+
+        Raises:
+            UsageError: there is a run in it already.
+        """
+        game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
+        named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+        path = self.run_dir or Path("runs") / named
+        if (path / "episodes.csv").exists():
+            raise UsageError(f"--run-dir {path}: holds a run already; give another folder")
+        return path
+
+
+OptionsT = TypeVar("OptionsT", bound=RunOptions)
+
+
+def parse_run(kind: type[OptionsT], program: str, description: str) -> OptionsT:
+    """Parse flags over the config that `--preset` or `--config` names.
+
+    Raises:
+        UsageError: whatever is wrong with them, in one line.
+    """
+    base = cli.base_config()
+    default = kind(**{field.name: getattr(base, field.name) for field in fields(RunConfig)})
+    return cli.parse(kind, program, description, default)

@@ -28,7 +28,7 @@ _QUIET = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "adminspace/enabled": True,
-    "connect/timeout_ms": 0,
+    "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "listen/exit_on_failure": True,
@@ -237,7 +237,7 @@ class Node:
     def close(self) -> None:
         """Close the session and wait for the serving threads."""
         self._closing = True
-        self.session.close()
+        self.session.close()  # type: ignore[no-untyped-call]
         for timer in self._timers:
             timer.cancel()
             timer.join()

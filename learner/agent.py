@@ -58,7 +58,7 @@ class Agent:
         self.config = config
         self.spec = spec
         self.device = _device(settings.device)
-        self.networks = [make_network(config, spec, number).to(self.device) for number in (0, 1)]
+        self.networks = [make_network(config, spec, number, self.device) for number in (0, 1)]
         self.acting = 0
         self.updates = 0
         self.versions = [0, 0]
@@ -104,6 +104,12 @@ class Agent:
         """The rate that s is now drawn from; 0 for the gradient methods."""
         return 0.0 if self.config.feedback == "none" else schedules.exploration_rate(self.config.edl, self.updates)
 
+    def losses(self, errors: Tensor) -> Tensor:
+        """The cost of each TD error: 1/2 e^2, or Huber's."""
+        if self.config.learner.loss == "huber":
+            return torch.nn.functional.huber_loss(errors, torch.zeros_like(errors), reduction="none")
+        return 0.5 * errors.square()
+
     def q_values(self, obs: Array) -> tuple[Tensor, Tensor]:
         """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
         with torch.no_grad():
@@ -141,10 +147,10 @@ class Agent:
 
     def _tensors(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Inputs of the networks, actions int64 [batch, 1], a copy of the rewards, weights with the batch mean."""
-        frames = torch.as_tensor(batch.frames, device=self.device)
+        frames = torch.tensor(batch.frames, device=self.device)
         index = torch.as_tensor(np.stack((batch.obs_index, batch.next_index)), device=self.device)
         both = frames[index.long()].view(2, len(batch), *self.spec.obs_shape)
-        actions = torch.as_tensor(batch.actions, device=self.device).long().unsqueeze(1)
+        actions = torch.tensor(batch.actions, device=self.device).long().unsqueeze(1)
         rewards = torch.tensor(batch.rewards, device=self.device)
         weights = torch.tensor(batch.weights, device=self.device).div_(len(batch))
         return preprocess(both[0], self.spec), preprocess(both[1], self.spec), actions, rewards, weights
@@ -177,10 +183,10 @@ class Agent:
         return due
 
 
-def make_network(config: RunConfig, spec: EnvSpec, number: int) -> FlatNetwork:
+def make_network(config: RunConfig, spec: EnvSpec, number: int, device: torch.device) -> FlatNetwork:
     """Network 0 or 1 of a run as it starts; the same one for both where the method has one and a copy."""
     seed = int(np.random.SeedSequence([config.seed, number if config.two_networks else 0]).generate_state(1)[0])
-    return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed))
+    return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device))
 
 
 def _device(name: str) -> torch.device:

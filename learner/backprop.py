@@ -84,6 +84,7 @@ class Chain:
         """
         k = cotangent.shape[1]
         rows = cotangent.flatten(0, 1)
+        fresh = False  # whether rows is ours to overwrite
         first = self.parametrised[0]
         for index in range(len(self._steps) - 1, first - 1, -1):
             step, weight, h = self._steps[index], self._weights[index], tape.inputs[index]
@@ -92,12 +93,11 @@ class Chain:
                 if index == first:
                     return
                 weight = weight if dtype is None else weight.to(dtype)
-            if isinstance(step, nn.Linear):
-                rows = rows @ weight  # type: ignore[operator]
-            elif isinstance(step, nn.Conv2d):
-                rows = _transposed(step, rows, weight, h)  # type: ignore[arg-type]
+                rows = rows @ weight if isinstance(step, nn.Linear) else _transposed(step, rows, weight, h)
+                fresh = True
             elif isinstance(step, nn.ReLU):
-                rows = _masked(rows, tape.output_of(index), k)
+                rows = _masked(rows, tape.output_of(index), k, fresh)
+                fresh = True
             else:
                 rows = rows.view(-1, *h.shape[1:])
                 if rows.dim() == 4:
@@ -127,14 +127,17 @@ class Chain:
                 self.write(tape, index, delta.squeeze(1), out)
 
 
-def _masked(rows: Tensor, activation: Tensor, k: int) -> Tensor:
+def _masked(rows: Tensor, activation: Tensor, k: int, in_place: bool) -> Tensor:
     """Cotangents [b * k, *shape] of a ReLU's output, whose value is `activation` [batch, *shape], at its input."""
     if k == 1 and len(rows) == len(activation):
         masked: Tensor = torch.ops.aten.threshold_backward(rows, activation, 0)
         return masked
     mask = activation.sign().to(rows.dtype).unsqueeze(1)  # a ReLU's output is never negative
     per_sample = rows.view(-1, k, *rows.shape[1:])
-    told_apart: Tensor = per_sample * mask if len(mask) > len(per_sample) else per_sample.mul_(mask)
+    if in_place and len(per_sample) == len(mask):
+        per_sample.mul_(mask)
+        return rows
+    told_apart: Tensor = per_sample * mask
     return told_apart.flatten(0, 1)
 
 

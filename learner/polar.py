@@ -20,11 +20,11 @@ def inverse_root(gram: Tensor) -> tuple[Tensor, Tensor]:
     harm, rows that are nearly parallel do. Those sums are the variance inflation factors of statistics.
     """
     g = gram.double()
-    diagonal = g.diagonal(dim1=-2, dim2=-1)
     info = torch.finfo(gram.dtype)
+    diagonal = g.diagonal(dim1=-2, dim2=-1)
     safe = diagonal.amin(-1) > info.tiny / info.eps  # also False for nan
     if gram.shape[-1] == 2:
-        root, inflation = _inverse_root_of_pairs(g, diagonal)
+        root, inflation = _inverse_root_of_pairs(g)
     else:
         safe &= g.isfinite().all(-1).all(-1)
         values, vectors = torch.linalg.eigh(g.masked_fill(~safe[..., None, None], 0))
@@ -33,17 +33,22 @@ def inverse_root(gram: Tensor) -> tuple[Tensor, Tensor]:
         root = (vectors * values.rsqrt().unsqueeze(-2)) @ vectors.mT
         inflation = (diagonal * (vectors.square() / values.unsqueeze(-2)).sum(-1)).sum(-1)
     safe &= inflation <= _MOST_INFLATION[gram.dtype]
-    return root.masked_fill_(~safe[..., None, None], 0).to(gram.dtype), safe
+    if not safe.all():
+        root.masked_fill_(~safe[..., None, None], 0)
+    return root.to(gram.dtype), safe
 
 
-def _inverse_root_of_pairs(g: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor]:
+def _inverse_root_of_pairs(g: Tensor) -> tuple[Tensor, Tensor]:
     """The closed form for 2 x 2: G^(-1/2) = ((t + d) I - G) / (d sqrt(t + 2 d)) with d^2 = det G and t = tr G."""
-    trace, product = diagonal.sum(-1), diagonal.prod(-1)
-    determinant = product - g[..., 0, 1].square()
-    d = determinant.sqrt()
-    root = g.neg()
-    root.diagonal(dim1=-2, dim2=-1).add_((trace + d).unsqueeze(-1))
-    return root.div_((d * (trace + 2 * d).sqrt())[..., None, None]), 2 * product / determinant.clamp_min_(0)
+    a, c, _, b = g.flatten(-2).unbind(-1)
+    product = a * b
+    determinant = torch.addcmul(product, c, c, value=-1)
+    inflation = 2 * product / determinant.clamp_min(0)
+    d = determinant.sqrt_()
+    trace = a + b
+    scale = d * torch.add(trace, d, alpha=2).sqrt_()
+    root = torch.stack([b + d, -c, -c, a + d], -1).div_(scale.unsqueeze(-1))
+    return root.view(g.shape), inflation
 
 
 def polar_by_svd(matrices: Tensor) -> Tensor:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
+from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -10,80 +12,118 @@ from torch import Tensor
 from learner.backprop import Chain, Tape
 from learner.polar import inverse_root, polar_by_svd
 
+# Rows at least this long are combined by a batched product; below, its cost per matrix outweighs its speed.
+_LONG_ROW = 2048
+
 
 class Transforms:
     """T(i) = d y / d a(i) of every layer with parameters, for each sample of a batch, ready to be applied.
 
     All A cotangents of a sample go down the network as one batch. They start from the rows of an orthogonal matrix Q
-    and not from the identity, so what is held is Q T(i), which has T(i)'s singular values and V.
-    Actions' values have most of their gradient in common; Q parts that from the differences, and the
-    Gram matrices stay accurate in the network's own dtype.
+    and not from the identity, so what is held is Q T(i), which has T(i)'s singular values and V. Actions' values have
+    most of their gradient in common; Q parts that from the differences, and the Gram matrices stay accurate in the
+    network's own dtype. T of a Linear layer at the end is the identity and is not held.
     """
 
     def __init__(self, chain: Chain, tape: Tape, dtype: torch.dtype | None = None) -> None:
         """dtype: what to compute the T(i) in, the network's if None; their algebra is done in float32 or better."""
-        self._batch, actions = tape.output.shape
-        self._basis = _basis(chain.output_weight, tape.output)
+        output = tape.output
+        self._batch, self._actions = output.shape
+        self._linear_end = chain.output_weight is not None
+        self._basis = _basis(chain.output_weight, output)
         self._layers: list[tuple[int, torch.Size]] = []
-        self._ts: list[Tensor] = []
-        compute = None if dtype == tape.output.dtype else dtype
-        start = self._basis.unsqueeze(0).to(dtype, copy=True) if compute else self._basis.unsqueeze(0).clone()
-        for index, t in chain.walk(tape, start, compute):
+        ts: list[Tensor] = []
+        start = self._basis.unsqueeze(0)
+        for index, t in chain.walk(tape, start if dtype is None else start.to(dtype), dtype):
             self._layers.append((index, t.shape[2:]))
-            self._ts.append(_flat(t).to(tape.output.dtype))
-        grams = [(t @ t.mT).expand(self._batch, actions, actions) for t in self._ts]
-        self._roots, self._safe = inverse_root(torch.stack(grams))
+            if len(self._layers) > 1 or not self._linear_end:
+                ts.append(_flat(t).to(output.dtype))
+        # Neighbours of one shape are handled together: [layers, batch or 1, A, n], the last layer first.
+        self._groups = [torch.stack(list(group)) for _, group in groupby(ts, lambda t: t.shape)]
+        self._roots, self._safe = self._inverse_roots()
         self._all_safe = bool(self._safe.all())
+
+    def _inverse_roots(self) -> tuple[Tensor, Tensor]:
+        """G(i)^(-1/2) and where it can be trusted: [layers, batch, A, A], bool [layers, batch]."""
+        batch, actions = self._batch, self._actions
+        grams = [self._basis.new_empty(0, batch, actions, actions)]
+        for ts in self._groups:
+            rows = ts.flatten(0, 1)
+            grams.append(torch.bmm(rows, rows.mT).view(len(ts), -1, actions, actions).expand(-1, batch, -1, -1))
+        return inverse_root(torch.cat(grams))
 
     def pull(self, error: Tensor, plain: float, s: float) -> Iterator[tuple[int, Tensor]]:
         """(step, (plain T(i) + s U V^T)^T e) for each layer, the last first: error [batch, A] -> [batch, *shape]."""
+        layers = iter(self._layers)
+        if self._linear_end:
+            yield next(layers)[0], error * (plain + s)
         e = error @ self._basis.mT
-        weights = (self._roots @ e.unsqueeze(-1)).squeeze(-1).mul_(s)
+        weights = (self._roots * e.mul(s).unsqueeze(-2)).sum(-1)
         if plain:
             weights.add_(e, alpha=plain)
-        for i, (index, shape) in enumerate(self._layers):
-            t, w = self._ts[i], weights[i]
-            sigma = w @ t[0] if len(t) < self._batch else (w.unsqueeze(1) @ t).squeeze(1)
-            if not self._all_safe:
-                unsafe, factor = self._repair(i)
-                sigma[unsafe] += s * (e[unsafe].unsqueeze(1) @ factor).squeeze(1)
-            yield index, _shaped(sigma, shape)
+        first = 0
+        for ts in self._groups:
+            sigmas = _combine(weights[first : first + len(ts)], ts)
+            for sigma, t in zip(sigmas.unbind(0), ts, strict=True):
+                if not self._all_safe:
+                    unsafe, factor = self._repair(first, t)
+                    sigma[unsafe] += s * _combine(e[unsafe].unsqueeze(0), factor.unsqueeze(0))[0]
+                index, shape = next(layers)
+                yield index, _shaped(sigma, shape)
+                first += 1
 
     def matrices(self, s: float) -> list[tuple[int, Tensor]]:
         """(step, B(i) = T(i) + s U V^T), the last first: [batch, A, n_i], images in the order of channels first."""
         found = []
-        for i, (index, shape) in enumerate(self._layers):
-            t = self._ts[i].expand(self._batch, -1, -1)
+        layers = iter(self._layers)
+        if self._linear_end:
+            identity = torch.eye(self._actions, dtype=self._basis.dtype, device=self._basis.device)
+            found.append((next(layers)[0], identity.mul_(1 + s).expand(self._batch, -1, -1)))
+        for i, t in enumerate(t for ts in self._groups for t in ts):
             b = t + s * (self._roots[i] @ t)
             if not self._all_safe:
-                unsafe, factor = self._repair(i)
+                unsafe, factor = self._repair(i, t)
                 b[unsafe] += s * factor
             b = self._basis.mT @ b
+            index, shape = next(layers)
             found.append((index, _shaped(b.flatten(0, 1), shape).reshape(b.shape)))
         return found
 
-    def _repair(self, i: int) -> tuple[Tensor, Tensor]:
+    def _repair(self, i: int, t: Tensor) -> tuple[Tensor, Tensor]:
         """Samples of layer i whose Gram matrix is of no use, and their polar factors: [k], [k, A, n_i]."""
         unsafe = (~self._safe[i]).nonzero().squeeze(1)
-        return unsafe, polar_by_svd(self._ts[i].expand(self._batch, -1, -1)[unsafe])
+        return unsafe, polar_by_svd(t.expand(self._batch, -1, -1)[unsafe])
+
+
+def _combine(weights: Tensor, ts: Tensor) -> Tensor:
+    """sum_a w_a t_a: weights [layers, batch, A], ts [layers, batch or 1, A, n] -> [layers, batch, n]."""
+    if ts.shape[1] < weights.shape[1]:
+        return weights @ ts.squeeze(1)
+    if ts.shape[-1] < _LONG_ROW:
+        return (weights.unsqueeze(-1) * ts).sum(-2)
+    return (weights.unsqueeze(-2) @ ts).squeeze(-2)
 
 
 def _basis(output_weight: Tensor | None, like: Tensor) -> Tensor:
     """An orthogonal Q [A, A] such that the rows of Q W, for the output weight W [A, n], are near orthogonal."""
     actions = like.shape[1]
-    if actions == 2:  # the sum and the difference
-        return torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=like.dtype, device=like.device).mul_(0.5**0.5)
+    if actions == 2:
+        return _sum_and_difference(like.dtype, like.device)
     if output_weight is None:
         return torch.eye(actions, dtype=like.dtype, device=like.device)
     w = output_weight.double()
-    gram = (w @ w.mT).nan_to_num_()
-    vectors: Tensor = torch.linalg.eigh(gram).eigenvectors
+    vectors: Tensor = torch.linalg.eigh((w @ w.mT).nan_to_num_()).eigenvectors
     return vectors.mT.to(like.dtype)
+
+
+@cache
+def _sum_and_difference(dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=dtype, device=device).mul_(0.5**0.5)
 
 
 def _flat(t: Tensor) -> Tensor:
     """[b, A, channels, height, width] with channels last in memory, as [b, A, n] without a copy."""
-    return (t.permute(0, 1, 3, 4, 2) if t.dim() == 5 else t).flatten(2)
+    return t.permute(0, 1, 3, 4, 2).flatten(2) if t.dim() == 5 else t.flatten(2)
 
 
 def _shaped(rows: Tensor, shape: torch.Size) -> Tensor:

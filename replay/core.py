@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from common.config import RunConfig
-from common.messages import Drawn, EpisodeRecord
+from common.experience import Drawn, EpisodeRecord
 from common.types import Batch, EnvSpec, Segment
 from replay.dedup import SeenWindow
 from replay.limiter import RateLimiter

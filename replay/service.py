@@ -12,10 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from common import messages
+from common import experience, messages
 from common.clients import replay_key
+from common.experience import SegmentReader
 from common.lifecycle import Stop
-from common.messages import ReplayStats, SegmentReader
+from common.messages import ReplayStats
 from common.transport import Node
 from common.types import EnvSpec
 from common.wire import Message
@@ -30,8 +31,9 @@ T = TypeVar("T")
 
 
 class _Gate:
-    """Where requests of one sort wait for the limiter. The deadline runs from the moment the gate closed, so that
-    requests queued behind the first do not wait for one another.
+    """Where requests of one sort wait for the limiter.
+
+    The deadline runs from the moment the gate closed, so that requests queued behind the first do not add up.
     """
 
     def __init__(self) -> None:
@@ -107,11 +109,11 @@ class ReplayService:
         return messages.encode_ack(self._node.run, outcome)
 
     def _sample(self, message: Message) -> bytearray:
-        request = messages.decode_sample(message)
+        request = experience.decode_sample(message)
         outcome = self._admit(self._draws, lambda: self._core.draw(*request))
         if isinstance(outcome, Wait):
             return messages.encode_retry(self._node.run, outcome.reason)
-        return messages.encode_batch(self._node.run, *outcome)
+        return experience.encode_batch(self._node.run, *outcome)
 
     def _admit(self, gate: _Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
         """Try, and try again whenever the core has changed, until the gate's deadline."""

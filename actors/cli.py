@@ -1,0 +1,80 @@
+"""`coop-actor`: one process of emulators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from actors.policy import Policy
+from actors.service import ActorService
+from common import cli
+from common.environments import make_vector_env
+from common.errors import JoinError, PeerLost
+from common.joining import join
+from common.lifecycle import Stop, run_main
+from common.messages import Join, Joined
+from common.networks import FlatNetwork, build_network
+from common.options import RoleOptions
+from common.transport import Node, new_incarnation, open_session
+
+
+@dataclass(frozen=True)
+class ActorOptions(RoleOptions):
+    """Flags of `coop-actor`."""
+
+    envs: int | None = None
+    """Emulators in this process; the run's actor.envs if not given."""
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop-actor", _run)
+
+
+def _run() -> None:
+    options = cli.parse(ActorOptions, "coop-actor", "Play emulators for a run; the rest comes from its learner.")
+    torch.set_num_threads(1)
+    stop = Stop()
+    stop.on_signals()
+    incarnation = new_incarnation()
+    joined = _join(options, stop, incarnation)
+    if joined is None:
+        return
+    config = joined.config
+    seed = np.random.SeedSequence([config.seed, 3, joined.index])
+    env_seed, policy_seed = seed.spawn(2)
+    env = make_vector_env(config.env, options.envs or config.actor.envs, int(env_seed.generate_state(1)[0]))
+    policy = Policy(_networks(joined), joined.spec, np.random.default_rng(policy_seed))
+    if env.spec != joined.spec:
+        raise JoinError(f"environment here {env.spec}, the learner's {joined.spec}")
+    endpoints = (*options.connect, *joined.replay_endpoints)
+    session = open_session((), endpoints, options.zenoh_config, options.shared_memory)
+    with Node(session, options.run, "actor", incarnation) as node:
+        node.follow_stop(stop, options.patience)
+        ActorService(node, stop, config.actor, env, policy, incarnation).run()
+    env.close()
+    if stop.failed:
+        raise PeerLost(stop.reason)
+
+
+def _join(options: ActorOptions, stop: Stop, incarnation: int) -> Joined | None:
+    """Ask over a session of its own: where the replay service is to be reached is part of the answer."""
+    session = open_session((), options.connect, options.zenoh_config)
+    with Node(session, options.run, "joining", incarnation) as node:
+        request = Join("actor", incarnation, [])
+        return join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
+
+
+def _networks(joined: Joined) -> tuple[FlatNetwork, FlatNetwork]:
+    """Networks of the run's layout, their parameters still to come.
+
+    Raises:
+        JoinError: this process builds another layout than the learner.
+    """
+    settings = joined.config.network
+    first, second = (FlatNetwork(build_network(settings.kind, joined.spec, settings.hidden, seed=0)) for _ in range(2))
+    if first.layout_digest() != joined.layout:
+        raise JoinError(f"network layout here {first.layout_digest()}, the learner's {joined.layout}")
+    return first, second

@@ -1,0 +1,42 @@
+"""Epsilon-greedy over the acting network, for all emulators of a process in one forward."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from common.networks import FlatNetwork, preprocess
+from common.types import Array, EnvSpec
+
+
+class Policy:
+    """Two networks, of which one acts.
+
+    networks: Q1 and Q2. acting: 0 or 1.
+    """
+
+    def __init__(self, networks: tuple[FlatNetwork, FlatNetwork], spec: EnvSpec, rng: np.random.Generator) -> None:
+        self.networks = networks
+        self.acting = 0
+        self._spec = spec
+        self._rng = rng
+
+    def act(self, obs: Array, epsilon: float) -> NDArray[np.int32]:
+        """Actions, int32 [envs], for <frame_dtype>[envs, *obs_shape]."""
+        random = self._rng.random(len(obs)) < epsilon
+        actions = self._rng.integers(self._spec.num_actions, size=len(obs), dtype=np.int32)
+        if not random.all():
+            greedy = self._values(self.acting, obs).argmax(1).numpy()
+            np.copyto(actions, greedy, where=~random, casting="same_kind")
+        return actions
+
+    def mean_values(self, obs: Array) -> tuple[float, float]:
+        """Mean over actions of Q1 and of Q2 at one observation <frame_dtype>[*obs_shape]."""
+        first, second = (float(self._values(number, obs[None]).mean()) for number in (0, 1))
+        return first, second
+
+    @torch.inference_mode()
+    def _values(self, number: int, obs: Array) -> Tensor:
+        return self.networks[number](preprocess(torch.from_numpy(obs), self._spec))

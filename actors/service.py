@@ -1,0 +1,78 @@
+"""The actor's loop: act, step the emulators, send segments."""
+
+from __future__ import annotations
+
+import time
+
+from actors.policy import Policy
+from actors.segments import EpisodeTracker, SegmentAssembler
+from actors.weights import WeightsFollower
+from common import schedules
+from common.clients import InsertClient
+from common.config import ActorSettings
+from common.environments import Steps, VectorEnv
+from common.lifecycle import Stop
+from common.transport import Node
+from common.types import Array, EpisodeEnd
+
+STATUS_EVERY = 0.5  # seconds
+
+
+class ActorService:
+    """Plays all emulators of one process until the stop."""
+
+    def __init__(
+        self, node: Node, stop: Stop, settings: ActorSettings, env: VectorEnv, policy: Policy, incarnation: int
+    ) -> None:
+        self._node = node
+        self._stop = stop
+        self._settings = settings
+        self._env = env
+        self._policy = policy
+        self._weights = WeightsFollower(node, policy)
+        self._inserts = InsertClient(node, stop, settings.window * env.num_envs)
+        self._segments = SegmentAssembler(env.spec, env.num_envs, incarnation, settings.segment_steps)
+        self._episodes = EpisodeTracker(env.num_envs)
+        self._steps = 0
+        self._status_due = 0.0
+
+    def run(self) -> None:
+        """Play until the stop; then hand in what is begun, if the replay service still takes it."""
+        while not self._weights.ready:
+            self._weights.refresh()
+            if self._stop.wait(0.05):
+                return
+        obs = self._env.reset()
+        self._segments.begin(obs)
+        while not self._stop.is_set():
+            obs = self._turn(obs)
+            if time.monotonic() >= self._status_due:
+                self._tell()
+
+    def _turn(self, obs: Array) -> Array:
+        """One step of all emulators; what they see next."""
+        self._weights.refresh()
+        epsilon = schedules.epsilon(self._settings, self._inserts.inserted)
+        actions = self._policy.act(obs, epsilon)
+        steps = self._env.step(actions)
+        self._steps += self._env.num_envs
+        ends = self._ends(steps, epsilon)
+        for segment in self._segments.add(actions, steps, self._weights.version, ends):
+            if not self._inserts.submit(segment):
+                break
+        return steps.obs
+
+    def _ends(self, steps: Steps, epsilon: float) -> dict[int, EpisodeEnd]:
+        ends = {}
+        for episode in self._episodes.add(steps):
+            q1_mean, q2_mean = self._policy.mean_values(steps.next_obs[episode.stream])
+            ends[episode.stream] = EpisodeEnd(
+                0, episode.episode_return, episode.length, epsilon, q1_mean, q2_mean, self._weights.version
+            )
+        return ends
+
+    def _tell(self) -> None:
+        self._status_due = time.monotonic() + STATUS_EVERY
+        self._node.publish_status(
+            {"steps": self._steps, "acked": self._inserts.acked, "waiting": self._inserts.waiting}
+        )

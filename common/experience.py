@@ -1,0 +1,207 @@
+"""Messages that carry experience: segments on their way to the table, draws and batches on their way out.
+
+insert    a segment for the table
+sample    a request for a batch
+batch     its answer; also carries the episodes that ended
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import numpy as np
+
+from common import wire
+from common.errors import BadMessage
+from common.messages import INCARNATION
+from common.schema import Int, ListOf, Real, Row, Rule, Schema
+from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
+from common.wire import Message
+
+MAX_SEGMENT_STEPS = 4096
+MAX_EPISODES = 100_000  # told with one batch
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRecord:
+    """A finished episode as the replay service books it, in order of acceptance.
+
+    env_step: transitions accepted up to the episode's last step.
+    """
+
+    env_step: int
+    actor: int
+    stream: int
+    end: EpisodeEnd
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What the table says beside a batch: its counters, and the episodes from number `first_episode` on."""
+
+    sequence: int
+    inserted: int
+    size: int
+    evicted: int
+    evicted_unsampled: int
+    first_episode: int
+    episodes: tuple[EpisodeRecord, ...]
+
+
+_EPISODE_END = Row((Int(0, MAX_SEGMENT_STEPS - 1), Real(), Int(1), Real(), Real(), Real(), Int(-1)))
+_EPISODE_RECORD = Row((Int(), Int(), Int(), _EPISODE_END))
+_SAMPLE = Schema(
+    "sample",
+    {"incarnation": INCARNATION, "sequence": Int(), "batch_size": Int(1, 65_536), "episodes_from": Int()},
+    {},
+)
+_DRAWN_FIELDS: dict[str, Rule] = {
+    "sequence": Int(),
+    "inserted": Int(),
+    "size": Int(),
+    "evicted": Int(),
+    "evicted_unsampled": Int(),
+    "first_episode": Int(),
+    "episodes": ListOf(_EPISODE_RECORD, MAX_EPISODES),
+}
+_SEGMENT_FIELDS: dict[str, Rule] = {
+    "incarnation": INCARNATION,
+    "stream": Int(0, 65_535),
+    "sequence": Int(),
+    "carried": Int(0, 1024),
+    "acked": Int(),
+    "episodes": ListOf(_EPISODE_END, MAX_SEGMENT_STEPS),
+}
+
+
+def encode_segment(run: str, segment: Segment) -> bytearray:
+    """Build an insert request."""
+    fields = {
+        "incarnation": segment.incarnation,
+        "stream": segment.stream,
+        "sequence": segment.sequence,
+        "carried": segment.carried,
+        "acked": segment.acked,
+        "episodes": [astuple(end) for end in segment.episodes],
+    }
+    arrays = {name: getattr(segment, name) for name in _SEGMENT_ARRAYS}
+    return wire.encode("insert", run, fields, arrays)
+
+
+_SEGMENT_ARRAYS = ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version")
+
+
+class SegmentReader:
+    """Reads insert requests for one environment."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        self._spec = spec
+        self._schema = Schema(
+            "insert",
+            _SEGMENT_FIELDS,
+            {
+                "frames": (spec.frame_dtype, ("frames", *spec.frame_shape)),
+                "obs_index": ("int32", ("steps", spec.stack)),
+                "next_index": ("int32", ("steps", spec.stack)),
+                "actions": ("int32", ("steps",)),
+                "rewards": ("float32", ("steps",)),
+                "terminated": ("bool", ("steps",)),
+                "param_version": ("int64", ("steps",)),
+            },
+        )
+
+    def __call__(self, message: Message) -> Segment:
+        """Read one; raises BadMessage for anything the table could not take."""
+        lengths = self._schema.check(message)
+        fields, arrays = message.fields, message.arrays
+        steps, frames = lengths["steps"], lengths["frames"]
+        if not 1 <= steps <= MAX_SEGMENT_STEPS:
+            raise BadMessage("arrays.actions", f"{steps} steps; allowed: 1 to {MAX_SEGMENT_STEPS}")
+        for name in ("obs_index", "next_index"):
+            _within(f"arrays.{name}", arrays[name], 0, frames - 1)
+        _within("arrays.actions", arrays["actions"], 0, self._spec.num_actions - 1)
+        _within("arrays.param_version", arrays["param_version"], 0, 2**62)
+        if not np.isfinite(arrays["rewards"]).all():
+            raise BadMessage("arrays.rewards", "not finite")
+        if arrays["frames"].dtype == np.float32 and not np.isfinite(arrays["frames"]).all():
+            raise BadMessage("arrays.frames", "not finite")
+        if arrays["terminated"].view(np.uint8).max() > 1:
+            raise BadMessage("arrays.terminated", "not boolean")
+        if fields["carried"] > frames:
+            raise BadMessage("fields.carried", f"{fields['carried']} of {frames} frames")
+        episodes = tuple(EpisodeEnd(*row) for row in fields["episodes"])
+        if any(end.step_in_segment >= steps for end in episodes):
+            raise BadMessage("fields.episodes", "an episode ends beyond the segment")
+        values: dict[str, Any] = {**fields, **arrays, "episodes": episodes}
+        return Segment(**values)
+
+
+def _within(field: str, array: Array, low: int, high: int) -> None:
+    if array.min() < low or array.max() > high:
+        raise BadMessage(field, f"values from {array.min()} to {array.max()}; allowed: {low} to {high}")
+
+
+def encode_sample(run: str, incarnation: int, sequence: int, batch_size: int, episodes_from: int) -> bytearray:
+    """Build a draw request; a repeated (incarnation, sequence) gets the same batch again."""
+    fields = {
+        "incarnation": incarnation,
+        "sequence": sequence,
+        "batch_size": batch_size,
+        "episodes_from": episodes_from,
+    }
+    return wire.encode("sample", run, fields)
+
+
+def decode_sample(message: Message) -> tuple[int, int, int, int]:
+    """Read (incarnation, sequence, batch_size, episodes_from); raises BadMessage."""
+    _SAMPLE.check(message)
+    fields = message.fields
+    return fields["incarnation"], fields["sequence"], fields["batch_size"], fields["episodes_from"]
+
+
+_BATCH_ARRAYS = (*_SEGMENT_ARRAYS, "weights", "ids", "age", "reuse")
+
+
+def encode_batch(run: str, batch: Batch, drawn: Drawn) -> bytearray:
+    """Build the answer to a draw."""
+    fields = {name: getattr(drawn, name) for name in _DRAWN_FIELDS}
+    fields["episodes"] = [astuple(record) for record in drawn.episodes]
+    return wire.encode("batch", run, fields, {name: getattr(batch, name) for name in _BATCH_ARRAYS})
+
+
+class BatchReader:
+    """Reads batches of one environment."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        row = ("batch",)
+        self._schema = Schema(
+            "batch",
+            _DRAWN_FIELDS,
+            {
+                "frames": (spec.frame_dtype, ("frames", *spec.frame_shape)),
+                "obs_index": ("int32", ("batch", spec.stack)),
+                "next_index": ("int32", ("batch", spec.stack)),
+                "actions": ("int32", row),
+                "rewards": ("float32", row),
+                "terminated": ("bool", row),
+                "param_version": ("int64", row),
+                "weights": ("float32", row),
+                "ids": ("int64", row),
+                "age": ("int64", row),
+                "reuse": ("int32", row),
+            },
+        )
+        self._spec = spec
+
+    def __call__(self, message: Message) -> tuple[Batch, Drawn]:
+        """Read one; raises BadMessage."""
+        lengths = self._schema.check(message)
+        for name in ("obs_index", "next_index"):
+            _within(f"arrays.{name}", message.arrays[name], 0, lengths["frames"] - 1)
+        _within("arrays.actions", message.arrays["actions"], 0, self._spec.num_actions - 1)
+        fields = dict(message.fields)
+        fields["episodes"] = tuple(
+            EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in fields["episodes"]
+        )
+        return Batch(**message.arrays), Drawn(**fields)

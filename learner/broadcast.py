@@ -1,0 +1,44 @@
+"""How the learner tells who acts: weights and role as broadcasts, and as answers to those who come late."""
+
+from __future__ import annotations
+
+from common import messages
+from common.messages import Role
+from common.transport import Node
+from common.wire import Message
+from learner.agent import Agent
+
+
+class Broadcaster:
+    """Publishes the networks of an agent, and answers queries with what was published last."""
+
+    def __init__(self, node: Node, agent: Agent) -> None:
+        self._node = node
+        self._agent = agent
+        self._published = [-1, -1]
+        self._weights = [bytearray(), bytearray()]
+        self._role = bytearray()
+        self.publish()
+        node.serve(self._weights_key(0), lambda message: self._answer(message, self._weights[0]))
+        node.serve(self._weights_key(1), lambda message: self._answer(message, self._weights[1]))
+        node.serve(node.key("role"), lambda message: self._answer(message, self._role))
+
+    def publish(self) -> None:
+        """Broadcast the networks that changed since they were published, then the role."""
+        agent, node = self._agent, self._node
+        for number, version in enumerate(agent.versions):
+            if version != self._published[number]:
+                flat = agent.networks[number].snapshot()
+                self._weights[number] = messages.encode_weights(node.run, number + 1, version, flat)
+                self._published[number] = version
+                node.publish(self._weights_key(number), self._weights[number])
+        role = Role(agent.acting + 1, (self._published[0], self._published[1]), agent.updates)
+        self._role = messages.encode_role(node.run, role)
+        node.publish(node.key("role"), self._role)
+
+    def _weights_key(self, number: int) -> str:
+        return self._node.key("weights", str(number + 1))
+
+    def _answer(self, message: Message, payload: bytearray) -> bytearray:
+        messages.decode_question("current", message)
+        return payload

@@ -1,0 +1,57 @@
+"""`coop-learner`: the head of a run, which everybody else asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from common.clients import SampleClient
+from common.environments import env_spec
+from common.lifecycle import Stop, run_main
+from common.options import RunOptions, parse_run
+from common.transport import Node, locators, new_incarnation, open_session
+from learner.agent import Agent
+from learner.reception import Reception
+from learner.run_directory import RunDirectory
+from learner.service import LearnerService
+
+
+@dataclass(frozen=True)
+class LearnerOptions(RunOptions):
+    """Flags of `coop-learner`."""
+
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints to listen on; tcp/0.0.0.0:7447 opens the run to other machines."""
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop-learner", _run)
+
+
+def _run() -> None:
+    options = parse_run(
+        LearnerOptions, "coop-learner", "Train the networks of a run; everybody else asks this process."
+    )
+    config = options.run_config()
+    spec = env_spec(config.env)
+    torch.set_num_threads(config.learner.threads)
+    stop = Stop()
+    stop.on_signals()
+    path = options.directory()
+    agent = Agent(config, spec)
+    incarnation = new_incarnation()
+    session = open_session(options.listen, (), options.zenoh_config, options.shared_memory)
+    with Node(session, config.run, "learner", incarnation) as node, RunDirectory(path, config) as directory:
+        settings = config.learner
+        Reception(node, config, spec, agent.networks[0].layout_digest())
+        samples = SampleClient(node, stop, incarnation, spec, settings.batch_size, settings.prefetch)
+        print(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}", flush=True)
+        summary = LearnerService(node, stop, agent, directory, samples).run()
+    print(
+        f"{summary['exit']}: {summary['env_steps']:,} steps, {summary['updates']:,} updates, return of the last "
+        f"100 episodes {summary['return_mean_100']:.1f} ({summary['return_sd_100']:.1f}), "
+        f"{summary['wall_seconds']:.0f} s",
+        flush=True,
+    )

@@ -1,0 +1,73 @@
+"""The files of a run: config, episodes, metrics, TensorBoard, summary and the learning curve."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from torch.utils.tensorboard import SummaryWriter
+
+from common.config import RunConfig, to_toml
+from common.errors import RunError
+from common.experience import EpisodeRecord
+
+EPISODE_FIELDS = (
+    "episode", "env_step", "update", "actor", "stream", "return", "length",
+    "epsilon", "s", "q1_mean", "q2_mean", "param_version",
+)  # fmt: skip
+
+
+class RunDirectory:
+    """Writes a run's files as the run goes on; every line is complete on disk when its call returns."""
+
+    def __init__(self, path: Path, config: RunConfig) -> None:
+        """Raises RunError where the folder can't be written."""
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            (path / "config.toml").write_text(to_toml(config), encoding="utf-8")
+            self._episodes = (path / "episodes.csv").open("w", newline="", encoding="utf-8", buffering=1)
+            self._metrics = (path / "metrics.jsonl").open("w", encoding="utf-8", buffering=1)
+        except OSError as error:
+            raise RunError(f"run directory {path}: {error.strerror or error}") from error
+        self._csv = csv.writer(self._episodes, lineterminator="\n")
+        self._csv.writerow(EPISODE_FIELDS)
+        self._board = SummaryWriter(str(path / "tb"))
+
+    def episode(self, number: int, record: EpisodeRecord, update: int, s: float) -> None:
+        """Add a line to episodes.csv."""
+        end = record.end
+        place = (number, record.env_step, update, f"{record.actor:x}", record.stream)
+        values = (f"{value:.6g}" for value in (end.epsilon, s, end.q1_mean, end.q2_mean))
+        self._csv.writerow((*place, f"{end.episode_return:g}", end.length, *values, end.param_version))
+        self._board.add_scalar("episode/return", end.episode_return, record.env_step)
+
+    def metrics(self, row: dict[str, Any]) -> None:
+        """Add a line to metrics.jsonl, and the same to TensorBoard."""
+        self._metrics.write(json.dumps(row) + "\n")
+        for name, value in row.items():
+            if name not in ("time", "env_step"):
+                self._board.add_scalar(f"train/{name}", value, row["env_step"])
+
+    def summary(self, values: dict[str, Any]) -> None:
+        """Write summary.json, whole or not at all."""
+        part = self.path / "summary.json.part"
+        part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+        part.replace(self.path / "summary.json")
+
+    def close(self) -> None:
+        """Flush and close all files."""
+        self._episodes.close()
+        self._metrics.close()
+        self._board.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

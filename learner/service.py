@@ -1,0 +1,181 @@
+"""The learner's loop in a distributed run: draw, update, broadcast, record; and how a run ends."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from common import messages, schedules
+from common.clients import SampleClient, replay_key
+from common.errors import RunError
+from common.experience import Drawn
+from common.lifecycle import Stop
+from common.messages import ReplayStats
+from common.transport import NoAnswer, Node
+from learner.agent import Agent
+from learner.broadcast import Broadcaster
+from learner.curve import draw_learning_curve
+from learner.epochs import save_epoch
+from learner.run_directory import RunDirectory
+from learner.telemetry import Telemetry
+
+METRICS_EVERY = 200  # updates
+STATUS_EVERY = 0.5  # seconds
+FAREWELL = 5.0  # seconds that the others get to leave
+SNAPSHOT_TIMEOUT = 600.0  # seconds
+NOTHING_DRAWN = Drawn(0, 0, 0, 0, 0, 0, ())
+
+
+class LearnerService:
+    """Trains an agent from a replay service until the run is complete or stopped."""
+
+    def __init__(self, node: Node, stop: Stop, agent: Agent, directory: RunDirectory, samples: SampleClient) -> None:
+        self._node = node
+        self._stop = stop
+        self._agent = agent
+        self._config = agent.config
+        self._directory = directory
+        self._samples = samples
+        self._telemetry = Telemetry()
+        self._broadcaster = Broadcaster(node, agent)
+        self._drawn = NOTHING_DRAWN
+        self._started = time.monotonic()
+        self._status_due = 0.0
+        self._speed = (self._started, 0, 0.0)
+
+    def run(self) -> dict[str, Any]:
+        """Train to the end; the summary, as it is on disk.
+
+        Raises:
+            RunError: the replay service found a request bad, or gave an answer that is not one.
+        """
+        outcome = "failed"
+        try:
+            while not (outcome := self._outcome()):
+                self._turn()
+        except RunError as error:
+            outcome = f"failed: {error}"
+            raise
+        finally:
+            summary = self._finish(outcome)
+        return summary
+
+    def _turn(self) -> None:
+        """One update, if there is a batch."""
+        agent, settings = self._agent, self._config.learner
+        got = self._samples.next()
+        if got is not None:
+            batch, self._drawn = got
+            result = agent.update(batch)
+            self._telemetry.add(agent, batch, result)
+            if result.swapped or agent.updates % settings.publish_every == 0:
+                self._broadcaster.publish()
+            self._book_episodes()
+            if agent.updates % METRICS_EVERY == 0:
+                self._directory.metrics(self._telemetry.row(agent, self._drawn, self._epsilon()))
+        if time.monotonic() >= self._status_due:
+            self._tell()
+
+    def _outcome(self) -> str:
+        """Why the run is over; empty while it goes on."""
+        config, agent, telemetry = self._config, self._agent, self._telemetry
+        if self._stop.is_set():
+            return self._stop.reason
+        if agent.updates >= config.planned_updates and self._drawn.inserted >= config.total_steps:
+            return "complete"
+        if 0 < config.total_updates <= agent.updates:
+            return "complete: total_updates reached"
+        if 0 < config.total_episodes <= telemetry.episodes:
+            return "complete: total_episodes reached"
+        target, full = config.target_return, len(telemetry.returns) == telemetry.returns.maxlen
+        if target is not None and full and telemetry.return_mean >= target:
+            return "complete: target_return reached"
+        return ""
+
+    def _book_episodes(self) -> None:
+        for record in self._drawn.episodes:
+            number = self._telemetry.episode(record.end.episode_return)
+            self._directory.episode(number, record, self._agent.updates, self._agent.exploration_rate())
+
+    def _epsilon(self) -> float:
+        return schedules.epsilon(self._config.actor, self._drawn.inserted)
+
+    def _tell(self) -> None:
+        """Publish the status that displays show, and the role once more for those who missed it."""
+        now = time.monotonic()
+        then, updates, speed = self._speed
+        if now - then >= STATUS_EVERY:
+            speed = (self._agent.updates - updates) / (now - then)
+            self._speed = (now, self._agent.updates, speed)
+        self._status_due = now + STATUS_EVERY
+        self._broadcaster.publish()
+        self._node.publish_status(
+            {
+                "env_steps": self._drawn.inserted,
+                "total_steps": self._config.total_steps,
+                "updates": self._agent.updates,
+                "updates_per_s": speed,
+                "acting": self._agent.acting + 1,
+                "episodes": self._telemetry.episodes,
+                "return_mean_100": self._telemetry.return_mean,
+                "epsilon": self._epsilon(),
+                "s": self._agent.exploration_rate(),
+                "waiting": self._samples.waiting,
+            }
+        )
+
+    def _finish(self, outcome: str) -> dict[str, Any]:
+        """Collect the last counters, save the epoch, write the summary, and send everybody home."""
+        try:
+            stats = self._replay_stats()
+            if stats is not None and self._agent.updates:
+                save_epoch(self._directory.path, self._agent.updates, self._state(), self._snapshot)
+            summary = self._summary(outcome, stats)
+            self._directory.summary(summary)
+            draw_learning_curve(self._directory.path, f"{summary['env']}, {summary['method']}, seed {summary['seed']}")
+        finally:
+            self._farewell(outcome)
+        return summary
+
+    def _replay_stats(self) -> ReplayStats | None:
+        question = messages.encode_question(self._node.run, "stats")
+        try:
+            return messages.decode_stats(self._node.ask(replay_key(self._node, "stats"), question))
+        except NoAnswer:
+            return None
+
+    def _snapshot(self, folder: str) -> None:
+        request = messages.encode_snapshot(self._node.run, folder)
+        messages.decode_ack(self._node.ask(replay_key(self._node, "snapshot"), request, SNAPSHOT_TIMEOUT))
+
+    def _state(self) -> dict[str, Any]:
+        return {"agent": self._agent.state(), "returns": list(self._telemetry.returns), "drawn": self._drawn.sequence}
+
+    def _summary(self, outcome: str, stats: ReplayStats | None) -> dict[str, Any]:
+        config, telemetry = self._config, self._telemetry
+        inserted = self._drawn.inserted if stats is None else stats.inserted
+        return {
+            "method": config.method,
+            "env": config.env.id,
+            "seed": config.seed,
+            "env_steps": inserted,
+            "updates": self._agent.updates,
+            "episodes": telemetry.episodes,
+            "return_mean_100": telemetry.return_mean,
+            "return_sd_100": telemetry.return_sd,
+            "wall_seconds": round(time.monotonic() - self._started, 3),
+            "transitions_accepted": inserted,
+            "transitions_lost": None if stats is None else stats.lost,
+            "duplicates_refused": None if stats is None else stats.duplicates,
+            "exit": outcome,
+        }
+
+    def _farewell(self, outcome: str) -> None:
+        """Announce the stop until the other roles have gone, or their time is up."""
+        deadline = time.monotonic() + FAREWELL
+        while time.monotonic() < deadline:
+            self._node.announce(self._node.key("stop"), messages.encode_stop(self._node.run, outcome))
+            time.sleep(0.1)
+            alive = self._node.alive()
+            if not alive.get("actor") and not alive.get("replay"):
+                return
