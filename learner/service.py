@@ -121,6 +121,7 @@ class LearnerService:
                 "epsilon": self._epsilon(),
                 "s": self._agent.exploration_rate(),
                 "waiting": self._samples.waiting,
+                "connected": self._node.alive(),
             }
         )
 

@@ -1,0 +1,112 @@
+"""What a run tells of itself: follows the status of every role, and shows it."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+
+from common.errors import BadMessage
+from common.transport import Node, open_session
+
+PLAIN_EVERY = 5.0  # seconds between lines where the output is no terminal
+
+
+class RunStatus:
+    """Follows one run through its learner.
+
+    Args:
+        endpoint: of the learner, or of any process that is connected to it and forwards.
+    """
+
+    def __init__(self, run: str, endpoint: str, incarnation: int) -> None:
+        self._node = Node(open_session((), (endpoint,)), run, "watch", incarnation)
+        self._learner = self._node.latest(self._node.key("metrics", "learner", "*"))
+        self.learner: dict[str, Any] = {}
+
+    def refresh(self) -> None:
+        """Take in what has been told since."""
+        message = self._learner.take()
+        if message is not None and message.kind == "status":
+            self.learner = dict(message.fields)
+
+    def line(self) -> str:
+        """The status in one line."""
+        told = self.learner
+        if not told:
+            return "waiting for the learner"
+        try:
+            text = (
+                f"step {told['env_steps']:,}/{told['total_steps']:,}  return {told['return_mean_100']:.1f} "
+                f"(last 100 of {told['episodes']:,} episodes)  {told['updates_per_s']:.0f} updates/s  "
+                f"network {told['acting']} acts  {self.connected()}"
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadMessage("status", str(error)) from error
+        return f"{text}  [{told['waiting']}]" if told.get("waiting") else text
+
+    def connected(self) -> str:
+        """Who is connected, in words."""
+        counts = self.learner.get("connected", {})
+        return ", ".join(f"{counts.get(role, 0)} {role}" for role in ("learner", "replay", "actor"))
+
+    def close(self) -> None:
+        """Leave the run."""
+        self._node.close()
+
+
+class Display:
+    """Shows a status: a live panel on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, status: RunStatus, title: str) -> None:
+        self._status = status
+        self._title = title
+        self._console = Console()
+        self._live = Live(console=self._console, refresh_per_second=4, transient=True)
+        self._due = time.monotonic() + PLAIN_EVERY
+
+    def __enter__(self) -> Display:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def update(self) -> None:
+        """Show what the status says now."""
+        self._status.refresh()
+        if self._console.is_terminal:
+            self._live.update(self._panel())
+        elif time.monotonic() >= self._due:
+            self._due = time.monotonic() + PLAIN_EVERY
+            self.say(self._status.line())
+
+    def say(self, text: str) -> None:
+        """Print a line that stays."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def _panel(self) -> RenderableType:
+        told = self._status.learner
+        table = Table(show_header=False, box=None, title=self._title, title_justify="left")
+        table.add_column(style="dim")
+        table.add_column()
+        if not told:
+            table.add_row("status", "waiting for the learner")
+            return table
+        rows = {
+            "step": f"{told['env_steps']:,} of {told['total_steps']:,}",
+            "return": f"{told['return_mean_100']:.1f}, mean of the last 100 of {told['episodes']:,} episodes",
+            "updates": f"{told['updates']:,}, {told['updates_per_s']:.0f}/s",
+            "acting": f"network {told['acting']}, epsilon {told['epsilon']:.3f}, s {told['s']:.3f}",
+            "connected": self._status.connected(),
+        }
+        if told.get("waiting"):
+            rows["waiting"] = str(told["waiting"])
+        for name, value in rows.items():
+            table.add_row(name, value)
+        return Group(table, ProgressBar(total=told["total_steps"], completed=told["env_steps"], width=60))
