@@ -61,7 +61,9 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
 
 
 def _one_line(box: str) -> str:
-    """The statement inside the box that tyro draws around an error, without the help below its rule."""
+    """The statement inside the box that tyro draws around an error, and the flag that it suggests."""
     body = box.split("\n", 1)[1] if box.startswith("╭") else box
-    statement = body.split("│ ─", 1)[0]
-    return re.sub(r"\s+", " ", _FRAME.sub(" ", statement)).strip() or "bad command line"
+    statement, _, advice = body.partition("│ ─")
+    text = re.sub(r"\s+", " ", _FRAME.sub(" ", statement)).strip() or "bad command line"
+    meant = re.search(r"Perhaps you meant:[\s│]*(--\S+)", advice)
+    return f"{text}; perhaps {meant[1]}" if meant else text

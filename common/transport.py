@@ -180,7 +180,7 @@ class Node:
                         query.reply_err(messages.encode_error(self.run, error))
                     continue
                 with contextlib.suppress(zenoh.ZError):  # the asker may be gone, and will ask again if it is not
-                    query.reply(key, reply, congestion_control=zenoh.CongestionControl.BLOCK)
+                    query.reply(key, reply)
 
     def read(self, payload: zenoh.ZBytes | None) -> Message:
         """Decode a payload of this run; raises BadMessage."""

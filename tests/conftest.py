@@ -1,0 +1,86 @@
+"""Fixtures of real Zenoh sessions, and the check that a test session leaves nothing behind."""
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from common.transport import Node, new_incarnation, open_session
+from common.types import EnvSpec
+
+SETTLE = 10.0  # seconds that threads and processes get to end
+
+
+def _children() -> set[int]:
+    """Processes whose parent is this one."""
+    found = set()
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except OSError:
+                continue
+            if parent == os.getpid():
+                found.add(int(entry.name))
+    return found
+
+
+def _sockets() -> set[str]:
+    """Sockets that this process holds open."""
+    found = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(entry.readlink())
+        except OSError:
+            continue
+        if target.startswith("socket:"):
+            found.add(target)
+    return found
+
+
+def _left(before: tuple[set[int], set[str], set[threading.Thread]]) -> str:
+    children, sockets, threads = before
+    left = [f"process {pid}" for pid in _children() - children]
+    left += [f"socket {name}" for name in _sockets() - sockets]
+    # pytest-timeout's own timer of the running test is still there when the session's fixtures end.
+    own = [thread for thread in threading.enumerate() if thread.name.startswith("pytest_timeout")]
+    left += [f"thread {thread.name}" for thread in set(threading.enumerate()) - threads - set(own)]
+    return ", ".join(left)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def nothing_left_behind() -> Iterator[None]:
+    """Fail the session where a process, thread or socket of a test outlives it."""
+    before = _children(), _sockets(), set(threading.enumerate())
+    yield
+    deadline = time.monotonic() + SETTLE
+    while (left := _left(before)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not left, f"left behind: {left}"
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return f"unixsock-stream/{tmp_path}/z.sock"
+
+
+@pytest.fixture
+def nodes(endpoint: str) -> Iterator[tuple[Node, Node]]:
+    """Two connected nodes of one run: a learner that listens, and an actor."""
+    with (
+        Node(open_session((endpoint,)), "test", "learner", new_incarnation()) as first,
+        Node(open_session((), (endpoint,)), "test", "actor", new_incarnation()) as second,
+    ):
+        deadline = time.monotonic() + 5
+        while not second.alive().get("learner") and time.monotonic() < deadline:
+            time.sleep(0.02)
+        yield first, second
+
+
+@pytest.fixture
+def spec() -> EnvSpec:
+    """CartPole's."""
+    return EnvSpec("CartPole-v0", (4,), "float32", 1, 2)

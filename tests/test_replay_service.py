@@ -1,0 +1,174 @@
+"""The replay service behind real Zenoh sessions: receipts, reasons, duplicates, bad messages, snapshots, restarts."""
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from samples import make_segment
+
+from common import experience, messages
+from common.clients import InsertClient, SampleClient, replay_key
+from common.config import ReplaySettings, RunConfig
+from common.errors import RunError
+from common.lifecycle import Stop
+from common.transport import NoAnswer, Node, Refused, locators, new_incarnation, open_session
+from common.types import EnvSpec
+from replay.core import ReplayCore, Wait
+from replay.service import ReplayService
+
+CONFIG = RunConfig(run="test", total_steps=1000, replay=ReplaySettings(capacity=100, start=8, tolerance=8.0))
+
+
+def _serve(node: Node, core: ReplayCore, spec: EnvSpec, folder: Path) -> ReplayService:
+    service = ReplayService(node, core, spec, folder)
+    service.start()
+    return service
+
+
+def test_receipts_duplicates_and_reasons(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
+    server, client = nodes
+    core = ReplayCore(CONFIG, spec)
+    service = _serve(server, core, spec, tmp_path)
+    key = replay_key(client, "insert")
+
+    sample = experience.encode_sample("test", 1, 0, 4, 0)
+    began = time.monotonic()
+    reply = client.ask(replay_key(client, "sample"), sample)
+    assert 0.5 < time.monotonic() - began < 4
+    assert messages.decode_retry(reply) == "waiting for 8 transitions, have 0"
+
+    first = experience.encode_segment("test", make_segment(spec, 0))
+    assert messages.decode_ack(client.ask(key, first)) == 4
+    assert messages.decode_ack(client.ask(key, first)) == 4, "a retry is acknowledged and not taken twice"
+    for sequence in range(1, 5):
+        client.ask(key, experience.encode_segment("test", make_segment(spec, sequence)))
+    reply = client.ask(key, experience.encode_segment("test", make_segment(spec, 5)))
+    assert messages.decode_retry(reply) == "inserts are 12 steps ahead of updates"
+
+    drawn = client.ask(replay_key(client, "sample"), sample)
+    again = client.ask(replay_key(client, "sample"), sample)
+    np.testing.assert_array_equal(drawn.arrays["ids"], again.arrays["ids"])
+    stats = service.stats()
+    assert (stats.inserted, stats.drawn, stats.duplicates, stats.lost, stats.episodes) == (20, 1, 1, 0, 5)
+    question = messages.encode_question("test", "stats")
+    asked = messages.decode_stats(client.ask(replay_key(client, "stats"), question))
+    assert asked.inserted == 20
+
+
+def test_a_waiting_insert_goes_in_when_updates_catch_up(
+    nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path
+) -> None:
+    server, client = nodes
+    _serve(server, ReplayCore(CONFIG, spec), spec, tmp_path)
+    for sequence in range(5):
+        client.ask(replay_key(client, "insert"), experience.encode_segment("test", make_segment(spec, sequence)))
+    payload = experience.encode_segment("test", make_segment(spec, 5))
+    pending = client.begin(replay_key(client, "insert"), payload)
+    for number in range(4):
+        client.ask(replay_key(client, "sample"), experience.encode_sample("test", 1, number, 4, 0))
+    assert messages.decode_ack(pending.wait()) == 24
+
+
+def test_bad_messages_change_nothing(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
+    server, client = nodes
+    service = _serve(server, ReplayCore(CONFIG, spec), spec, tmp_path)
+    key = replay_key(client, "insert")
+    wrong = make_segment(spec, actions=np.full(4, 9, np.int32))
+    before = service.stats()
+    for payload, field in (
+        (bytearray(b"nonsense, but long enough"), "magic"),
+        (bytearray(), "payload"),
+        (experience.encode_segment("test", wrong), "arrays.actions"),
+        (experience.encode_segment("other", make_segment(spec)), "run"),
+    ):
+        with pytest.raises(Refused, match=field):
+            client.ask(key, payload)
+    assert service.stats().bad_messages == before.bad_messages + 4
+    assert service.stats().inserted == 0
+    assert messages.decode_ack(client.ask(key, experience.encode_segment("test", make_segment(spec)))) == 4
+
+
+def test_snapshot_on_disk(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
+    server, client = nodes
+    core = ReplayCore(CONFIG, spec)
+    _serve(server, core, spec, tmp_path)
+    client.ask(replay_key(client, "insert"), experience.encode_segment("test", make_segment(spec)))
+    client.ask(replay_key(client, "snapshot"), messages.encode_snapshot("test", "checkpoints/12"))
+    folder = tmp_path / "checkpoints" / "12" / "replay"
+    assert np.load(folder / "rewards.npy").tolist() == [0, 1, 2, 3]
+    assert np.load(folder / "frames.npy").shape == (5, 4)
+    assert (folder / "state.msgpack").stat().st_size > 0
+
+
+def test_lost_counts_receipts_without_transitions(spec: EnvSpec) -> None:
+    core = ReplayCore(CONFIG, spec)
+    assert not isinstance(core.insert(make_segment(spec, 0)), Wait)
+    assert core.lost == 0
+    core.insert(make_segment(spec, 2, acked=8))
+    assert core.lost == 0, "4 taken then, 4 more now"
+    core.insert(make_segment(spec, 3, acked=16))
+    assert core.lost == 4
+
+
+def test_clients_survive_a_service_that_goes_away(endpoint: str, spec: EnvSpec, tmp_path: Path) -> None:
+    core, stop, sent = ReplayCore(CONFIG, spec), Stop(), 12
+    first = Node(open_session((endpoint,)), "test", "replay", new_incarnation())
+    _serve(first, core, spec, tmp_path)
+    with Node(open_session((), (endpoint,)), "test", "actor", new_incarnation()) as client:
+        inserts = InsertClient(client, stop, window=2)
+        samples = SampleClient(client, stop, 1, spec, batch_size=4, prefetch=2)
+        outcome: list[bool] = []
+
+        def act() -> None:
+            outcome.extend(inserts.submit(make_segment(spec, number, acked=inserts.acked)) for number in range(sent))
+            outcome.append(inserts.drain())
+
+        thread = threading.Thread(target=act)
+        thread.start()
+        episodes, batches = [], 0
+        try:
+            while batches < 8:
+                if (got := samples.next()) is not None:
+                    batches += 1
+                    episodes += got[1].episodes
+            first.close()
+            time.sleep(0.3)
+            second = Node(open_session((endpoint,)), "test", "replay", new_incarnation())
+            _serve(second, core, spec, tmp_path)
+            while batches < 40:
+                if (got := samples.next()) is not None:
+                    batches += 1
+                    episodes += got[1].episodes
+            thread.join(20)
+            assert not thread.is_alive()
+        finally:
+            stop.set("test over")
+            thread.join()
+        second.close()
+    assert outcome == [True] * (sent + 1)
+    assert core.table.inserted == 4 * sent
+    assert inserts.acked == 4 * sent
+    assert core.lost == 0
+    assert [record.env_step for record in episodes] == sorted({record.env_step for record in episodes})
+
+
+def test_a_stop_ends_the_waiting(endpoint: str, spec: EnvSpec) -> None:
+    stop = Stop()
+    with Node(open_session((endpoint,)), "test", "actor", new_incarnation()) as client:
+        inserts = InsertClient(client, stop, window=1)
+        threading.Timer(0.3, stop.set, ("enough",)).start()
+        assert inserts.submit(make_segment(spec, 0))
+        assert not inserts.submit(make_segment(spec, 1))
+        assert inserts.waiting == "the replay service does not answer"
+        with pytest.raises(NoAnswer):
+            client.ask(replay_key(client, "stats"), messages.encode_question("test", "stats"))
+
+
+def test_a_port_in_use_is_named() -> None:
+    with (
+        Node(open_session(("tcp/127.0.0.1:0",)), "test", "replay", new_incarnation()) as node,
+        pytest.raises(RunError, match="can't listen on"),
+    ):
+        open_session(tuple(locators(node.session)))

@@ -1,0 +1,198 @@
+"""Whole runs: real processes through the console commands, over Zenoh on loopback, with kills and Ctrl-C."""
+
+import csv
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sysconfig
+import time
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+
+from learner.epochs import load_learner
+
+SCRIPTS = Path(sysconfig.get_path("scripts"))
+EPISODES = "episode,env_step,update,actor,stream,return,length,epsilon,s,q1_mean,q2_mean,param_version"
+METRICS = [
+    *("time", "env_step", "update", "acting", "td_error", "loss", "s", "epsilon", "q_gap", "q1_mean", "q2_mean"),
+    *("updates_per_s", "env_steps_per_s", "replay_size", "sample_age_mean", "sample_age_p95", "reuse_mean"),
+    *("evicted_unsampled", "weight_lag_mean"),
+]
+SUMMARY = [
+    *("method", "env", "seed", "env_steps", "updates", "episodes", "return_mean_100", "return_sd_100"),
+    *("wall_seconds", "transitions_accepted", "transitions_lost", "duplicates_refused", "exit"),
+]
+
+
+@contextmanager
+def running(name: str, *flags: str) -> Iterator[subprocess.Popen[str]]:
+    """A console command; killed at the end if it is still there."""
+    command = [str(SCRIPTS / name), *flags]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def run(name: str, *flags: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(SCRIPTS / name), *flags], capture_output=True, text=True, timeout=90, check=False)
+
+
+def wait_for(what: str, reached: object, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not reached():  # type: ignore[operator]
+        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
+        time.sleep(0.1)
+
+
+def lines(path: Path) -> int:
+    return len(path.read_text().splitlines()) if path.exists() else 0
+
+
+def children(pid: int) -> dict[str, int]:
+    """Direct children by their command's name, the last one of each."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        try:
+            if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
+                arguments = (entry / "cmdline").read_bytes().split(b"\0")
+                found[next(Path(os.fsdecode(a)).name for a in arguments if b"coop-" in a)] = int(entry.name)
+        except (OSError, ValueError, StopIteration):
+            continue
+    return found
+
+
+def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, object]:
+    """The run directory is whole and its numbers agree with each other; the summary."""
+    config = tomllib.loads((path / "config.toml").read_text())
+    summary: dict[str, object] = json.loads((path / "summary.json").read_text())
+    assert list(summary) == SUMMARY
+    assert summary["exit"] == outcome
+    assert summary["transitions_lost"] == 0
+    rows = list(csv.DictReader((path / "episodes.csv").read_text().splitlines()))
+    assert (path / "episodes.csv").read_text().splitlines()[0] == EPISODES
+    assert len(rows) == summary["episodes"]
+    assert [int(row["episode"]) for row in rows] == list(range(len(rows)))
+    metrics = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    assert all(list(row) == METRICS for row in metrics)
+    assert list((path / "tb").iterdir())
+    if outcome == "complete":
+        env_steps, updates = summary["env_steps"], summary["updates"]
+        assert isinstance(env_steps, int)
+        assert isinstance(updates, int)
+        assert steps <= env_steps < steps + 64
+        assert abs(updates - (steps - config["replay"]["start"])) <= 0.02 * steps
+    epochs = list((path / "checkpoints").iterdir())
+    assert all((epoch / "DONE").exists() for epoch in epochs)
+    state = load_learner(epochs[0])
+    assert state["agent"]["updates"] == summary["updates"]
+    assert all(torch.isfinite(flat).all() for flat in state["agent"]["networks"])
+    assert (epochs[0] / "replay" / "frames.npy").exists()
+    assert (path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    return summary
+
+
+def test_coop_local_end_to_end(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    flags = ("--preset", "cartpole", "--actors", "2", "--seed", "3", "--total-steps", "1500", "--run-dir", str(path))
+    done = run("coop-local", *flags)
+    assert (done.returncode, done.stderr) == (0, "")
+    check_files(path, 1500)
+    again = run("coop-local", *flags)
+    assert again.returncode == 2
+    assert again.stderr.count("\n") == 1
+    assert "holds a run already" in again.stderr
+
+
+def test_three_shells_a_late_actor_and_a_kill(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    joining = ("--run", "hand", "--connect", endpoint)
+    learning = ("--run", "hand", "--listen", endpoint, "--total-steps", "4000", "--run-dir", str(path))
+    with (
+        running("coop-actor", *joining) as first,
+        running("coop-replay", *joining, "--run-dir", str(path)) as replay,
+        running("coop-learner", *learning) as learner,
+    ):
+        wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
+        with running("coop-actor", *joining) as second:
+            wait_for("more metrics", lambda: lines(path / "metrics.jsonl") >= 4)
+            first.send_signal(signal.SIGKILL)
+            out, err = learner.communicate(timeout=80)
+            assert (learner.returncode, err) == (0, "")
+            assert out.splitlines()[-1].startswith("complete: ")
+            assert (second.wait(20), replay.wait(20)) == (0, 0)
+    check_files(path, 4000)
+    rows = csv.DictReader((path / "episodes.csv").read_text().splitlines())
+    assert len({row["actor"] for row in rows}) == 2
+
+
+def test_ctrl_c_and_a_killed_actor(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    with running("coop-local", "--actors", "1", "--run-dir", str(path)) as local:
+        wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
+        roles = children(local.pid)
+        assert sorted(roles) == ["coop-actor", "coop-learner", "coop-replay"]
+        os.kill(roles["coop-actor"], signal.SIGKILL)
+        wait_for("the new actor", lambda: children(local.pid).get("coop-actor", 0) != roles["coop-actor"])
+        before = lines(path / "metrics.jsonl")
+        wait_for("metrics with the new actor", lambda: lines(path / "metrics.jsonl") > before + 1)
+        local.send_signal(signal.SIGINT)
+        out, err = local.communicate(timeout=40)
+        assert (local.returncode, err) == (0, "")
+    assert re.search(r"actor 1 ended \(killed by SIGKILL\).*starting it again", out)
+    check_files(path, 50_000, "interrupted")
+
+
+def test_a_dead_replay_service_ends_the_run_and_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    with running("coop-local", "--actors", "1", "--run-dir", str(path)) as local:
+        wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
+        os.kill(children(local.pid)["coop-replay"], signal.SIGKILL)
+        _, err = local.communicate(timeout=60)
+        assert local.returncode == 1
+        assert children(local.pid) == {}
+    assert err.count("\n") == 1
+    assert "replay ended (killed by SIGKILL)" in err
+
+
+def test_a_port_in_use(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = run("coop-learner", "--listen", endpoint, "--run-dir", str(tmp_path / "run"))
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert endpoint in done.stderr
+
+
+@pytest.mark.parametrize("name", ["coop-actor", "coop-replay"])
+def test_no_learner(name: str) -> None:
+    done = run(name, "--run", "nobody", "--connect", "tcp/127.0.0.1:9", "--join-timeout", "1")
+    assert done.returncode == 1
+    assert done.stderr == f"{name}: error: no learner of run 'nobody' found at tcp/127.0.0.1:9 within 1 s\n"
+
+
+def test_bad_flags_of_a_command() -> None:
+    done = run("coop-local", "--preset", "cartpole", "--replay.capacity", "-1")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "coop-local: error: replay.capacity = -1: input should be greater than 0\n"
+
+
+def test_replay_runs_without_torch() -> None:
+    code = "import sys, replay.cli; sys.exit(bool({'torch', 'gymnasium'} & sys.modules.keys()))"
+    assert subprocess.run([SCRIPTS / "python", "-c", code], check=False).returncode == 0

@@ -1,0 +1,97 @@
+"""The wire format: what goes in comes out, and anything else is refused by the name of its field."""
+
+import contextlib
+import struct
+
+import hypothesis.extra.numpy as hnp
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common import wire
+from common.errors import BadMessage
+
+ARRAYS = hnp.arrays(
+    st.sampled_from([np.dtype(name) for name in sorted(wire.DTYPES)]),
+    hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=5),
+)
+
+
+@given(st.dictionaries(st.text("abc", min_size=1, max_size=4), ARRAYS, max_size=4), st.integers(-(2**63), 2**64 - 1))
+def test_what_goes_in_comes_out(arrays: dict[str, np.ndarray], number: int) -> None:
+    message = wire.decode(bytes(wire.encode("kind", "run", {"n": number, "t": [1.5, "é"]}, arrays)))
+    assert (message.kind, message.run, message.fields) == ("kind", "run", {"n": number, "t": [1.5, "é"]})
+    assert list(message.arrays) == list(arrays)
+    for name, array in arrays.items():
+        assert message.arrays[name].dtype == array.dtype
+        assert message.arrays[name].shape == array.shape
+        assert message.arrays[name].tobytes() == array.tobytes()
+
+
+def test_arrays_are_aligned_and_viewed_in_place() -> None:
+    payload = bytes(wire.encode("k", "r", {}, {"a": np.zeros(3, np.uint8), "b": np.arange(5, dtype=np.int64)}))
+    b = wire.decode(payload).arrays["b"]
+    start = b.__array_interface__["data"][0] - np.frombuffer(payload, np.uint8).__array_interface__["data"][0]
+    assert start % wire.ALIGNMENT == 0
+    assert 0 < start < len(payload)
+
+
+def _with(**changes: object) -> bytes:
+    header = {"protocol": wire.PROTOCOL, "kind": "k", "run": "r", "fields": {}, "arrays": [], **changes}
+    return _packed(msgpack.packb({name: value for name, value in header.items() if value is not ...}))
+
+
+def _packed(header: bytes, magic: int = wire.MAGIC, length: int | None = None) -> bytes:
+    prefix = struct.pack("<II", magic, len(header) if length is None else length)
+    return prefix + header + bytes(256)
+
+
+@pytest.mark.parametrize(
+    ("payload", "field"),
+    [
+        (b"", "payload"),
+        (b"1234567", "payload"),
+        (_packed(b"", magic=1), "magic"),
+        (_packed(b"abc", length=10_000), "header length"),
+        (_packed(b"\xc1"), "header"),
+        (_packed(b"\x91" * 5000 + b"\xc0"), "header"),
+        (_packed(msgpack.packb([1, 2])), "header"),
+        (_with(extra=1), "header"),
+        (_with(run=...), "header"),
+        (_with(protocol=2), "protocol"),
+        (_with(kind=5), "kind"),
+        (_with(run=None), "run"),
+        (_with(fields=[]), "fields"),
+        (_with(arrays={}), "arrays"),
+        (_with(arrays=[["a", "uint8", [0], 0]] * 65), "arrays"),
+        (_with(arrays=[["a", "uint8", [1]]]), "arrays"),
+        (_with(arrays=[["a", "object", [1], 0]]), "arrays"),
+        (_with(arrays=[["a", "uint8", [-1], 0]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [True], 0]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [2**40], 0]]), "arrays.a"),
+        (_with(arrays=[["a", "float64", [2**15, 2**15, 2**15], 0]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [1] * 9, 0]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [1], 3]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [1], 64 * 100]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [1], 0], ["a", "uint8", [1], 64]]), "arrays.a"),
+    ],
+)
+def test_refused_by_name(payload: bytes, field: str) -> None:
+    with pytest.raises(BadMessage) as caught:
+        wire.decode(payload)
+    assert caught.value.field == field
+
+
+@settings(max_examples=2000)
+@given(st.data())
+def test_no_mutation_raises_anything_else(data: st.DataObject) -> None:
+    arrays = {"a": np.arange(9, dtype=np.float32), "b": np.zeros((2, 3), np.uint8)}
+    payload = bytearray(wire.encode("insert", "run", {"x": 1, "y": [1, 2]}, arrays))
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(0, len(payload)))
+    for mutated in (bytes(payload), bytes(payload[:cut])):
+        with contextlib.suppress(BadMessage):
+            wire.decode(mutated)
