@@ -93,7 +93,7 @@ class Chain:
                 if index == first:
                     return
                 weight = weight if dtype is None else weight.to(dtype)
-                rows = rows @ weight if isinstance(step, nn.Linear) else _transposed(step, rows, weight, h)
+                rows = _transposed(step, rows, weight, h) if isinstance(step, nn.Conv2d) else rows @ weight
                 fresh = True
             elif isinstance(step, nn.ReLU):
                 rows = _masked(rows, tape.output_of(index), k, fresh)
