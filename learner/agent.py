@@ -11,6 +11,7 @@ The four methods differ by config only:
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,7 +122,7 @@ class Agent:
         generator = self._noise.bit_generator.state
         return {
             "networks": [network.flat.detach().cpu().clone() for network in self.networks],
-            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
+            "optimizers": [copy.deepcopy(optimizer.state_dict()) for optimizer in self.optimizers],
             "acting": self.acting,
             "updates": self.updates,
             "versions": list(self.versions),

@@ -1,0 +1,151 @@
+"""The four methods: who is trained, who gives the targets, and what happens every C updates."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from samples import make_segment
+
+from common.config import EdlSettings, LearnerSettings, Method, NetworkSettings, RunConfig
+from common.errors import UsageError
+from common.types import Batch, EnvSpec
+from learner.agent import Agent
+from learner.optimizers import MnihRMSProp
+from replay.table import Table
+
+SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
+
+
+def _config(method: Method, **learner: object) -> RunConfig:
+    settings = LearnerSettings(**{"swap_every": 10, "learning_rate": 1e-3, **learner})  # type: ignore[arg-type]
+    return RunConfig(method=method, learner=settings, network=NetworkSettings(hidden=(8, 8)))
+
+
+def _batches(count: int) -> list[Batch]:
+    rng = np.random.default_rng(0)
+    table = Table(SPEC, 500, rng=rng)
+    for sequence in range(10):
+        frames = rng.standard_normal((9, 4)).astype(np.float32)
+        terminated = rng.random(8) < 0.2
+        actions = rng.integers(2, size=8).astype(np.int32)
+        table.insert(make_segment(SPEC, sequence, 8, frames=frames, terminated=terminated, actions=actions, carried=0))
+    return [table.sample(32) for _ in range(count)]
+
+
+@pytest.mark.parametrize("method", ["g-coop", "coop"])
+def test_roles_swap_every_c_updates(method: Method) -> None:
+    agent = Agent(_config(method), SPEC)
+    assert not torch.equal(agent.networks[0].flat, agent.networks[1].flat)
+    for number, batch in enumerate(_batches(35)):
+        before = [network.snapshot() for network in agent.networks]
+        acting = number // 10 % 2
+        assert agent.acting == acting
+        result = agent.update(batch)
+        changed = [not np.array_equal(b, n.snapshot()) for b, n in zip(before, agent.networks, strict=True)]
+        assert changed == [acting == 0, acting == 1]
+        assert result.swapped == (number % 10 == 9)
+    assert agent.versions == [30, 35]
+
+
+@pytest.mark.parametrize("method", ["dqn", "edql"])
+def test_the_target_is_a_copy_every_c_updates(method: Method) -> None:
+    agent = Agent(_config(method), SPEC)
+    copy = agent.networks[0].snapshot()
+    for number, batch in enumerate(_batches(25), start=1):
+        np.testing.assert_array_equal(agent.networks[1].snapshot(), copy)
+        agent.update(batch)
+        assert agent.acting == 0
+        if number % 10 == 0:
+            copy = agent.networks[0].snapshot()
+    np.testing.assert_array_equal(agent.networks[1].snapshot(), copy)
+
+
+def test_coop_without_s_is_g_coop() -> None:
+    config = _config("coop")
+    coop = Agent(replace(config, edl=EdlSettings(rate=0.0)), SPEC)
+    g_coop = Agent(replace(config, method="g-coop"), SPEC)
+    for batch in _batches(200):
+        coop.update(batch)
+        g_coop.update(batch)
+    for one, other in zip(coop.networks, g_coop.networks, strict=True):
+        torch.testing.assert_close(one.flat, other.flat, rtol=1e-5, atol=1e-6)
+    edl = Agent(config, SPEC)
+    edl.update(_batches(1)[0])
+    assert edl.exploration_rate() > 0
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize("loss", ["squared", "huber"])
+def test_an_update_by_autograd(double: bool, loss: str) -> None:
+    """One step of SGD on 1/2 e^2 (or Huber's) with the targets written out."""
+    agent = Agent(_config("g-coop", optimizer="sgd", double=double, loss=loss, gamma=0.9), SPEC)
+    batch = _batches(1)[0]
+    batch = replace(batch, rewards=batch.rewards * 3, weights=np.linspace(0.5, 1.5, 32, dtype=np.float32))
+    online, target = agent.networks
+    obs, next_obs = (torch.tensor(batch.frames[i[:, 0]]) for i in (batch.obs_index, batch.next_index))
+    actions = torch.tensor(batch.actions).long()[:, None]
+    with torch.no_grad():
+        best = (online if double else target)(next_obs).argmax(1, keepdim=True)
+        value = target(next_obs).gather(1, best)[:, 0]
+        targets = torch.tensor(batch.rewards) + 0.9 * torch.tensor(~batch.terminated) * value
+    errors = online.module(obs).gather(1, actions)[:, 0] - targets
+    costs = (
+        0.5 * errors**2 if loss == "squared" else torch.nn.functional.huber_loss(errors, 0 * errors, reduction="none")
+    )
+    parameters = list(online.module.parameters())
+    gradients = torch.autograd.grad((costs * torch.tensor(batch.weights)).mean(), parameters)
+    expected = online.snapshot() - 1e-3 * torch.cat([g.flatten() for g in gradients]).numpy()
+    result = agent.update(batch)
+    np.testing.assert_allclose(agent.networks[0].snapshot(), expected, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(result.td_errors, errors.detach())
+
+
+def test_weight_decay_by_layer() -> None:
+    plain = Agent(_config("dqn", optimizer="sgd"), SPEC)
+    decayed = Agent(_config("dqn", optimizer="sgd", weight_decay=(0.0, 0.5, 0.0)), SPEC)
+    before = {name: p.detach().clone() for name, p in plain.networks[0].module.named_parameters()}
+    batch = _batches(1)[0]
+    plain.update(batch)
+    decayed.update(batch)
+    other = dict(decayed.networks[0].module.named_parameters())
+    for name, p in plain.networks[0].module.named_parameters():
+        expected = p - (1e-3 * 0.5 * before[name] if name.startswith("fc2") else 0)
+        torch.testing.assert_close(other[name], expected)
+    with pytest.raises(UsageError, match="3 layers"):
+        Agent(_config("dqn", weight_decay=(0.1, 0.1)), SPEC)
+
+
+def test_rmsprop_of_mnih() -> None:
+    rng = np.random.default_rng(1)
+    theta = torch.nn.Parameter(torch.tensor([1.0, -2.0, 3.0]))
+    optimizer = MnihRMSProp([theta], lr=0.1, momentum=0.95, decay=0.9, constant=0.01)
+    expected, mean, square = theta.detach().numpy().astype(np.float64), np.zeros(3), np.zeros(3)
+    for _ in range(5):
+        g = rng.standard_normal(3)
+        theta.grad = torch.tensor(g, dtype=torch.float32)
+        optimizer.step()
+        mean = 0.95 * mean + 0.05 * g
+        square = 0.9 * square + 0.1 * g * g
+        expected = expected - 0.1 * g / np.sqrt(square - mean * mean + 0.01)
+    np.testing.assert_allclose(theta.detach().numpy(), expected, rtol=1e-5)
+
+
+def test_a_restored_agent_goes_on_to_the_bit() -> None:
+    config = replace(_config("coop"), edl=EdlSettings(noise="normal"))
+    batches = _batches(40)
+    first, second = Agent(config, SPEC), Agent(replace(config, seed=0), SPEC)
+    for batch in batches[:17]:
+        first.update(batch)
+    second.load_state(first.state())
+    for batch in batches[17:]:
+        first.update(batch)
+        second.update(batch)
+    for one, other in zip(first.networks, second.networks, strict=True):
+        assert torch.equal(one.flat, other.flat)
+    assert first.acting == second.acting
+
+
+def test_a_device_that_is_not_there() -> None:
+    with pytest.raises(UsageError, match=r"learner\.device"):
+        Agent(_config("dqn", device="nonsense"), SPEC)

@@ -1,0 +1,147 @@
+"""Error-driven learning: one update by hand, s = 0 is backpropagation, and the equations by plain SVDs."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from common.networks import build_network
+from common.types import EnvSpec
+from learner.edl import edl_gradients, feedback_matrices
+
+
+def _spec(kind: str, actions: int) -> EnvSpec:
+    if kind == "mlp":
+        return EnvSpec("vector", (4,), "float32", 1, actions)
+    return EnvSpec("pictures", (84, 84), "uint8", 4, actions)
+
+
+def _case(kind: str, actions: int, batch: int, seed: int = 0) -> tuple[nn.Sequential, Tensor, Tensor]:
+    """A float64 network, an input batch, and errors of one action each."""
+    spec = _spec(kind, actions)
+    network = build_network(kind, spec, (16, 16), seed).double()
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.rand(batch, *spec.obs_shape, generator=generator, dtype=torch.float64)
+    error = torch.zeros(batch, actions, dtype=torch.float64)
+    taken = torch.randint(actions, (batch,), generator=generator)
+    error[torch.arange(batch), taken] = torch.randn(batch, generator=generator, dtype=torch.float64) / batch
+    return network, x, error
+
+
+def _reference(network: nn.Sequential, x: Tensor, error: Tensor, s: float) -> dict[str, Tensor]:
+    """Gradients from the equations: T(i) by autograd, B(i) = U (S + s I) V^T by SVD, one sample after the other."""
+    gradients = {name: torch.zeros_like(p) for name, p in network.named_parameters()}
+    for sample, e in zip(x, error, strict=True):
+        inputs, outputs, h = {}, {}, sample[None]
+        for name, layer in network.named_children():
+            inputs[name] = h.detach()
+            h = layer(h)
+            outputs[name] = h
+        for name, layer in network.named_children():
+            if not isinstance(layer, nn.Linear | nn.Conv2d):
+                continue
+            a = outputs[name]
+            rows = [torch.autograd.grad(y, a, retain_graph=True)[0].flatten() for y in h[0]]
+            u, values, vt = torch.linalg.svd(torch.stack(rows), full_matrices=False)
+            sigma = (u * (values + s) @ vt).T @ e
+            layer.zero_grad()
+            layer(inputs[name]).backward(sigma.view(a.shape))
+            for part, p in layer.named_parameters():
+                assert p.grad is not None
+                gradients[f"{name}.{part}"] += p.grad
+    return gradients
+
+
+def _relative(got: dict[str, Tensor], want: dict[str, Tensor]) -> float:
+    assert got.keys() == want.keys()
+    difference = torch.cat([(got[name].double() - want[name]).flatten() for name in want])
+    return float(difference.norm() / torch.cat([g.flatten() for g in want.values()]).norm())
+
+
+def test_one_update_by_hand() -> None:
+    """A network 2-3-2 whose third hidden unit is dead.
+
+    x = (1, 2);  a1 = W1 x = (1, 2, -1), h = (1, 2, 0);  y = W2 h = (4, -3).
+    T(2) = I, so B(2) = (1 + s) I;  sigma(2) = 1.5 (1, 2) = (1.5, 3).
+    T(1) = W2 with the dead unit's column out = [[0, 2, 0], [-3, 0, 0]]: singular values 3 and 2, polar factor
+    U V^T = [[0, 1, 0], [-1, 0, 0]];  B(1) = T(1) + 0.5 U V^T = [[0, 2.5, 0], [-3.5, 0, 0]];
+    sigma(1) = B(1)^T (1, 2) = (-7, 2.5, 0).  Gradients: sigma(2) h^T, sigma(2), sigma(1) x^T, sigma(1).
+    """
+    network = nn.Sequential(nn.Linear(2, 3), nn.ReLU(), nn.Linear(3, 2))
+    with torch.no_grad():
+        network[0].weight.copy_(torch.tensor([[1.0, 0], [0, 1], [-1, 0]]))
+        network[2].weight.copy_(torch.tensor([[0.0, 2, 5], [-3, 0, 7]]))
+        network[0].bias.zero_()
+        network[2].bias.zero_()
+    x, error = torch.tensor([[1.0, 2]]), torch.tensor([[1.0, 2]])
+    expected = {
+        "0.weight": [[-7, -14], [2.5, 5], [0, 0]],
+        "0.bias": [-7, 2.5, 0],
+        "2.weight": [[1.5, 3, 0], [3, 6, 0]],
+        "2.bias": [1.5, 3],
+    }
+    gradients = edl_gradients(network, x, error, 0.5)
+    assert gradients.keys() == expected.keys()
+    for name, numbers in expected.items():
+        torch.testing.assert_close(gradients[name], torch.tensor(numbers, dtype=torch.float32))
+    b = feedback_matrices(network, x, 0.5)
+    torch.testing.assert_close(b["0"][0], torch.tensor([[0.0, 2.5, 0], [-3.5, 0, 0]]))
+    torch.testing.assert_close(b["2"][0], 1.5 * torch.eye(2))
+
+
+@pytest.mark.parametrize("kind", ["mlp", "nature", "nips2013"])
+@pytest.mark.parametrize("feedback", ["transform", "weight-gradient"])
+def test_without_s_it_is_backpropagation(kind: str, feedback: str) -> None:
+    network, x, error = _case(kind, 4, 8)
+    loss = (network(x) * error).sum()  # d loss / d y = error, as for 1/2 e^2
+    loss.backward()
+    expected = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
+    assert _relative(edl_gradients(network, x, error, 0.0, feedback), expected) < 1e-12
+    single = edl_gradients(network.float(), x.float(), error.float(), 0.0, feedback)
+    assert _relative(single, expected) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("kind", "actions", "batch"),
+    [("mlp", 2, 64), ("mlp", 3, 16), ("mlp", 18, 4), ("nips2013", 6, 2), ("nature", 4, 2), ("nature", 18, 1)],
+)
+def test_the_equations_by_svd(kind: str, actions: int, batch: int) -> None:
+    network, x, error = _case(kind, actions, batch, seed=3)
+    if actions == 18:  # enough live units that every T(i) has full rank, where B(i) is unique
+        network = build_network(kind, _spec(kind, actions), (128, 128), 3).double()
+    expected = _reference(network, x, error, 0.3)
+    assert _relative(edl_gradients(network, x, error, 0.3), expected) < 1e-6
+    single = edl_gradients(network.float(), x.float(), error.float(), 0.3)
+    assert _relative(single, expected) < 1e-4
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**31), st.sampled_from(["dead", "duplicate", "near", "zero"]), st.integers(2, 6))
+def test_lost_rank_is_harmless(seed: int, fault: str, actions: int) -> None:
+    network, x, error = _case("mlp", actions, 5, seed)
+    last = network.get_submodule("out")
+    middle = network.get_submodule("fc2")
+    assert isinstance(last, nn.Linear)
+    assert isinstance(middle, nn.Linear)
+    with torch.no_grad():
+        match fault:
+            case "dead":
+                middle.bias.fill_(-100.0)
+            case "duplicate":
+                last.weight[1] = last.weight[0]
+            case "near":
+                last.weight[1] = last.weight[0] * (1 + 1e-9)
+            case "zero":
+                last.weight.zero_()
+    s = 0.2
+    assert all(torch.isfinite(g).all() for g in edl_gradients(network, x, error, s).values())
+    single = edl_gradients(network.float(), x.float(), error.float(), s)
+    assert all(torch.isfinite(g).all() for g in single.values())
+    for b in feedback_matrices(network.double(), x, s).values():
+        assert float(torch.linalg.svdvals(b).min()) >= s * (1 - 1e-3)
+
+
+def test_an_unknown_layer_is_refused_by_name() -> None:
+    with pytest.raises(Exception, match="Tanh"):
+        edl_gradients(nn.Sequential(nn.Linear(2, 2), nn.Tanh()), torch.zeros(1, 2), torch.zeros(1, 2), 0.1)
