@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,18 +24,22 @@ EPISODE_FIELDS = (
 class RunDirectory:
     """Writes a run's files as the run goes on; every line is complete on disk when its call returns."""
 
-    def __init__(self, path: Path, config: RunConfig) -> None:
-        """Raises RunError where the folder can't be written."""
+    def __init__(self, path: Path, config: RunConfig, sizes: dict[str, int] | None = None) -> None:
+        """Begin a run's files, or go on with those cut back to `sizes` in bytes; RunError where that can't be."""
         self.path = path
         try:
             path.mkdir(parents=True, exist_ok=True)
             (path / "config.toml").write_text(to_toml(config), encoding="utf-8")
-            self._episodes = (path / "episodes.csv").open("w", newline="", encoding="utf-8", buffering=1)
-            self._metrics = (path / "metrics.jsonl").open("w", encoding="utf-8", buffering=1)
+            for name, size in (sizes or {}).items():
+                os.truncate(path / name, size)
+            mode = "w" if sizes is None else "a"
+            self._episodes = (path / "episodes.csv").open(mode, newline="", encoding="utf-8", buffering=1)
+            self._metrics = (path / "metrics.jsonl").open(mode, encoding="utf-8", buffering=1)
         except OSError as error:
             raise RunError(f"run directory {path}: {error.strerror or error}") from error
         self._csv = csv.writer(self._episodes, lineterminator="\n")
-        self._csv.writerow(EPISODE_FIELDS)
+        if sizes is None:
+            self._csv.writerow(EPISODE_FIELDS)
         self._board = SummaryWriter(str(path / "tb"))
 
     def episode(self, number: int, record: EpisodeRecord, update: int, s: float) -> None:
@@ -57,6 +62,11 @@ class RunDirectory:
         part = self.path / "summary.json.part"
         part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
         part.replace(self.path / "summary.json")
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system."""
+        self._episodes.flush()
+        self._metrics.flush()
 
     def close(self) -> None:
         """Flush and close all files."""

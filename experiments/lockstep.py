@@ -1,0 +1,195 @@
+"""Algorithm 1 exactly: act, store, sample, update, toggle, in one process with the roles' own objects."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from actors.policy import Policy
+from actors.segments import EpisodeTracker, SegmentAssembler
+from common import schedules
+from common.config import RunConfig
+from common.environments import Steps, make_vector_env
+from common.errors import UsageError
+from common.experience import Drawn, EpisodeRecord
+from common.types import EpisodeEnd
+from learner.agent import Agent
+from learner.curve import draw_learning_curve
+from learner.epochs import DONE, load_learner, save_epoch
+from learner.run_directory import RunDirectory
+from learner.telemetry import Telemetry
+from replay.table import Table
+
+METRICS_EVERY = 200  # updates
+
+
+class Lockstep:
+    """One run of Algorithm 1 with one emulator; deterministic to the bit for a seed.
+
+    step: environment steps done. telemetry: returns of the last 100 episodes.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        if config.actor.envs != 1:
+            raise UsageError(f"actor.envs = {config.actor.envs}: lockstep runs play one emulator")
+        env_seed, policy_seed = np.random.SeedSequence([config.seed, 3, 0]).spawn(2)
+        self.config = config
+        self.step = 0
+        self.env = make_vector_env(config.env, 1, int(env_seed.generate_state(1)[0]))
+        self.agent = Agent(config, self.env.spec)
+        self.telemetry = Telemetry()
+        self._policy_rng = np.random.default_rng(policy_seed)
+        first, second = self.agent.networks
+        self._policy = Policy((first, second), self.env.spec, self._policy_rng)
+        replay = config.replay
+        self._table = Table(
+            self.env.spec,
+            replay.capacity,
+            eviction=replay.eviction,
+            sampling=replay.sampling,
+            rng=np.random.default_rng([config.seed, 1]),
+            priority_exponent=replay.priority_exponent,
+            importance_exponent=replay.importance_exponent,
+        )
+        self._episodes = EpisodeTracker(1)
+        self._segments = SegmentAssembler(self.env.spec, 1, 0, 1)
+        self._actions: list[int] = []
+        self._obs = self.env.reset()
+        self._segments.begin(self._obs)
+
+    def play(self, directory: RunDirectory) -> None:
+        """One pass through Algorithm 1's inner loop."""
+        config, agent = self.config, self.agent
+        epsilon = schedules.epsilon(config.actor, self.step)
+        self._policy.acting = agent.acting
+        actions = self._policy.act(self._obs, epsilon)
+        steps = self.env.step(actions)
+        self._actions.append(int(actions[0]))
+        (segment,) = self._segments.add(actions, steps, agent.updates, {})
+        self._table.insert(segment)
+        self._obs = steps.obs
+        self.step += 1
+        for _ in range(self._due()):
+            self._update(directory, epsilon)
+        self._book(steps, epsilon, directory)
+        if config.learner.swap_by == "plays" and self.step % config.learner.swap_every == 0:
+            agent.swap()
+        if config.learner.reset_role_at_episode and steps.episode_over[0] and agent.acting:
+            agent.swap()
+
+    def _due(self) -> int:
+        """Updates that the replay ratio asks for after this step."""
+        replay = self.config.replay
+        since = self.step - replay.start
+        return 0 if since <= 0 else math.floor(replay.ratio * since) - math.floor(replay.ratio * (since - 1))
+
+    def _update(self, directory: RunDirectory, epsilon: float) -> None:
+        agent, table = self.agent, self._table
+        batch = table.sample(self.config.learner.batch_size)
+        result = agent.update(batch)
+        if self.config.replay.sampling == "prioritized" or self.config.replay.eviction == "prioritized":
+            table.update_priorities(batch.ids, result.td_errors.abs().cpu().numpy())
+        self.telemetry.add(agent, batch, result)
+        if agent.updates % METRICS_EVERY == 0:
+            drawn = Drawn(0, self.step, len(table), table.evicted, table.evicted_unsampled, 0, ())
+            directory.metrics(self.telemetry.row(agent, drawn, epsilon))
+
+    def _book(self, steps: Steps, epsilon: float, directory: RunDirectory) -> None:
+        for episode in self._episodes.add(steps):
+            q1_mean, q2_mean = self._policy.mean_values(steps.next_obs[0])
+            version = self.agent.updates
+            end = EpisodeEnd(0, episode.episode_return, episode.length, epsilon, q1_mean, q2_mean, version)
+            number = self.telemetry.episode(episode.episode_return)
+            directory.episode(number, EpisodeRecord(self.step, 0, 0, end), version, self.agent.exploration_rate())
+
+    def save(self, run_dir: Path) -> None:
+        """Save an epoch from which `restore` goes on to the bit."""
+        generator = self._policy_rng.bit_generator.state
+        state = {
+            "agent": self.agent.state(),
+            "returns": list(self.telemetry.returns),
+            "episodes": self.telemetry.episodes,
+            "step": self.step,
+            "policy": {**generator, "state": {name: str(value) for name, value in generator["state"].items()}},
+            "sizes": {name: (run_dir / name).stat().st_size for name in ("episodes.csv", "metrics.jsonl")},
+        }
+
+        def snapshot(folder: str) -> None:
+            path = run_dir / folder / "replay"
+            path.mkdir(exist_ok=True)
+            meta, arrays = self._table.state()
+            (path / "state.msgpack").write_bytes(msgpack.packb({"table": meta}))
+            for name, array in {**arrays, "played": np.array(self._actions, np.int32)}.items():
+                np.save(path / f"{name}.npy", array)
+
+        save_epoch(run_dir, self.step, state, snapshot)
+
+    def restore(self, epoch: Path) -> dict[str, int]:
+        """Go on where `save` was called; the sizes that the run's files had.
+
+        The emulator comes back by playing the same actions again: exact for every deterministic environment.
+        """
+        state = load_learner(epoch)
+        arrays = {path.stem: np.load(path) for path in (epoch / "replay").glob("*.npy")}
+        played = arrays.pop("played")
+        self._actions = []
+        for action in played:
+            actions = np.array([action], np.int32)
+            steps = self.env.step(actions)
+            self._segments.add(actions, steps, 0, {})
+            self._episodes.add(steps)
+            self._obs = steps.obs
+        self._actions = played.tolist()
+        meta = msgpack.unpackb((epoch / "replay" / "state.msgpack").read_bytes(), strict_map_key=False)["table"]
+        self._table.load_state(meta, arrays)
+        self.agent.load_state(state["agent"])
+        generator = state["policy"]
+        self._policy_rng.bit_generator.state = {
+            **generator,
+            "state": {name: int(value) for name, value in generator["state"].items()},
+        }
+        self.telemetry.returns.extend(state["returns"])
+        self.telemetry.episodes = state["episodes"]
+        self.step = state["step"]
+        sizes: dict[str, int] = state["sizes"]
+        return sizes
+
+
+def newest_epoch(run_dir: Path) -> Path | None:
+    """The newest complete epoch of a run directory."""
+    done = [path.parent for path in (run_dir / "checkpoints").glob(f"*/{DONE}")]
+    return max(done, key=lambda path: int(path.name), default=None)
+
+
+def summary(run: Lockstep, started: float, outcome: str) -> dict[str, Any]:
+    """summary.json of a lockstep run."""
+    config, telemetry = run.config, run.telemetry
+    return {
+        "method": config.method,
+        "env": config.env.id,
+        "seed": config.seed,
+        "env_steps": run.step,
+        "updates": run.agent.updates,
+        "episodes": telemetry.episodes,
+        "return_mean_100": telemetry.return_mean,
+        "return_sd_100": telemetry.return_sd,
+        "wall_seconds": round(time.monotonic() - started, 3),
+        "transitions_accepted": run.step,
+        "transitions_lost": 0,
+        "duplicates_refused": 0,
+        "exit": outcome,
+    }
+
+
+def finish(run: Lockstep, directory: RunDirectory, started: float, outcome: str) -> dict[str, Any]:
+    """Write what a run leaves at its end."""
+    run.save(directory.path)
+    values = summary(run, started, outcome)
+    directory.summary(values)
+    draw_learning_curve(directory.path, f"{values['env']}, {values['method']}, seed {values['seed']}, lockstep")
+    return values

@@ -1,0 +1,58 @@
+"""Lockstep runs: the same bytes for a seed, also through a kill -9, for every method."""
+
+import subprocess
+import sysconfig
+import time
+from pathlib import Path
+
+import pytest
+
+from common.cli import base_config
+from common.config import Method
+from experiments.lockstep import Lockstep
+from learner.run_directory import RunDirectory
+
+COMMAND = str(Path(sysconfig.get_path("scripts")) / "coop-lockstep")
+
+
+def _run(path: Path, method: Method, steps: int) -> Lockstep:
+    run = Lockstep(base_config(["--method", method]))
+    with RunDirectory(path, run.config) as directory:
+        for _ in range(steps):
+            run.play(directory)
+    run.env.close()
+    return run
+
+
+@pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
+def test_the_same_bytes_for_a_seed(method: Method, tmp_path: Path) -> None:
+    first, second = (_run(tmp_path / name, method, 700) for name in "ab")
+    content = (tmp_path / "a" / "episodes.csv").read_bytes()
+    assert content.count(b"\n") > 10
+    assert (tmp_path / "b" / "episodes.csv").read_bytes() == content
+    assert first.agent.updates == second.agent.updates == 700 - first.config.replay.start
+
+
+def test_killed_and_resumed_to_the_byte(tmp_path: Path) -> None:
+    flags = ["--total-steps", "1500", "--checkpoint-every", "300", "--seed", "4"]
+    whole = subprocess.run([COMMAND, *flags, "--run-dir", str(tmp_path / "a")], capture_output=True, check=True)
+    assert b"complete: 1,500 steps" in whole.stdout
+    torn = [COMMAND, *flags, "--run-dir", str(tmp_path / "b")]
+    with subprocess.Popen(torn, stdout=subprocess.DEVNULL) as process:
+        while not (tmp_path / "b" / "checkpoints" / "600" / "DONE").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.kill()
+    assert not (tmp_path / "b" / "summary.json").exists()
+    subprocess.run([*torn, "--resume"], capture_output=True, check=True)
+    episodes = [(tmp_path / name / "episodes.csv").read_bytes() for name in "ab"]
+    assert episodes[0] == episodes[1]
+
+
+def test_resuming_something_else_is_refused(tmp_path: Path) -> None:
+    _run(tmp_path / "a", "coop", 5)
+    for flags in (["--run-dir", str(tmp_path / "none")], ["--run-dir", str(tmp_path / "a"), "--seed", "9"]):
+        done = subprocess.run([COMMAND, "--resume", *flags], capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert "--resume" in done.stderr
