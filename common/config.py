@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -246,7 +246,15 @@ def _first_problem(error: pydantic.ValidationError) -> str:
     first, *rest = error.errors(include_url=False)
     name = ".".join(str(part) for part in first["loc"])
     if first["type"] == "unexpected_keyword_argument":
-        text = f"{name}: no such field"
+        text = f"{name} = {first['input']!r}: no such field; allowed: {', '.join(_siblings(first['loc']))}"
     else:
         text = f"{name} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
     return f"{text} (and {len(rest)} more)" if rest else text
+
+
+def _siblings(path: tuple[int | str, ...]) -> list[str]:
+    """The fields that are allowed where the last name of `path` stands."""
+    place: Any = RunConfig()
+    for name in path[:-1]:
+        place = getattr(place, str(name))
+    return [field.name for field in fields(place)]

@@ -59,6 +59,10 @@ def run_main(program: str, main: Callable[[], None]) -> None:
     except CoopError as error:
         print(f"{program}: error: {error}", file=sys.stderr, flush=True)
         sys.exit(error.exit_status)
+    except BrokenPipeError:
+        # Whoever read our output has gone; the interpreter must not try to flush what is left.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr, flush=True)
         sys.exit(130)

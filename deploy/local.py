@@ -134,7 +134,7 @@ def _run() -> None:
     title = f"{config.env.id}, {config.method}, seed {config.seed}: {directory}"
     interrupted = False
     try:
-        with Display(status, title) as display:
+        with Display(status) as display:
             display.say(title)
             while not topology.check(display):
                 display.update()

@@ -62,9 +62,8 @@ class RunStatus:
 class Display:
     """Shows a status: a live panel on a terminal, a line now and then elsewhere."""
 
-    def __init__(self, status: RunStatus, title: str) -> None:
+    def __init__(self, status: RunStatus) -> None:
         self._status = status
-        self._title = title
         self._console = Console()
         self._live = Live(console=self._console, refresh_per_second=4, transient=True)
         self._due = time.monotonic() + PLAIN_EVERY
@@ -92,7 +91,7 @@ class Display:
 
     def _panel(self) -> RenderableType:
         told = self._status.learner
-        table = Table(show_header=False, box=None, title=self._title, title_justify="left")
+        table = Table(show_header=False, box=None)
         table.add_column(style="dim")
         table.add_column()
         if not told:

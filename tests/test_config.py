@@ -56,8 +56,8 @@ def test_refused_in_one_line(flags: list[str], words: list[str], monkeypatch: py
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
-        ({"replay": {"capcity": 5}}, "replay.capcity: no such field"),
-        ({"speed": 5}, "speed: no such field"),
+        ({"replay": {"capcity": 5}}, "replay.capcity = 5: no such field; allowed: capacity, start"),
+        ({"speed": 5}, "speed = 5: no such field; allowed: run, method"),
         ({"replay": 5}, "replay = 5"),
         ({"replay": {"capacity": "many"}}, "replay.capacity = 'many'"),
     ],
