@@ -200,8 +200,8 @@ def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     if method is not None:
         merged["method"] = method
     chosen = merged.get("method", RunConfig.method)
-    for section, fields in tables.get("methods", {}).get(chosen, {}).items():
-        merged[section] = {**merged.get(section, {}), **fields}
+    for section, overrides in tables.get("methods", {}).get(chosen, {}).items():
+        merged[section] = {**merged.get(section, {}), **overrides}
     return validated(merged)
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from common import cli
-from common.errors import PeerLost
+from common.errors import PeerLost, RunError
 from common.joining import join
 from common.lifecycle import Stop, run_main
-from common.messages import Join
+from common.messages import Join, Joined
 from common.options import RoleOptions
 from common.transport import Node, locators, new_incarnation, open_session
 from replay.core import ReplayCore
 from replay.service import ReplayService
+from replay.stats import estimated_bytes
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,22 @@ def _run() -> None:
         request = Join("replay", incarnation, locators(session))
         joined = join(node, stop, request, options.connect, options.join_timeout)
         if joined is not None:
+            _check_memory(joined)
             service = ReplayService(node, ReplayCore(joined.config, joined.spec), joined.spec, options.run_dir)
             service.start()
             service.run(stop)
     if stop.failed:
         raise PeerLost(stop.reason)
+
+
+def _check_memory(joined: Joined) -> None:
+    """Refuse a table that this machine can't hold; other evictions than fifo may keep stack + 1 frames a transition."""
+    capacity = joined.config.replay.capacity
+    copies = 1 if joined.config.replay.eviction == "fifo" else joined.spec.stack + 1
+    needed = estimated_bytes(joined.spec, capacity) * copies
+    present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > present:
+        raise RunError(
+            f"replay.capacity = {capacity:,}: needs up to {needed / 2**30:.1f} GiB, this machine has "
+            f"{present / 2**30:.1f} GiB"
+        )
