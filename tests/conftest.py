@@ -7,9 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 from common.transport import Node, new_incarnation, open_session
 from common.types import EnvSpec
+
+# Default threads of several torch processes starve each other.
+torch.set_num_threads(1)
 
 SETTLE = 10.0  # seconds that threads and processes get to end
 
