@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from reprlib import repr as shown
 from typing import Any, Protocol
 
 from common.errors import BadMessage
@@ -29,7 +30,7 @@ class Int:
         """See `Rule`."""
         if type(value) is int and self.low <= value <= self.high:
             return None
-        return f"{value!r}; an integer from {self.low} to {self.high}"
+        return f"{shown(value)}; an integer from {self.low} to {self.high}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class Real:
         """See `Rule`."""
         if type(value) in (int, float) and math.isfinite(value):
             return None
-        return f"{value!r}; a finite number"
+        return f"{shown(value)}; a finite number"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from reprlib import repr as shown
 from typing import Any
 
 import msgpack
@@ -25,6 +26,7 @@ MAX_HEADER = 1 << 20
 MAX_PAYLOAD = 1 << 30
 MAX_ARRAYS = 64
 MAX_DIMENSIONS = 8
+MAX_NAME = 64
 DTYPES = frozenset({"uint8", "bool", "int32", "int64", "uint64", "float32", "float64"})
 
 _PREFIX = struct.Struct("<II")
@@ -98,10 +100,12 @@ def _header(payload: bytes) -> tuple[dict[str, Any], int]:
     if not isinstance(header, dict) or header.keys() != {"protocol", "kind", "run", "fields", "arrays"}:
         raise BadMessage("header", "must hold exactly protocol, kind, run, fields, arrays")
     if header["protocol"] != PROTOCOL:
-        raise BadMessage("protocol", f"version {header['protocol']!r}; this process speaks {PROTOCOL}")
+        raise BadMessage("protocol", f"version {shown(header['protocol'])}; this process speaks {PROTOCOL}")
     for name, kind in (("kind", str), ("run", str), ("fields", dict), ("arrays", list)):
         if not isinstance(header[name], kind):
             raise BadMessage(name, f"must be a {kind.__name__}")
+    if not all(isinstance(name, str) for name in header["fields"]):
+        raise BadMessage("fields", "names must be strings")
     if len(header["arrays"]) > MAX_ARRAYS:
         raise BadMessage("arrays", f"{len(header['arrays'])} of them; at most {MAX_ARRAYS}")
     return header, _aligned(_PREFIX.size + length)
@@ -111,13 +115,17 @@ def _view(payload: bytes, start: int, entry: Any) -> tuple[str, Array]:  # noqa:
     if not isinstance(entry, list) or len(entry) != 4:
         raise BadMessage("arrays", "each entry is [name, dtype, shape, offset]")
     name, dtype, shape, offset = entry
-    if not isinstance(name, str) or not isinstance(dtype, str) or dtype not in DTYPES:
-        raise BadMessage("arrays", f"dtype {dtype!r}; allowed: {', '.join(sorted(DTYPES))}")
+    if not isinstance(name, str) or len(name) > MAX_NAME:
+        raise BadMessage("arrays", f"name {shown(name)}; a string of at most {MAX_NAME} characters")
+    if not isinstance(dtype, str) or dtype not in DTYPES:
+        raise BadMessage(f"arrays.{name}", f"dtype {shown(dtype)}; allowed: {', '.join(sorted(DTYPES))}")
     if not isinstance(shape, list) or len(shape) > MAX_DIMENSIONS or not all(map(_is_length, shape)):
-        raise BadMessage(f"arrays.{name}", f"shape {shape!r}")
+        raise BadMessage(f"arrays.{name}", f"shape {shown(shape)}")
+    if math.prod(filter(None, shape)) > MAX_PAYLOAD:  # numpy refuses even an empty array of such a shape
+        raise BadMessage(f"arrays.{name}", f"shape {shape}; at most {MAX_PAYLOAD} items")
     size = math.prod(shape)
     if not _is_length(offset) or offset % ALIGNMENT:
-        raise BadMessage(f"arrays.{name}", f"offset {offset!r}; a multiple of {ALIGNMENT}")
+        raise BadMessage(f"arrays.{name}", f"offset {shown(offset)}; a multiple of {ALIGNMENT}")
     kind = np.dtype(dtype)
     if size and start + offset + size * kind.itemsize > len(payload):
         raise BadMessage(

@@ -43,9 +43,22 @@ def _with(**changes: object) -> bytes:
     return _packed(msgpack.packb({name: value for name, value in header.items() if value is not ...}))
 
 
+def _nested(depth: int) -> object:
+    value: object = None
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
 def _packed(header: bytes, magic: int = wire.MAGIC, length: int | None = None) -> bytes:
     prefix = struct.pack("<II", magic, len(header) if length is None else length)
     return prefix + header + bytes(256)
+
+
+# The deepest nesting that msgpack reads, deeper than Python can print.
+_DEEPEST = msgpack.packb({"kind": "k", "run": "r", "fields": {}, "arrays": []}).replace(
+    b"\x84", b"\x85\xa8protocol" + b"\x91" * 1000 + b"\xc0", 1
+)
 
 
 @pytest.mark.parametrize(
@@ -61,19 +74,30 @@ def _packed(header: bytes, magic: int = wire.MAGIC, length: int | None = None) -
         (_with(extra=1), "header"),
         (_with(run=...), "header"),
         (_with(protocol=2), "protocol"),
+        (_with(protocol=_nested(400)), "protocol"),
+        (_packed(_DEEPEST), "protocol"),
         (_with(kind=5), "kind"),
         (_with(run=None), "run"),
         (_with(fields=[]), "fields"),
+        (_with(fields={b"x": 1}), "fields"),
         (_with(arrays={}), "arrays"),
         (_with(arrays=[["a", "uint8", [0], 0]] * 65), "arrays"),
         (_with(arrays=[["a", "uint8", [1]]]), "arrays"),
-        (_with(arrays=[["a", "object", [1], 0]]), "arrays"),
+        (_with(arrays=[[1, "uint8", [1], 0]]), "arrays"),
+        (_with(arrays=[["a" * 65, "uint8", [1], 0]]), "arrays"),
+        (_with(arrays=[["a", "object", [1], 0]]), "arrays.a"),
+        (_with(arrays=[["a", 5, [1], 0]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", 1, 0]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [1.0], 0]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [0, 2**30, 2**30, 2**30], 0]]), "arrays.a"),
         (_with(arrays=[["a", "uint8", [-1], 0]]), "arrays.a"),
         (_with(arrays=[["a", "uint8", [True], 0]]), "arrays.a"),
         (_with(arrays=[["a", "uint8", [2**40], 0]]), "arrays.a"),
         (_with(arrays=[["a", "float64", [2**15, 2**15, 2**15], 0]]), "arrays.a"),
         (_with(arrays=[["a", "uint8", [1] * 9, 0]]), "arrays.a"),
         (_with(arrays=[["a", "uint8", [1], 3]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [1], -64]]), "arrays.a"),
+        (_with(arrays=[["a", "uint8", [1], None]]), "arrays.a"),
         (_with(arrays=[["a", "uint8", [1], 64 * 100]]), "arrays.a"),
         (_with(arrays=[["a", "uint8", [1], 0], ["a", "uint8", [1], 64]]), "arrays.a"),
     ],
@@ -84,7 +108,14 @@ def test_refused_by_name(payload: bytes, field: str) -> None:
     assert caught.value.field == field
 
 
-@settings(max_examples=2000)
+def test_a_refusal_is_short() -> None:
+    payload = _with(kind="k" * 100_000, protocol="p" * 100_000)
+    with pytest.raises(BadMessage) as caught:
+        wire.decode(payload)
+    assert len(str(caught.value)) < 200
+
+
+@settings(max_examples=2000, deadline=None)
 @given(st.data())
 def test_no_mutation_raises_anything_else(data: st.DataObject) -> None:
     arrays = {"a": np.arange(9, dtype=np.float32), "b": np.zeros((2, 3), np.uint8)}
