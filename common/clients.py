@@ -109,8 +109,6 @@ class InsertClient:
         while True:
             try:
                 if self._accept(sent.pending.wait(), sent):
-                    self._backoff.reset()
-                    self.waiting = ""
                     return True
             except NoAnswer:
                 self.waiting = "the replay service does not answer"
@@ -124,6 +122,8 @@ class InsertClient:
             return False
         self.inserted = max(self.inserted, messages.decode_ack(message))
         self.acked += sent.steps
+        self.waiting = ""
+        self._backoff.reset()
         return True
 
 

@@ -7,7 +7,7 @@ retry                the limiter's answer to an insert or a sample, with the rea
 weights, role        the learner's broadcasts
 status               what a role is doing, for displays
 stats, snapshot      questions to the replay service
-error                the answer to a bad message: the field and the problem
+error                the answer to a message that is bad (names the field) or that could not be carried out
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 from common import wire
 from common.config import RunConfig, to_tables, validated
-from common.errors import BadMessage, UsageError
+from common.errors import BadMessage, CoopError, UsageError
 from common.schema import Int, ListOf, Row, Rule, Schema, Table, Text
 from common.types import Array, EnvSpec
 from common.wire import Message
@@ -180,9 +180,10 @@ def decode_retry(message: Message) -> str:
     return str(message.fields["reason"])
 
 
-def encode_error(run: str, error: BadMessage) -> bytearray:
-    """Build the answer to a bad message."""
-    return wire.encode("error", run, {"field": error.field, "problem": str(error)[:4096]})
+def encode_error(run: str, error: CoopError) -> bytearray:
+    """Build the answer to a bad message, or to one that could not be carried out."""
+    field = error.field if isinstance(error, BadMessage) else ""
+    return wire.encode("error", run, {"field": field, "problem": str(error)[:4096]})
 
 
 def decode_error(message: Message) -> str:

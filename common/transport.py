@@ -18,7 +18,7 @@ from typing import Any, Self
 import zenoh
 
 from common import messages, wire
-from common.errors import BadMessage, RunError, UsageError
+from common.errors import BadMessage, CoopError, RunError, UsageError
 from common.lifecycle import Stop
 from common.wire import Message
 
@@ -43,7 +43,7 @@ class NoAnswer(RunError):
 
 
 class Refused(RunError):
-    """The peer found our message bad, and said why."""
+    """The peer found our message bad or could not do what it asks, and said why."""
 
 
 def new_incarnation() -> int:
@@ -90,15 +90,16 @@ def locators(session: zenoh.Session) -> list[str]:
 class Pending:
     """A query under way."""
 
-    def __init__(self, handler: Any) -> None:  # noqa: ANN401 (zenoh's handler of replies)
+    def __init__(self, handler: Any, key: str) -> None:  # noqa: ANN401 (zenoh's handler of replies)
         self._handler = handler
+        self._key = key
 
     def ready(self) -> Message | None:
         """The answer if it is there, else None; raises as `wait`."""
         try:
             reply = self._handler.try_recv()
         except zenoh.ZError as error:
-            raise NoAnswer("no answer") from error
+            raise NoAnswer(f"no answer to {self._key}") from error
         return None if reply is None else _answer(reply)
 
     def wait(self) -> Message:
@@ -106,12 +107,12 @@ class Pending:
 
         Raises:
             NoAnswer: nobody serves this key, or the time-out passed.
-            Refused: the peer found the message bad.
+            Refused: the peer found the message bad, or could not do what it asks.
         """
         try:
             return _answer(self._handler.recv())
         except zenoh.ZError as error:
-            raise NoAnswer("no answer") from error
+            raise NoAnswer(f"no answer to {self._key}") from error
 
 
 class Node:
@@ -148,7 +149,7 @@ class Node:
             congestion_control=zenoh.CongestionControl.BLOCK,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
-        return Pending(handler)
+        return Pending(handler, key)
 
     def ask(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Message:
         """Send a query and wait for its answer; raises as `Pending.wait`."""
@@ -158,7 +159,7 @@ class Node:
         """Answer the queries on `key`, one after the other, in a thread of its own, until the session closes.
 
         A message that does not decode, names another run, or that `answer` refuses with BadMessage gets an error
-        reply, is counted, and changes nothing.
+        reply, is counted, and changes nothing. Any other CoopError of `answer` becomes an error reply too.
         """
         queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(depth), complete=True)
         thread = threading.Thread(target=self._serve, args=(queryable, key, answer), name=f"serve {key}", daemon=True)
@@ -174,8 +175,8 @@ class Node:
             with query:
                 try:
                     reply = answer(self.read(query.payload))
-                except BadMessage as error:
-                    self.bad_messages += 1
+                except CoopError as error:
+                    self.bad_messages += isinstance(error, BadMessage)
                     with contextlib.suppress(zenoh.ZError):
                         query.reply_err(messages.encode_error(self.run, error))
                     continue

@@ -47,13 +47,14 @@ class LearnerService:
         """Train to the end; the summary, as it is on disk.
 
         Raises:
-            RunError: the replay service found a request bad, or gave an answer that is not one.
+            CoopError: the replay service found a request bad, gave an answer that is not one, or could not save itself.
         """
-        outcome = "failed"
+        outcome = ""
         try:
             while not (outcome := self._outcome()):
                 self._turn()
-        except RunError as error:
+            self._save()
+        except Exception as error:
             outcome = f"failed: {error}"
             raise
         finally:
@@ -125,13 +126,20 @@ class LearnerService:
             }
         )
 
-    def _finish(self, outcome: str) -> dict[str, Any]:
-        """Collect the last counters, save the epoch, write the summary, and send everybody home."""
+    def _save(self) -> None:
+        """Save the closing epoch; there is none before the first update, or where the replay service is gone."""
+        updates = self._agent.updates
+        if not updates or self._replay_stats() is None:
+            return
         try:
-            stats = self._replay_stats()
-            if stats is not None and self._agent.updates:
-                save_epoch(self._directory.path, self._agent.updates, self._state(), self._snapshot)
-            summary = self._summary(outcome, stats)
+            save_epoch(self._directory.path, updates, self._state(), self._snapshot)
+        except OSError as error:
+            raise RunError(f"checkpoint {updates} in {self._directory.path}: {error.strerror or error}") from error
+
+    def _finish(self, outcome: str) -> dict[str, Any]:
+        """Collect the last counters, write the summary, and send everybody home."""
+        try:
+            summary = self._summary(outcome, self._replay_stats())
             self._directory.summary(summary)
             draw_learning_curve(self._directory.path, f"{summary['env']}, {summary['method']}, seed {summary['seed']}")
         finally:

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from common import experience, messages
 from common.clients import replay_key
+from common.errors import RunError
 from common.experience import SegmentReader
 from common.lifecycle import Stop
 from common.messages import ReplayStats
@@ -136,5 +137,8 @@ class ReplayService:
     def _snapshot(self, message: Message) -> bytearray:
         folder = messages.decode_snapshot(message)
         path = self._snapshots / folder / "replay"
-        save_snapshot(self._core, self._changed, path)
+        try:
+            save_snapshot(self._core, self._changed, path)
+        except OSError as error:
+            raise RunError(f"snapshot {path}: {error.strerror or error}") from error
         return messages.encode_ack(self._node.run, self._core.table.inserted)
