@@ -7,6 +7,7 @@ batch     its answer; also carries the episodes that ended
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass
 from typing import Any
 
@@ -118,16 +119,8 @@ class SegmentReader:
         steps, frames = lengths["steps"], lengths["frames"]
         if not 1 <= steps <= MAX_SEGMENT_STEPS:
             raise BadMessage("arrays.actions", f"{steps} steps; allowed: 1 to {MAX_SEGMENT_STEPS}")
-        for name in ("obs_index", "next_index"):
-            _within(f"arrays.{name}", arrays[name], 0, frames - 1)
-        _within("arrays.actions", arrays["actions"], 0, self._spec.num_actions - 1)
+        _check_transitions(self._spec, arrays)
         _within("arrays.param_version", arrays["param_version"], 0, 2**62)
-        if not np.isfinite(arrays["rewards"]).all():
-            raise BadMessage("arrays.rewards", "not finite")
-        if arrays["frames"].dtype == np.float32 and not np.isfinite(arrays["frames"]).all():
-            raise BadMessage("arrays.frames", "not finite")
-        if arrays["terminated"].view(np.uint8).max() > 1:
-            raise BadMessage("arrays.terminated", "not boolean")
         if fields["carried"] > frames:
             raise BadMessage("fields.carried", f"{fields['carried']} of {frames} frames")
         episodes = tuple(EpisodeEnd(*row) for row in fields["episodes"])
@@ -135,6 +128,24 @@ class SegmentReader:
             raise BadMessage("fields.episodes", "an episode ends beyond the segment")
         values: dict[str, Any] = {**fields, **arrays, "episodes": episodes}
         return Segment(**values)
+
+
+def _check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
+    """Check the values that segments and batches share: at least one transition each."""
+    frames = arrays["frames"]
+    for name in ("obs_index", "next_index"):
+        _within(f"arrays.{name}", arrays[name], 0, len(frames) - 1)
+    _within("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
+    _finite("arrays.rewards", arrays["rewards"])
+    if frames.dtype == np.float32:
+        _finite("arrays.frames", frames)
+    if arrays["terminated"].view(np.uint8).max() > 1:
+        raise BadMessage("arrays.terminated", "not boolean")
+
+
+def _finite(field: str, array: Array) -> None:
+    if not np.isfinite(array).all():
+        raise BadMessage(field, "not finite")
 
 
 def _within(field: str, array: Array, low: int, high: int) -> None:
@@ -196,10 +207,10 @@ class BatchReader:
 
     def __call__(self, message: Message) -> tuple[Batch, Drawn]:
         """Read one; raises BadMessage."""
-        lengths = self._schema.check(message)
-        for name in ("obs_index", "next_index"):
-            _within(f"arrays.{name}", message.arrays[name], 0, lengths["frames"] - 1)
-        _within("arrays.actions", message.arrays["actions"], 0, self._spec.num_actions - 1)
+        if not self._schema.check(message)["batch"]:
+            raise BadMessage("arrays.actions", "an empty batch")
+        _check_transitions(self._spec, message.arrays)
+        _finite("arrays.weights", message.arrays["weights"])
         fields = dict(message.fields)
         fields["episodes"] = tuple(
             EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in fields["episodes"]

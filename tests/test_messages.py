@@ -1,167 +1,262 @@
-"""Messages: valid ones come back whole, and each broken field is refused by its name."""
+"""Messages: valid ones come back whole, and whatever is wrong with one is refused by the name of its field."""
 
+import contextlib
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from samples import make_segment
 
 from common import experience, messages, wire
-from common.config import RunConfig
-from common.errors import BadMessage
+from common.config import RunConfig, to_tables
+from common.errors import BadMessage, RunError
 from common.experience import BatchReader, Drawn, EpisodeRecord, SegmentReader
 from common.messages import Join, Joined, ReplayStats, Role
-from common.types import EnvSpec, EpisodeEnd
+from common.types import Batch, EnvSpec, EpisodeEnd
 from common.wire import Message
 from replay.table import Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
+END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]
+RECORD = [4, 7, 0, END]
+STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
+JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"])
+TABLES = to_tables(RunConfig())
+FLAT = np.arange(3, dtype=np.float32)
 
 
-def _batch() -> tuple[Any, Drawn]:
+def _batch() -> tuple[Batch, Drawn]:
     table = Table(SPEC, 100, rng=np.random.default_rng(0))
     table.insert(make_segment(SPEC))
     end = EpisodeRecord(4, 7, 0, EpisodeEnd(3, 1.5, 4, 0.1, 0.2, 0.3, 5))
     return table.sample(8), Drawn(3, 4, 4, 0, 0, 0, (end,))
 
 
-def _decoded(payload: bytearray) -> Message:
-    return wire.decode(bytes(payload))
+READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
+    "join": (messages.encode_join("r", Join("replay", 5, ["tcp/127.0.0.1:1"])), messages.decode_join),
+    "joined": (messages.encode_joined(JOINED), messages.decode_joined),
+    "insert": (experience.encode_segment("r", make_segment(SPEC)), SegmentReader(SPEC)),
+    "ack": (messages.encode_ack("r", 9), messages.decode_ack),
+    "retry": (messages.encode_retry("r", "later"), messages.decode_retry),
+    "error": (messages.encode_error("r", BadMessage("f", "wrong")), messages.decode_error),
+    "sample": (experience.encode_sample("r", 1, 2, 3, 4), experience.decode_sample),
+    "batch": (experience.encode_batch("r", *_batch()), BatchReader(SPEC)),
+    "weights": (messages.encode_weights("r", 2, 8, FLAT), partial(messages.decode_weights, parameters=3)),
+    "role": (messages.encode_role("r", Role(2, (4, 5), 6)), messages.decode_role),
+    "stats": (messages.encode_stats("r", STATS), messages.decode_stats),
+    "snapshot": (messages.encode_snapshot("r", "checkpoints/12"), messages.decode_snapshot),
+    "current": (messages.encode_question("r", "current"), partial(messages.decode_question, "current")),
+}
 
 
-STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
-JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"])
+def _valid(kind: str) -> Message:
+    return wire.decode(bytes(READERS[kind][0]))
 
 
-def test_everything_comes_back() -> None:
-    join = Join("replay", 5, ["tcp/127.0.0.1:1"])
-    assert messages.decode_join(_decoded(messages.encode_join("r", join))) == join
-    assert messages.decode_joined(_decoded(messages.encode_joined(JOINED))) == JOINED
-    role = Role(2, (4, 5), 6)
-    assert messages.decode_role(_decoded(messages.encode_role("r", role))) == role
-    assert messages.decode_stats(_decoded(messages.encode_stats("r", STATS))) == STATS
-    assert messages.decode_retry(_decoded(messages.encode_retry("r", "later"))) == "later"
-    assert messages.decode_ack(_decoded(messages.encode_ack("r", 9))) == 9
-    assert experience.decode_sample(_decoded(experience.encode_sample("r", 1, 2, 3, 4))) == (1, 2, 3, 4)
-    number, version, flat = messages.decode_weights(
-        _decoded(messages.encode_weights("r", 2, 8, np.arange(3, dtype=np.float32))), 3
-    )
-    assert (number, version, flat.tolist()) == (2, 8, [0.0, 1.0, 2.0])
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        ("join", Join("replay", 5, ["tcp/127.0.0.1:1"])),
+        ("joined", JOINED),
+        ("ack", 9),
+        ("retry", "later"),
+        ("error", "f: wrong"),
+        ("sample", (1, 2, 3, 4)),
+        ("role", Role(2, (4, 5), 6)),
+        ("stats", STATS),
+        ("snapshot", "checkpoints/12"),
+        ("current", None),
+    ],
+)
+def test_everything_comes_back(kind: str, value: object) -> None:
+    assert READERS[kind][1](_valid(kind)) == value
 
 
-def test_segments_and_batches_come_back() -> None:
-    segment = make_segment(SPEC, sequence=3)
-    back = SegmentReader(SPEC)(_decoded(experience.encode_segment("r", segment)))
+def test_an_error_that_is_not_about_a_field_comes_back() -> None:
+    payload = messages.encode_error("r", RunError("disk full"))
+    assert messages.decode_error(wire.decode(bytes(payload))) == "disk full"
+
+
+def test_arrays_come_back() -> None:
+    number, version, flat = READERS["weights"][1](_valid("weights"))
+    assert (number, version, flat.tolist()) == (2, 8, FLAT.tolist())
+    segment, back = make_segment(SPEC), READERS["insert"][1](_valid("insert"))
     assert back.episodes == segment.episodes
     for name in ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version"):
         np.testing.assert_array_equal(getattr(back, name), getattr(segment, name))
     batch, drawn = _batch()
-    batch_back, drawn_back = BatchReader(SPEC)(_decoded(experience.encode_batch("r", batch, drawn)))
+    batch_back, drawn_back = READERS["batch"][1](_valid("batch"))
     assert drawn_back == drawn
-    np.testing.assert_array_equal(batch_back.frames[batch_back.obs_index], batch.frames[batch.obs_index])
+    for name in ("frames", "obs_index", "next_index", "actions", "rewards", "weights", "ids", "age", "reuse"):
+        np.testing.assert_array_equal(getattr(batch_back, name), getattr(batch, name))
 
 
-def _breaking(array: str, place: Any, value: Any) -> Callable[[Message], Message]:
-    def change(message: Message) -> Message:
-        arrays = {name: np.array(a) for name, a in message.arrays.items()}
-        arrays[array][place] = value
-        return replace(message, arrays=arrays)
-
-    return change
-
-
-def _with_array(name: str, value: Any) -> Callable[[Message], Message]:
-    return lambda message: replace(message, arrays={**message.arrays, name: value})
-
-
-def _with_field(name: str, value: Any) -> Callable[[Message], Message]:
-    return lambda message: replace(message, fields={**message.fields, name: value})
-
-
-END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        (lambda message: replace(message, kind="sample"), "kind"),
-        (_with_field("extra", 1), "fields"),
-        (_with_field("incarnation", -1), "fields.incarnation"),
-        (_with_field("incarnation", True), "fields.incarnation"),
-        (_with_field("stream", 65_536), "fields.stream"),
-        (_with_field("sequence", "1"), "fields.sequence"),
-        (_with_field("carried", 6), "fields.carried"),
-        (_with_field("episodes", [END[:-1]]), "fields.episodes"),
-        (_with_field("episodes", [[4, *END[1:]]]), "fields.episodes"),
-        (_with_field("episodes", [[3, float("nan"), *END[2:]]]), "fields.episodes"),
-        (_with_array("extra", np.zeros(1)), "arrays"),
-        (_with_array("frames", np.zeros((5, 4), np.float64)), "arrays.frames"),
-        (_with_array("frames", np.zeros((5, 3), np.float32)), "arrays.frames"),
-        (_with_array("frames", np.zeros((0, 4), np.float32)), "arrays.obs_index"),
-        (_with_array("actions", np.zeros(5, np.int32)), "arrays.actions"),
-        (_with_array("actions", np.zeros((4, 1), np.int32)), "arrays.actions"),
-        (_breaking("frames", 0, np.inf), "arrays.frames"),
-        (_breaking("obs_index", 0, -1), "arrays.obs_index"),
-        (_breaking("next_index", 3, 5), "arrays.next_index"),
-        (_breaking("actions", 1, 2), "arrays.actions"),
-        (_breaking("rewards", 1, np.nan), "arrays.rewards"),
-        (_breaking("param_version", 1, -3), "arrays.param_version"),
-    ],
-)
-def test_a_bad_segment_is_refused_by_field(change: Callable[[Message], Message], field: str) -> None:
-    message = _decoded(experience.encode_segment("r", make_segment(SPEC)))
-    with pytest.raises(BadMessage) as caught:
-        SegmentReader(SPEC)(change(message))
-    assert caught.value.field == field
-
-
-def _spec_table(**changes: Any) -> dict[str, Any]:
+def _spec(**changes: object) -> dict[str, object]:
     table = {"env_id": "x", "frame_shape": [4], "frame_dtype": "float32", "stack": 1, "num_actions": 2}
     return {**table, **changes}
 
 
+FIELDS = [
+    ("join", "role", "boss"),
+    ("join", "role", 5),
+    ("join", "incarnation", 2**63),
+    ("join", "endpoints", ["x"] * 17),
+    ("join", "endpoints", ["x" * 257]),
+    ("joined", "config", {"learning": 1}),
+    ("joined", "config", {**TABLES, "replay": {"capacity": -1}}),
+    ("joined", "config", []),
+    ("joined", "layout", "x" * 65),
+    ("joined", "index", -1),
+    ("joined", "replay_endpoints", "tcp/h:1"),
+    ("joined", "spec", {}),
+    ("joined", "spec", _spec(frame_shape=[0])),
+    ("insert", "incarnation", -1),
+    ("insert", "incarnation", True),
+    ("insert", "stream", 65_536),
+    ("insert", "sequence", "1"),
+    ("insert", "carried", 6),
+    ("insert", "carried", -1),
+    ("insert", "acked", 1.0),
+    ("insert", "episodes", [END[:-1]]),
+    ("insert", "episodes", [[4, *END[1:]]]),
+    ("insert", "episodes", [[3, math.nan, *END[2:]]]),
+    ("ack", "inserted", None),
+    ("retry", "reason", 5),
+    ("error", "problem", "x" * 4097),
+    ("sample", "batch_size", 0),
+    ("sample", "batch_size", 65_537),
+    ("sample", "sequence", -1),
+    ("sample", "episodes_from", -1),
+    ("batch", "sequence", -1),
+    ("batch", "episodes", [RECORD[:-1]]),
+    ("batch", "episodes", [[*RECORD[:3], [3, math.inf, *END[2:]]]]),
+    ("weights", "network", 0),
+    ("weights", "version", -1),
+    ("role", "acting", 3),
+    ("role", "versions", [1]),
+    ("role", "versions", [1, -1]),
+    ("role", "updates", "many"),
+    ("stats", "lost", -1),
+    ("stats", "samples_wait_for", None),
+    ("snapshot", "folder", "../../etc"),
+    ("snapshot", "folder", "checkpoints/../12"),
+    ("snapshot", "folder", "/checkpoints/1"),
+    ("snapshot", "folder", "checkpoints/1\n"),
+    ("snapshot", "folder", "checkpoints/1\0"),
+]
+
+
+@pytest.mark.parametrize(("kind", "field", "value"), FIELDS)
+def test_a_bad_field_is_refused_by_name(kind: str, field: str, value: object) -> None:
+    message = _valid(kind)
+    with pytest.raises(BadMessage) as caught:
+        READERS[kind][1](replace(message, fields={**message.fields, field: value}))
+    assert caught.value.field == f"fields.{field}"
+
+
 @pytest.mark.parametrize(
-    ("decode", "payload", "change", "field"),
-    [
-        (messages.decode_join, messages.encode_join("r", Join("boss", 1, [])), None, "fields.role"),
-        (messages.decode_join, messages.encode_join("r", Join("actor", 1, ["x"] * 17)), None, "fields.endpoints"),
-        (messages.decode_joined, messages.encode_joined(JOINED), _with_field("config", {"a": 1}), "fields.config"),
-        (messages.decode_joined, messages.encode_joined(JOINED), _with_field("spec", {}), "fields.spec"),
-        (
-            messages.decode_joined,
-            messages.encode_joined(JOINED),
-            _with_field("spec", _spec_table(frame_dtype="object")),
-            "fields.spec.frame_dtype",
-        ),
-        (
-            messages.decode_joined,
-            messages.encode_joined(JOINED),
-            _with_field("spec", _spec_table(num_actions=0)),
-            "fields.spec.num_actions",
-        ),
-        (experience.decode_sample, experience.encode_sample("r", 1, 1, 0, 0), None, "fields.batch_size"),
-        (messages.decode_snapshot, messages.encode_snapshot("r", "../../etc"), None, "fields.folder"),
-        (messages.decode_snapshot, messages.encode_snapshot("r", "checkpoints/1\n"), None, "fields.folder"),
-        (messages.decode_role, messages.encode_role("r", Role(3, (0, 0), 0)), None, "fields.acting"),
-        (messages.decode_stats, messages.encode_stats("r", STATS), _with_field("lost", -1), "fields.lost"),
-    ],
+    ("field", "value"),
+    [("env_id", 5), ("frame_dtype", "object"), ("stack", 0), ("stack", 65), ("num_actions", 0)],
 )
-def test_other_bad_messages(
-    decode: Callable[[Message], Any],
-    payload: bytearray,
-    change: Callable[[Message], Message] | None,
-    field: str,
-) -> None:
-    message = _decoded(payload)
+def test_a_bad_specification_is_refused_by_name(field: str, value: object) -> None:
+    message = _valid("joined")
     with pytest.raises(BadMessage) as caught:
-        decode(change(message) if change else message)
-    assert caught.value.field == field
+        messages.decode_joined(replace(message, fields={**message.fields, "spec": _spec(**{field: value})}))
+    assert caught.value.field == f"fields.spec.{field}"
 
 
-def test_weights_of_another_size_are_refused() -> None:
-    message = _decoded(messages.encode_weights("r", 1, 0, np.zeros(3, np.float32)))
+ARRAYS = [
+    ("insert", "frames", np.zeros((5, 4), np.float64), "frames"),
+    ("insert", "frames", np.zeros((5, 3), np.float32), "frames"),
+    ("insert", "frames", np.zeros((0, 4), np.float32), "obs_index"),
+    ("insert", "frames", np.full((5, 4), np.inf, np.float32), "frames"),
+    ("insert", "obs_index", np.array([[0], [1], [-1], [3]], np.int32), "obs_index"),
+    ("insert", "obs_index", np.zeros((4, 2), np.int32), "obs_index"),
+    ("insert", "next_index", np.array([[1], [2], [3], [5]], np.int32), "next_index"),
+    ("insert", "actions", np.zeros(5, np.int32), "actions"),
+    ("insert", "actions", np.zeros((4, 1), np.int32), "actions"),
+    ("insert", "actions", np.array([0, 1, 2, 0], np.int32), "actions"),
+    ("insert", "actions", np.array([0, 1, -1, 0], np.int32), "actions"),
+    ("insert", "rewards", np.array([0, np.nan, 0, 0], np.float32), "rewards"),
+    ("insert", "rewards", np.array([0, 0, 0, -np.inf], np.float32), "rewards"),
+    ("insert", "terminated", np.array([0, 1, 2, 0], np.uint8).view(np.bool_), "terminated"),
+    ("insert", "param_version", np.array([0, 0, -3, 0]), "param_version"),
+    ("batch", "frames", np.zeros((5, 4), np.uint8), "frames"),
+    ("batch", "obs_index", np.full((8, 1), 5, np.int32), "obs_index"),
+    ("batch", "next_index", np.full((8, 1), -1, np.int32), "next_index"),
+    ("batch", "actions", np.full(8, 2, np.int32), "actions"),
+    ("batch", "actions", np.zeros(7, np.int32), "actions"),
+    ("batch", "rewards", np.full(8, np.nan, np.float32), "rewards"),
+    ("batch", "terminated", np.full(8, 3, np.uint8).view(np.bool_), "terminated"),
+    ("batch", "weights", np.full(8, np.inf, np.float32), "weights"),
+    ("weights", "flat", np.zeros(4, np.float32), "flat"),
+    ("weights", "flat", np.zeros(3), "flat"),
+]
+
+
+@pytest.mark.parametrize(("kind", "array", "value", "named"), ARRAYS)
+def test_a_bad_array_is_refused_by_name(kind: str, array: str, value: Any, named: str) -> None:
+    message = _valid(kind)
     with pytest.raises(BadMessage) as caught:
-        messages.decode_weights(message, 4)
-    assert caught.value.field == "arrays.flat"
+        READERS[kind][1](replace(message, arrays={**message.arrays, array: value}))
+    assert caught.value.field == f"arrays.{named}"
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_every_kind_refuses_what_is_missing_or_unknown(kind: str) -> None:
+    message, read = _valid(kind), READERS[kind][1]
+    wrong = {
+        "kind": replace(message, kind="other"),
+        "fields": replace(message, fields={**message.fields, "extra": 1}),
+        "arrays": replace(message, arrays={**message.arrays, "extra": np.zeros(1, np.float32)}),
+    }
+    for field, changed in wrong.items():
+        with pytest.raises(BadMessage) as caught:
+            read(changed)
+        assert caught.value.field == field
+    for name in message.fields:
+        with pytest.raises(BadMessage, match=f"fields: missing {name}"):
+            read(replace(message, fields={key: value for key, value in message.fields.items() if key != name}))
+    for name in message.arrays:
+        with pytest.raises(BadMessage, match=f"arrays: missing {name}"):
+            read(replace(message, arrays={key: value for key, value in message.arrays.items() if key != name}))
+
+
+@pytest.mark.parametrize("kind", ["insert", "batch"])
+def test_nothing_at_all_is_refused(kind: str) -> None:
+    message = _valid(kind)
+    arrays = {name: array if name == "frames" else array[:0] for name, array in message.arrays.items()}
+    with pytest.raises(BadMessage) as caught:
+        READERS[kind][1](replace(message, arrays=arrays))
+    assert caught.value.field == "arrays.actions"
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5) | st.binary(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4) | st.binary(), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@pytest.mark.parametrize("kind", READERS)
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_no_value_raises_anything_else(kind: str, data: st.DataObject) -> None:
+    message, read = _valid(kind), READERS[kind][1]
+    fields = dict(message.fields)
+    place = data.draw(st.sampled_from([*fields, "extra"]))
+    inner = fields.get(place)
+    if isinstance(inner, dict) and data.draw(st.booleans()):
+        name = data.draw(st.sampled_from([*inner, "extra"]))
+        fields[place] = {**inner, name: data.draw(ANYTHING)}
+    else:
+        fields[place] = data.draw(ANYTHING)
+    payload = wire.encode(message.kind, message.run, fields, message.arrays)
+    with contextlib.suppress(BadMessage):
+        read(wire.decode(bytes(payload)))
