@@ -25,6 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from learner.backprop import Chain, Tape
+from learner.memory import keep_freed_memory
 from learner.polar import polar_by_svd
 from learner.transforms import Transforms
 
@@ -45,6 +46,7 @@ class FeedbackRule:
     ) -> None:
         if feedback not in FEEDBACKS:
             raise ValueError(f"feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
+        keep_freed_memory()
         self.chain = Chain(network)
         self.feedback = feedback
         self._seed = seed

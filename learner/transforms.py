@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from learner.backprop import Chain, Tape
-from learner.polar import inverse_root, polar_by_svd
+from learner.polar import polar_by_svd, whitened
 
 # Rows at least this long are combined by a batched product; below, its cost per matrix outweighs its speed.
 _LONG_ROW = 2048
@@ -39,18 +39,8 @@ class Transforms:
             if len(self._layers) > 1 or not self._linear_end:
                 ts.append(_flat(t).to(output.dtype))
         # Neighbours of one shape are handled together: [layers, batch or 1, A, n], the last layer first.
-        self._groups = [torch.stack(list(group)) for _, group in groupby(ts, lambda t: t.shape)]
-        self._roots, self._safe = self._inverse_roots()
-        self._all_safe = bool(self._safe.all())
-
-    def _inverse_roots(self) -> tuple[Tensor, Tensor]:
-        """G(i)^(-1/2) and where it can be trusted: [layers, batch, A, A], bool [layers, batch]."""
-        batch, actions = self._batch, self._actions
-        grams = [self._basis.new_empty(0, batch, actions, actions)]
-        for ts in self._groups:
-            rows = ts.flatten(0, 1)
-            grams.append(torch.bmm(rows, rows.mT).view(len(ts), -1, actions, actions).expand(-1, batch, -1, -1))
-        return inverse_root(torch.cat(grams))
+        groups = [list(group) for _, group in groupby(ts, lambda t: t.shape)]
+        self._groups = [torch.stack(group) if len(group) > 1 else group[0].unsqueeze(0) for group in groups]
 
     def pull(self, error: Tensor, plain: float, s: float) -> Iterator[tuple[int, Tensor]]:
         """(step, (plain T(i) + s U V^T)^T e) for each layer, the last first: error [batch, A] -> [batch, *shape]."""
@@ -58,16 +48,17 @@ class Transforms:
         if self._linear_end:
             yield next(layers)[0], error * (plain + s)
         e = error @ self._basis.mT
-        weights = (self._roots * e.mul(s).unsqueeze(-2)).sum(-1)
+        white, unsafe = self._whitened(e.unsqueeze(-1))
+        weights = white.squeeze(-1).mul_(s)
         if plain:
             weights.add_(e, alpha=plain)
         first = 0
         for ts in self._groups:
             sigmas = _combine(weights[first : first + len(ts)], ts)
-            for sigma, t in zip(sigmas.unbind(0), ts, strict=True):
-                if not self._all_safe:
-                    unsafe, factor = self._repair(first, t)
-                    sigma[unsafe] += s * _combine(e[unsafe].unsqueeze(0), factor.unsqueeze(0))[0]
+            for sigma, t in zip(sigmas, ts, strict=True):
+                if unsafe is not None:
+                    samples, factor = self._repair(unsafe[first], t)
+                    sigma[samples] += s * _combine(e[samples].unsqueeze(0), factor.unsqueeze(0))[0]
                 index, shape = next(layers)
                 yield index, _shaped(sigma, shape)
                 first += 1
@@ -76,23 +67,36 @@ class Transforms:
         """(step, B(i) = T(i) + s U V^T), the last first: [batch, A, n_i], images in the order of channels first."""
         found = []
         layers = iter(self._layers)
+        identity = torch.eye(self._actions, dtype=self._basis.dtype, device=self._basis.device)
         if self._linear_end:
-            identity = torch.eye(self._actions, dtype=self._basis.dtype, device=self._basis.device)
-            found.append((next(layers)[0], identity.mul_(1 + s).expand(self._batch, -1, -1)))
+            found.append((next(layers)[0], (identity * (1 + s)).expand(self._batch, -1, -1)))
+        roots, unsafe = self._whitened(identity)
         for i, t in enumerate(t for ts in self._groups for t in ts):
-            b = t + s * (self._roots[i] @ t)
-            if not self._all_safe:
-                unsafe, factor = self._repair(i, t)
-                b[unsafe] += s * factor
+            b = t + s * (roots[i] @ t)
+            if unsafe is not None:
+                samples, factor = self._repair(unsafe[i], t)
+                b[samples] += s * factor
             b = self._basis.mT @ b
             index, shape = next(layers)
             found.append((index, _shaped(b.flatten(0, 1), shape).reshape(b.shape)))
         return found
 
-    def _repair(self, i: int, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Samples of layer i whose Gram matrix is of no use, and their polar factors: [k], [k, A, n_i]."""
-        unsafe = (~self._safe[i]).nonzero().squeeze(1)
-        return unsafe, polar_by_svd(t.expand(self._batch, -1, -1)[unsafe])
+    def _whitened(self, e: Tensor) -> tuple[Tensor, Tensor | None]:
+        """G(i)^(-1/2) e, [batch or 1, A, k], of each layer held, and where that is of no use.
+
+        [layers, batch, A, k] and bool [layers, batch], or None.
+        """
+        shape = (-1, self._actions, self._actions)
+        grams = [e.new_empty(0, self._batch, *shape[1:])]
+        for ts in self._groups:
+            rows = ts.flatten(0, 1)
+            grams.append(torch.bmm(rows, rows.mT).view(len(ts), *shape).expand(-1, self._batch, -1, -1))
+        return whitened(torch.cat(grams), e)
+
+    def _repair(self, unsafe: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """The unsafe samples of a layer, and their polar factors: [k], [k, A, n_i]."""
+        samples = unsafe.nonzero().squeeze(1)
+        return samples, polar_by_svd(t.expand(self._batch, -1, -1)[samples])
 
 
 def _combine(weights: Tensor, ts: Tensor) -> Tensor:
