@@ -82,26 +82,26 @@ class Chain:
         cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
         share, and then stays 1 until a ReLU tells samples apart. dtype: what to compute in, the network's if None.
         """
-        k = cotangent.shape[1]
-        rows = cotangent.flatten(0, 1)
+        rows = cotangent
         fresh = False  # whether rows is ours to overwrite
         first = self.parametrised[0]
         for index in range(len(self._steps) - 1, first - 1, -1):
             step, weight, h = self._steps[index], self._weights[index], tape.inputs[index]
             if weight is not None:
-                yield index, rows.view(-1, k, *rows.shape[1:])
+                yield index, rows
                 if index == first:
                     return
                 weight = weight if dtype is None else weight.to(dtype)
                 rows = _transposed(step, rows, weight, h) if isinstance(step, nn.Conv2d) else rows @ weight
                 fresh = True
             elif isinstance(step, nn.ReLU):
-                rows = _masked(rows, tape.output_of(index), k, fresh)
+                rows = _masked(rows, tape.output_of(index), fresh)
                 fresh = True
+            elif h.dim() == 4:
+                pictures = rows.reshape(-1, *h.shape[1:]).contiguous(memory_format=torch.channels_last)
+                rows = pictures.view(*rows.shape[:2], *h.shape[1:])
             else:
-                rows = rows.view(-1, *h.shape[1:])
-                if rows.dim() == 4:
-                    rows = rows.contiguous(memory_format=torch.channels_last)
+                rows = rows.view(*rows.shape[:2], *h.shape[1:])
 
     def write(self, tape: Tape, index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
         """Write the gradients of step `index`'s parameters, given delta [batch, *output] at its pre-activation."""
@@ -127,29 +127,28 @@ class Chain:
                 self.write(tape, index, delta.squeeze(1), out)
 
 
-def _masked(rows: Tensor, activation: Tensor, k: int, in_place: bool) -> Tensor:
-    """Cotangents [b * k, *shape] of a ReLU's output, whose value is `activation` [batch, *shape], at its input."""
-    if k == 1 and len(rows) == len(activation):
-        masked: Tensor = torch.ops.aten.threshold_backward(rows, activation, 0)
+def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:
+    """Cotangents [b, k, *shape] of a ReLU's output, whose value is `activation` [batch, *shape], at its input."""
+    if rows.shape[1] == 1:
+        masked: Tensor = torch.ops.aten.threshold_backward(rows, activation.unsqueeze(1), 0)
         return masked
-    mask = activation.sign().to(rows.dtype).unsqueeze(1)  # a ReLU's output is never negative
-    per_sample = rows.view(-1, k, *rows.shape[1:])
-    if in_place and len(per_sample) == len(mask):
-        per_sample.mul_(mask)
-        return rows
-    told_apart: Tensor = per_sample * mask
-    return told_apart.flatten(0, 1)
+    mask = activation.sign().unsqueeze(1)  # a ReLU's output is never negative
+    mask = mask if mask.dtype == rows.dtype else mask.to(rows.dtype)
+    return rows.mul_(mask) if in_place and rows.shape[0] == mask.shape[0] else rows * mask
 
 
 def _transposed(conv: nn.Conv2d, rows: Tensor, weight: Tensor, h: Tensor) -> Tensor:
-    """Cotangents [rows, *output] of a convolution of h [batch, *input], at its input: [rows, *input]."""
+    """Cotangents [b, k, *output] of a convolution of h [batch, *input], at its input: [b, k, *input]."""
     spare = [
         h.shape[2 + i] + 2 * int(conv.padding[i]) - conv.dilation[i] * (conv.kernel_size[i] - 1) - 1
-        - (rows.shape[2 + i] - 1) * conv.stride[i]
+        - (rows.shape[3 + i] - 1) * conv.stride[i]
         for i in (0, 1)
     ]  # fmt: skip
     padding = [int(p) for p in conv.padding]
-    return F.conv_transpose2d(rows, weight, None, conv.stride, padding, spare, conv.groups, conv.dilation)
+    pictures = F.conv_transpose2d(
+        rows.flatten(0, 1), weight, None, conv.stride, padding, spare, conv.groups, conv.dilation
+    )
+    return pictures.view(*rows.shape[:2], *pictures.shape[1:])
 
 
 def _leaves(module: nn.Module, prefix: str) -> Iterator[tuple[str, nn.Module]]:

@@ -79,10 +79,10 @@ class FeedbackRule:
         """sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e for every layer, then its gradients."""
         transforms = Transforms(self.chain, tape, self._polar_dtype)
         if self._polar_dtype is None:
-            for index, sigma in transforms.pull(error, 1.0, s):
+            for index, sigma in transforms.pull(error, s):
                 self.chain.write(tape, index, sigma, out)
         else:
-            polar_parts = dict(transforms.pull(error, 0.0, s))
+            polar_parts = dict(transforms.pull(error, s, polar_only=True))
             for index, delta in self.chain.walk(tape, error.unsqueeze(1)):
                 self.chain.write(tape, index, delta.squeeze(1) + polar_parts[index], out)
 

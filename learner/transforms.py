@@ -12,9 +12,6 @@ from torch import Tensor
 from learner.backprop import Chain, Tape
 from learner.polar import polar_by_svd, whitened
 
-# Rows at least this long are combined by a batched product; below, its cost per matrix outweighs its speed.
-_LONG_ROW = 2048
-
 
 class Transforms:
     """T(i) = d y / d a(i) of every layer with parameters, for each sample of a batch, ready to be applied.
@@ -29,82 +26,72 @@ class Transforms:
         """dtype: what to compute the T(i) in, the network's if None; their algebra is done in float32 or better."""
         output = tape.output
         self._batch, self._actions = output.shape
-        self._linear_end = chain.output_weight is not None
         self._basis = _basis(chain.output_weight, output)
+        walk = chain.walk(tape, self._basis.unsqueeze(0) if dtype is None else self._basis.unsqueeze(0).to(dtype), dtype)
+        self._linear_end = next(walk)[0] if chain.output_weight is not None else None
+        # The layers held, the last first: step, shape of its output, and T as [batch or 1, A, n].
         self._layers: list[tuple[int, torch.Size]] = []
-        ts: list[Tensor] = []
-        start = self._basis.unsqueeze(0)
-        for index, t in chain.walk(tape, start if dtype is None else start.to(dtype), dtype):
+        self._ts: list[Tensor] = []
+        for index, t in walk:
             self._layers.append((index, t.shape[2:]))
-            if len(self._layers) > 1 or not self._linear_end:
-                ts.append(_flat(t).to(output.dtype))
-        # Neighbours of one shape are handled together: [layers, batch or 1, A, n], the last layer first.
-        groups = [list(group) for _, group in groupby(ts, lambda t: t.shape)]
+            self._ts.append(_flat(t) if dtype is None else _flat(t).to(output.dtype))
+        # Neighbours of one shape are handled together: [layers, batch or 1, A, n].
+        groups = [list(group) for _, group in groupby(self._ts, Tensor.size)]
         self._groups = [torch.stack(group) if len(group) > 1 else group[0].unsqueeze(0) for group in groups]
 
-    def pull(self, error: Tensor, plain: float, s: float) -> Iterator[tuple[int, Tensor]]:
-        """(step, (plain T(i) + s U V^T)^T e) for each layer, the last first: error [batch, A] -> [batch, *shape]."""
-        layers = iter(self._layers)
-        if self._linear_end:
-            yield next(layers)[0], error * (plain + s)
-        e = error @ self._basis.mT
-        white, unsafe = self._whitened(e.unsqueeze(-1))
-        weights = white.squeeze(-1).mul_(s)
-        if plain:
-            weights.add_(e, alpha=plain)
-        first = 0
+    def pull(self, error: Tensor, s: float, polar_only: bool = False) -> Iterator[tuple[int, Tensor]]:
+        """(step, B(i)^T e) for each layer, the last first: error [batch, A] -> [batch, *shape].
+
+        polar_only: s (U V^T)^T e instead of (T(i) + s U V^T)^T e.
+        """
+        if self._linear_end is not None:
+            yield self._linear_end, error * s if polar_only else torch.add(error, error, alpha=s)
+        e = torch.mm(error, self._basis.t())
+        layers = iter(zip(self._layers, self._ts, strict=True))
         for ts in self._groups:
-            sigmas = _combine(weights[first : first + len(ts)], ts)
-            for sigma, t in zip(sigmas, ts, strict=True):
-                if unsafe is not None:
-                    samples, factor = self._repair(unsafe[first], t)
-                    sigma[samples] += s * _combine(e[samples].unsqueeze(0), factor.unsqueeze(0))[0]
-                index, shape = next(layers)
+            white, doubtful = whitened(self._gram(ts), e)
+            sigmas = _combined(white * s if polar_only else torch.add(e, white, alpha=s), ts)
+            for i, sigma in enumerate(sigmas.unbind(0)):
+                (index, shape), t = next(layers)
+                if doubtful is not None:
+                    where = doubtful[i]
+                    sigma[where] += s * (e[where].unsqueeze(-2) @ self._by_svd(t, where)).squeeze(-2)
                 yield index, _shaped(sigma, shape)
-                first += 1
 
     def matrices(self, s: float) -> list[tuple[int, Tensor]]:
         """(step, B(i) = T(i) + s U V^T), the last first: [batch, A, n_i], images in the order of channels first."""
         found = []
-        layers = iter(self._layers)
-        identity = torch.eye(self._actions, dtype=self._basis.dtype, device=self._basis.device)
-        if self._linear_end:
-            found.append((next(layers)[0], (identity * (1 + s)).expand(self._batch, -1, -1)))
-        roots, unsafe = self._whitened(identity)
-        for i, t in enumerate(t for ts in self._groups for t in ts):
-            b = t + s * (roots[i] @ t)
-            if unsafe is not None:
-                samples, factor = self._repair(unsafe[i], t)
-                b[samples] += s * factor
+        units = torch.eye(self._actions, dtype=self._basis.dtype, device=self._basis.device)
+        if self._linear_end is not None:
+            found.append((self._linear_end, (units * (1 + s)).expand(self._batch, -1, -1)))
+        for (index, shape), t in zip(self._layers, self._ts, strict=True):
+            columns = [whitened(self._gram(t.unsqueeze(0))[0], unit) for unit in units]
+            b = t + s * (torch.stack([column for column, _ in columns], -1) @ t)
+            doubtful = columns[0][1]
+            if doubtful is not None:
+                b[doubtful] += s * self._by_svd(t, doubtful)
             b = self._basis.mT @ b
-            index, shape = next(layers)
             found.append((index, _shaped(b.flatten(0, 1), shape).reshape(b.shape)))
         return found
 
-    def _whitened(self, e: Tensor) -> tuple[Tensor, Tensor | None]:
-        """G(i)^(-1/2) e, [batch or 1, A, k], of each layer held, and where that is of no use.
+    def _gram(self, ts: Tensor) -> Tensor:
+        """G(i) = T(i) T(i)^T of layers of one shape: [layers, batch, A, A]."""
+        rows = ts.flatten(0, 1)
+        gram = torch.bmm(rows, rows.mT).view(ts.shape[0], -1, self._actions, self._actions)
+        return gram if gram.shape[1] == self._batch else gram.expand(-1, self._batch, -1, -1)
 
-        [layers, batch, A, k] and bool [layers, batch], or None.
-        """
-        shape = (-1, self._actions, self._actions)
-        grams = [e.new_empty(0, self._batch, *shape[1:])]
-        for ts in self._groups:
-            rows = ts.flatten(0, 1)
-            grams.append(torch.bmm(rows, rows.mT).view(len(ts), *shape).expand(-1, self._batch, -1, -1))
-        return whitened(torch.cat(grams), e)
-
-    def _repair(self, unsafe: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """The unsafe samples of a layer, and their polar factors: [k], [k, A, n_i]."""
-        samples = unsafe.nonzero().squeeze(1)
-        return samples, polar_by_svd(t.expand(self._batch, -1, -1)[samples])
+    def _by_svd(self, t: Tensor, where: Tensor) -> Tensor:
+        """Polar factors of the samples of T [batch or 1, A, n] that are true in `where`: [k, A, n]."""
+        return polar_by_svd(t.expand(self._batch, -1, -1)[where])
 
 
-def _combine(weights: Tensor, ts: Tensor) -> Tensor:
+def _combined(weights: Tensor, ts: Tensor) -> Tensor:
     """sum_a w_a t_a: weights [layers, batch, A], ts [layers, batch or 1, A, n] -> [layers, batch, n]."""
+    if weights.shape[-1] == 2:
+        (v, w), (t, u) = weights.unsqueeze(-1).unbind(2), ts.unbind(2)
+        return torch.addcmul(v * t, w, u)
     if ts.shape[1] < weights.shape[1]:
         return weights @ ts.squeeze(1)
-    if ts.shape[-1] < _LONG_ROW:
-        return (weights.unsqueeze(-1) * ts).sum(-2)
     return (weights.unsqueeze(-2) @ ts).squeeze(-2)
 
 
@@ -127,12 +114,12 @@ def _sum_and_difference(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def _flat(t: Tensor) -> Tensor:
     """[b, A, channels, height, width] with channels last in memory, as [b, A, n] without a copy."""
-    return t.permute(0, 1, 3, 4, 2).flatten(2) if t.dim() == 5 else t.flatten(2)
+    return t.permute(0, 1, 3, 4, 2).flatten(2) if t.dim() == 5 else t
 
 
 def _shaped(rows: Tensor, shape: torch.Size) -> Tensor:
     """[rows, n] of `_flat` back to [rows, *shape]."""
-    if len(shape) == 3:
-        channels, height, width = shape
-        return rows.view(-1, height, width, channels).permute(0, 3, 1, 2)
-    return rows.view(-1, *shape)
+    if len(shape) == 1:
+        return rows
+    channels, height, width = shape
+    return rows.view(-1, height, width, channels).permute(0, 3, 1, 2)
