@@ -17,6 +17,8 @@ from common.types import Batch, EnvSpec, Segment
 from common.wire import Message
 
 REPLAY_SHARD = "0"
+NO_ANSWER = "the replay service does not answer"
+BAD_ANSWER = "the replay service's answer is bad"
 
 
 def replay_key(node: Node, what: str) -> str:
@@ -95,11 +97,12 @@ class InsertClient:
             sent = self._outstanding[0]
             try:
                 message = sent.pending.ready()
-            except NoAnswer:
+                if message is None:
+                    return
+                accepted = self._accept(message, sent)
+            except (NoAnswer, BadMessage):
                 return  # the next full window will send it again
-            if message is None:
-                return
-            if not self._accept(message, sent):
+            if not accepted:
                 sent.pending = self._node.begin(self._key, sent.payload)
                 return
             self._outstanding.popleft()
@@ -111,7 +114,9 @@ class InsertClient:
                 if self._accept(sent.pending.wait(), sent):
                     return True
             except NoAnswer:
-                self.waiting = "the replay service does not answer"
+                self.waiting = NO_ANSWER
+            except BadMessage as error:
+                self.waiting = f"{BAD_ANSWER}: {error}"
             if self._backoff.pause(self._stop):
                 return False
             sent.pending = self._node.begin(self._key, sent.payload)
@@ -152,7 +157,6 @@ class SampleClient:
 
         Raises:
             Refused: the replay service found a request bad.
-            BadMessage: its answer is not a batch.
         """
         while len(self._outstanding) < self._prefetch:
             self._outstanding.append((self._next, self._request(self._next)))
@@ -160,15 +164,16 @@ class SampleClient:
         sequence, pending = self._outstanding[0]
         try:
             message = pending.wait()
-        except NoAnswer:
-            self.waiting = "the replay service does not answer"
-            self._backoff.pause(self._stop)
-        else:
             if message.kind != "retry":
+                accepted = self._accept(message, sequence)
                 self._outstanding.popleft()
-                return self._accept(message, sequence)
+                return accepted
             self.waiting = messages.decode_retry(message)
-            self._backoff.pause(self._stop)
+        except NoAnswer:
+            self.waiting = NO_ANSWER
+        except BadMessage as error:
+            self.waiting = f"{BAD_ANSWER}: {error}"
+        self._backoff.pause(self._stop)
         self._outstanding[0] = (sequence, self._request(sequence))
         return None
 

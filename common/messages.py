@@ -4,7 +4,7 @@ join / joined        a role asks the learner for the run
 insert / ack         a segment for the table, and its receipt
 sample / batch       the learner draws; also carries the episodes that ended
 retry                the limiter's answer to an insert or a sample, with the reason in words
-weights, role        the learner's broadcasts
+weights, role, stop  the learner's broadcasts
 status               what a role is doing, for displays
 stats, snapshot      questions to the replay service
 error                the answer to a message that is bad (names the field) or that could not be carried out
@@ -100,6 +100,7 @@ _STATS = Schema(
     {},
 )
 _SNAPSHOT = Schema("snapshot", {"folder": Text(256)}, {})
+_STOP = Schema("stop", {"reason": Text()}, {})
 _FOLDER = re.compile(r"checkpoints/[0-9]{1,12}")
 
 
@@ -252,4 +253,10 @@ def decode_snapshot(message: Message) -> str:
 
 def encode_stop(run: str, reason: str) -> bytearray:
     """Build the broadcast that ends the run."""
-    return wire.encode("stop", run, {"reason": reason})
+    return wire.encode("stop", run, {"reason": reason[:1024]})
+
+
+def decode_stop(message: Message) -> str:
+    """Read why the run ends; raises BadMessage."""
+    _STOP.check(message)
+    return str(message.fields["reason"])

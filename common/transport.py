@@ -33,6 +33,7 @@ _QUIET = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "listen/exit_on_failure": True,
     "transport/link/rx/buffer_size": 4 << 20,
+    "transport/link/rx/max_message_size": wire.MAX_PAYLOAD + (1 << 16),
     "transport/link/tx/queue/size/data": 16,
     "transport/shared_memory/enabled": False,
 }
@@ -220,8 +221,10 @@ class Node:
         timers = self._timers
 
         def stopped(sample: zenoh.Sample) -> None:
-            with contextlib.suppress(BadMessage):
-                stop.set(str(self.read(sample.payload).fields.get("reason", "stopped")))
+            try:
+                stop.set(messages.decode_stop(self.read(sample.payload)))
+            except BadMessage:
+                self.bad_messages += 1
 
         def learner(sample: zenoh.Sample) -> None:
             while timers:
@@ -275,10 +278,13 @@ class Latest:
 
 def _answer(reply: zenoh.Reply) -> Message:
     if reply.ok is not None:
-        return wire.decode(reply.ok.payload.to_bytes())
-    error = reply.err
-    assert error is not None
-    raw = error.payload.to_bytes()
+        try:
+            return wire.decode(reply.ok.payload.to_bytes())
+        except BadMessage as error:
+            raise NoAnswer(f"an answer that can't be read: {error}") from error
+    failure = reply.err
+    assert failure is not None
+    raw = failure.payload.to_bytes()
     try:
         problem = messages.decode_error(wire.decode(raw))
     except BadMessage:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
@@ -10,8 +11,24 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from common.errors import BadMessage
+from common.schema import Int, Real, Rule, Text
+from common.schema import Table as TableOf
 from common.transport import Node, open_session
+
+# What a display needs of the learner's status; a status where it does not fit is not shown.
+_SHOWN: dict[str, Rule] = {
+    "env_steps": Int(),
+    "total_steps": Int(),
+    "updates": Int(),
+    "updates_per_s": Real(),
+    "acting": Int(1, 2),
+    "episodes": Int(),
+    "return_mean_100": Real(),
+    "epsilon": Real(),
+    "s": Real(),
+    "waiting": Text(),
+    "connected": TableOf(),
+}
 
 PLAIN_EVERY = 5.0  # seconds between lines where the output is no terminal
 
@@ -31,7 +48,7 @@ class RunStatus:
     def refresh(self) -> None:
         """Take in what has been told since."""
         message = self._learner.take()
-        if message is not None and message.kind == "status":
+        if message is not None and message.kind == "status" and _can_be_shown(message.fields):
             self.learner = dict(message.fields)
 
     def line(self) -> str:
@@ -39,14 +56,11 @@ class RunStatus:
         told = self.learner
         if not told:
             return "waiting for the learner"
-        try:
-            text = (
-                f"step {told['env_steps']:,}/{told['total_steps']:,}  return {told['return_mean_100']:.1f} "
-                f"(last 100 of {told['episodes']:,} episodes)  {told['updates_per_s']:.0f} updates/s  "
-                f"network {told['acting']} acts  {self.connected()}"
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise BadMessage("status", str(error)) from error
+        text = (
+            f"step {told['env_steps']:,}/{told['total_steps']:,}  return {told['return_mean_100']:.1f} "
+            f"(last 100 of {told['episodes']:,} episodes)  {told['updates_per_s']:.0f} updates/s  "
+            f"network {told['acting']} acts  {self.connected()}"
+        )
         return f"{text}  [{told['waiting']}]" if told.get("waiting") else text
 
     def connected(self) -> str:
@@ -57,6 +71,10 @@ class RunStatus:
     def close(self) -> None:
         """Leave the run."""
         self._node.close()
+
+
+def _can_be_shown(fields: Mapping[str, Any]) -> bool:
+    return all(rule.problem(fields.get(name)) is None for name, rule in _SHOWN.items())
 
 
 class Display:

@@ -122,6 +122,7 @@ class LearnerService:
                 "epsilon": self._epsilon(),
                 "s": self._agent.exploration_rate(),
                 "waiting": self._samples.waiting,
+                "bad_messages": self._node.bad_messages,
                 "connected": self._node.alive(),
             }
         )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from common.config import RunConfig
-from common.experience import Drawn, EpisodeRecord
+from common.experience import MAX_EPISODES, Drawn, EpisodeRecord
 from common.types import Batch, EnvSpec, Segment
 from replay.dedup import SeenWindow
 from replay.limiter import RateLimiter
@@ -50,6 +50,7 @@ class ReplayCore:
         self.limiter = RateLimiter(
             settings.ratio, settings.start, settings.tolerance, config.total_steps, settings.capacity
         )
+        self.batch_size = config.learner.batch_size
         self.drawn = 0
         self.duplicates = 0
         self.inserts_wait_for = ""
@@ -108,7 +109,7 @@ class ReplayCore:
             evicted=table.evicted,
             evicted_unsampled=table.evicted_unsampled,
             first_episode=min(episodes_from, len(self._episodes)),
-            episodes=tuple(self._episodes[episodes_from:]),
+            episodes=tuple(self._episodes[episodes_from : episodes_from + MAX_EPISODES]),
         )
         self._replies[incarnation, sequence] = batch, drawn
         if len(self._replies) > REPLIES_KEPT:

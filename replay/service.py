@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from common import experience, messages
 from common.clients import replay_key
-from common.errors import RunError
+from common.errors import BadMessage, RunError
 from common.experience import SegmentReader
 from common.lifecycle import Stop
 from common.messages import ReplayStats
@@ -111,6 +111,8 @@ class ReplayService:
 
     def _sample(self, message: Message) -> bytearray:
         request = experience.decode_sample(message)
+        if request[2] != self._core.batch_size:
+            raise BadMessage("fields.batch_size", f"{request[2]}; this run draws {self._core.batch_size}")
         outcome = self._admit(self._draws, lambda: self._core.draw(*request))
         if isinstance(outcome, Wait):
             return messages.encode_retry(self._node.run, outcome.reason)

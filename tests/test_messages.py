@@ -51,6 +51,7 @@ READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "role": (messages.encode_role("r", Role(2, (4, 5), 6)), messages.decode_role),
     "stats": (messages.encode_stats("r", STATS), messages.decode_stats),
     "snapshot": (messages.encode_snapshot("r", "checkpoints/12"), messages.decode_snapshot),
+    "stop": (messages.encode_stop("r", "complete"), messages.decode_stop),
     "current": (messages.encode_question("r", "current"), partial(messages.decode_question, "current")),
 }
 
@@ -71,6 +72,7 @@ def _valid(kind: str) -> Message:
         ("role", Role(2, (4, 5), 6)),
         ("stats", STATS),
         ("snapshot", "checkpoints/12"),
+        ("stop", "complete"),
         ("current", None),
     ],
 )
@@ -144,6 +146,7 @@ FIELDS = [
     ("role", "updates", "many"),
     ("stats", "lost", -1),
     ("stats", "samples_wait_for", None),
+    ("stop", "reason", None),
     ("snapshot", "folder", "../../etc"),
     ("snapshot", "folder", "checkpoints/../12"),
     ("snapshot", "folder", "/checkpoints/1"),

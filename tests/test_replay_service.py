@@ -10,7 +10,7 @@ from samples import make_segment
 
 from common import experience, messages
 from common.clients import InsertClient, SampleClient, replay_key
-from common.config import ReplaySettings, RunConfig
+from common.config import LearnerSettings, ReplaySettings, RunConfig
 from common.errors import RunError
 from common.lifecycle import Stop
 from common.transport import NoAnswer, Node, Refused, locators, new_incarnation, open_session
@@ -18,7 +18,12 @@ from common.types import EnvSpec
 from replay.core import ReplayCore, Wait
 from replay.service import ReplayService
 
-CONFIG = RunConfig(run="test", total_steps=1000, replay=ReplaySettings(capacity=100, start=8, tolerance=8.0))
+CONFIG = RunConfig(
+    run="test",
+    total_steps=1000,
+    learner=LearnerSettings(batch_size=4),
+    replay=ReplaySettings(capacity=100, start=8, tolerance=8.0),
+)
 
 
 def _serve(node: Node, core: ReplayCore, spec: EnvSpec, folder: Path) -> ReplayService:
