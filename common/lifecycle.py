@@ -11,7 +11,7 @@ from types import FrameType
 
 from common.errors import CoopError
 
-SUPERVISED = "COOP_SUPERVISED"  # set by a supervisor whose death must end this process
+SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
 
 
 class Stop:
@@ -19,7 +19,8 @@ class Stop:
 
     def __init__(self) -> None:
         self._event = threading.Event()
-        self._parent = os.getppid() if os.environ.get(SUPERVISED) else None
+        supervisor = os.environ.get(SUPERVISED)
+        self._parent = int(supervisor) if supervisor else None
         self.reason = ""
         self.failed = False
 

@@ -11,8 +11,8 @@ from common.environments import env_spec
 from common.errors import RunError, UsageError
 from common.lifecycle import Stop, run_main
 from common.options import RunOptions, parse_run
+from common.processes import ChildProcess, command, free_endpoint
 from common.transport import new_incarnation
-from deploy.processes import RoleProcess, command, free_endpoint
 from deploy.status import Display, RunStatus
 
 TICK = 0.1  # seconds
@@ -51,14 +51,14 @@ class Topology:
         common += ["--shared-memory"] if options.shared_memory else []
         joining = [f"--run={config.run}", "--connect", self.endpoint, *common]
         files = [f"--config={resolved}", f"--run-dir={directory}", "--listen", self.endpoint, *common]
-        self.learner = RoleProcess("learner", command("coop-learner", *files), logs / "learner.log")
-        self._replay = RoleProcess(
+        self.learner = ChildProcess("learner", command("coop-learner", *files), logs / "learner.log")
+        self._replay = ChildProcess(
             "replay",
             command("coop-replay", *joining, "--listen", free_endpoint(), f"--run-dir={directory}"),
             logs / "replay.log",
         )
         self._actors = [
-            RoleProcess(f"actor {number}", command("coop-actor", *joining), logs / f"actor-{number}.log")
+            ChildProcess(f"actor {number}", command("coop-actor", *joining), logs / f"actor-{number}.log")
             for number in range(1, options.actors + 1)
         ]
         self._restart_at: dict[str, float] = {}
@@ -87,7 +87,7 @@ class Topology:
                 self._revive(actor, display)
         return False
 
-    def _revive(self, actor: RoleProcess, display: Display) -> None:
+    def _revive(self, actor: ChildProcess, display: Display) -> None:
         now = time.monotonic()
         if actor.name not in self._restart_at:
             self._restarts[actor.name] = self._restarts.get(actor.name, 0) + 1
@@ -110,7 +110,7 @@ class Topology:
             process.interrupt()
         self.finish()
 
-    def _all(self) -> list[RoleProcess]:
+    def _all(self) -> list[ChildProcess]:
         return [self.learner, self._replay, *self._actors]
 
 

@@ -1,4 +1,4 @@
-"""The roles' processes on this machine: start, watch, interrupt, end."""
+"""Child processes on this machine, a run's roles or a sweep's runs: start, watch, interrupt, end."""
 
 from __future__ import annotations
 
@@ -16,16 +16,19 @@ from common.lifecycle import SUPERVISED
 LAST_WORDS = 400  # characters of a log's last line
 
 
-class RoleProcess:
-    """One role as a child process of its own process group, its output in a log file.
+class ChildProcess:
+    """A command as a child process of its own process group, its output in a log file; it ends when this one does.
 
-    name: for people, for example "actor 2".
+    Args:
+        name: for people, for example "actor 2".
+        inherit: file descriptors that it gets too.
     """
 
-    def __init__(self, name: str, command: list[str], log: Path) -> None:
+    def __init__(self, name: str, command: list[str], log: Path, inherit: tuple[int, ...] = ()) -> None:
         self.name = name
         self._command = command
         self._log = log
+        self._inherit = inherit
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -36,8 +39,9 @@ class RoleProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
+                pass_fds=self._inherit,
                 start_new_session=True,  # a Ctrl-C at the terminal reaches the supervisor alone
-                env={**os.environ, SUPERVISED: "1"},
+                env={**os.environ, SUPERVISED: str(os.getpid())},
             )
 
     def exit_status(self) -> int | None:
