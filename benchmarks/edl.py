@@ -112,7 +112,7 @@ def main() -> None:
     for kind, spec, double, repeat in cases:
         title = f"{kind}, {spec.num_actions} actions, {'double' if double else 'single'} targets"
         if options.only in title:
-            names = methods
+            names = [*methods, "weight-gradient", "weight-gradient svd"] if spec.num_actions in (2, 6) else methods
             compare(title, {name: Update(kind, spec, name, double) for name in names}, options.rounds, repeat)
 
 

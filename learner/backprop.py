@@ -120,12 +120,6 @@ class Chain:
             if bias is not None:
                 out[name + "bias"].copy_(bias_grad)
 
-    def backward(self, tape: Tape, error: Tensor, out: Mapping[str, Tensor]) -> None:
-        """Write the gradient of (error . output) into `out`: error [batch, actions], one tensor per parameter name."""
-        with torch.no_grad():
-            for index, delta in self.walk(tape, error.unsqueeze(1)):
-                self.write(tape, index, delta.squeeze(1), out)
-
 
 def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:
     """Cotangents [b, k, *shape] of a ReLU's output, whose value is `activation` [batch, *shape], at its input."""

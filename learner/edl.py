@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from learner.backprop import Chain, Tape
 from learner.memory import keep_freed_memory
-from learner.polar import polar_by_svd
+from learner.polar import polar, polar_of_product
 from learner.transforms import Transforms
 
 FEEDBACKS = ("none", "transform", "weight-gradient", "random")
@@ -69,11 +69,11 @@ class FeedbackRule:
             elif self.feedback == "transform" and s != 0:
                 self._transform(tape, error, s, out)
             else:
-                self.chain.backward(tape, error, out)
-                if self.feedback == "weight-gradient" and s != 0:
-                    for g in out.values():
-                        if g.dim() > 1:
-                            g.add_(polar_by_svd(g.flatten(1).unsqueeze(0)).view(g.shape), alpha=s)
+                for index, delta in self.chain.walk(tape, error.unsqueeze(1)):
+                    self.chain.write(tape, index, delta.squeeze(1), out)
+                    if self.feedback == "weight-gradient" and s != 0:
+                        gradient = out[self.chain.names[index] + "weight"].flatten(1)
+                        gradient.add_(_polar_of_gradient(gradient, delta.squeeze(1), tape.inputs[index]), alpha=s)
 
     def _transform(self, tape: Tape, error: Tensor, s: float, out: Mapping[str, Tensor]) -> None:
         """sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e for every layer, then its gradients."""
@@ -97,6 +97,13 @@ class FeedbackRule:
             draw = torch.randn(error.shape[1], size, generator=generator, dtype=torch.float64) / math.sqrt(size)
             self._fixed[index] = draw.to(error)
         return (error @ self._fixed[index]).view(shape)
+
+
+def _polar_of_gradient(gradient: Tensor, delta: Tensor, h: Tensor) -> Tensor:
+    """U V^T of a weight gradient [m, n]; that of a Linear layer is delta^T h, which lacks rank in a small batch."""
+    if delta.dim() == 2 and len(delta) < min(gradient.shape):
+        return polar_of_product(delta, h)
+    return polar(gradient)
 
 
 def edl_gradients(

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+_SMALL = 8  # the shorter side up to which an SVD is quicker than the algebra around a Gram matrix
+
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
@@ -67,13 +69,41 @@ def _whitened_by_eigh(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Te
     return white.squeeze(-1), None if safe.all() else ~safe
 
 
+def polar(matrix: Tensor) -> Tensor:
+    """U V^T of one matrix [m, n], by the Gram matrix of its shorter side, computed in float64."""
+    if min(matrix.shape) <= _SMALL:
+        return polar_by_svd(matrix.unsqueeze(0))[0]
+    if matrix.shape[0] > matrix.shape[1]:
+        return polar(matrix.t()).t()
+    wide = matrix.double()
+    units = torch.eye(len(wide), dtype=wide.dtype, device=wide.device)
+    root, doubtful = whitened((wide @ wide.t()).unsqueeze(0), units)
+    return polar_by_svd(matrix.unsqueeze(0))[0] if doubtful is not None else (root @ wide).to(matrix.dtype)
+
+
+def polar_of_product(left: Tensor, right: Tensor) -> Tensor:
+    """U V^T [m, n] of left^T right, whose rank is at most r < m, n: left [r, m], right [r, n]; nan if not finite.
+
+    With the full QR factorisations left^T = Q R and right^T = P L, left^T right = Q (R L^T) P^T. So U V^T is
+    Q K P^T, with the polar factor of the r x r matrix R L^T in the corner of K and an identity beside it, which
+    completes the null directions.
+    """
+    r, m, n = len(left), left.shape[1], right.shape[1]
+    (q, q_tau), (p, p_tau) = torch.geqrf(left.t().double()), torch.geqrf(right.t().double())
+    factor = torch.eye(m, n, dtype=left.dtype, device=left.device)
+    factor[:r, :r] = polar_by_svd((q[:r].triu() @ p[:r].triu().t()).unsqueeze(0))[0].to(left.dtype)
+    factor = torch.ormqr(q.to(left.dtype), q_tau.to(left.dtype), factor)
+    return torch.ormqr(p.to(left.dtype), p_tau.to(left.dtype), factor, left=False, transpose=True)
+
+
 def polar_by_svd(matrices: Tensor) -> Tensor:
     """U V^T of each matrix [batch, m, n], computed in float64; nan where a matrix is not finite.
 
     All min(m, n) singular values of the result are 1: where a matrix lacks rank, LAPACK's U and V complete it with an
     orthonormal basis of the null directions, which depends on nothing but the matrix.
     """
-    finite = matrices.isfinite().flatten(1).all(1)[:, None, None]
-    u, _, vh = torch.linalg.svd(matrices.double().masked_fill(~finite, 0), full_matrices=False)
-    factor: Tensor = u @ vh
-    return factor.to(matrices.dtype).masked_fill_(~finite, torch.nan)
+    m = matrices.double()
+    broken = None if m.sum().isfinite() else ~m.isfinite().flatten(1).all(1)[:, None, None]
+    u, _, vh = torch.linalg.svd(m if broken is None else m.masked_fill(broken, 0), full_matrices=False)
+    factor: Tensor = (u @ vh).to(matrices.dtype)
+    return factor if broken is None else factor.masked_fill_(broken, torch.nan)

@@ -27,7 +27,9 @@ class Transforms:
         output = tape.output
         self._batch, self._actions = output.shape
         self._basis = _basis(chain.output_weight, output)
-        walk = chain.walk(tape, self._basis.unsqueeze(0) if dtype is None else self._basis.unsqueeze(0).to(dtype), dtype)
+        walk = chain.walk(
+            tape, self._basis.unsqueeze(0) if dtype is None else self._basis.unsqueeze(0).to(dtype), dtype
+        )
         self._linear_end = next(walk)[0] if chain.output_weight is not None else None
         # The layers held, the last first: step, shape of its output, and T as [batch or 1, A, n].
         self._layers: list[tuple[int, torch.Size]] = []
@@ -65,11 +67,11 @@ class Transforms:
         if self._linear_end is not None:
             found.append((self._linear_end, (units * (1 + s)).expand(self._batch, -1, -1)))
         for (index, shape), t in zip(self._layers, self._ts, strict=True):
-            columns = [whitened(self._gram(t.unsqueeze(0))[0], unit) for unit in units]
-            b = t + s * (torch.stack([column for column, _ in columns], -1) @ t)
-            doubtful = columns[0][1]
+            root, doubtful = whitened(self._gram(t.unsqueeze(0))[0].unsqueeze(1), units)
+            b = t + s * (root @ t)
             if doubtful is not None:
-                b[doubtful] += s * self._by_svd(t, doubtful)
+                where = doubtful.squeeze(1)
+                b[where] += s * self._by_svd(t, where)
             b = self._basis.mT @ b
             found.append((index, _shaped(b.flatten(0, 1), shape).reshape(b.shape)))
         return found
