@@ -72,7 +72,7 @@ class WeightsFollower:
         try:
             number, version, flat = messages.decode_weights(message, self._size)
         except BadMessage:
-            self._node.bad_messages += 1
+            self._node.count_bad()
             return
         self._policy.networks[number - 1].load(flat)
         self._held[number - 1] = version
@@ -81,7 +81,7 @@ class WeightsFollower:
         try:
             role = messages.decode_role(message)
         except BadMessage:
-            self._node.bad_messages += 1
+            self._node.count_bad()
             return
         self._told = list(role.versions)
         self._policy.acting = role.acting - 1

@@ -129,6 +129,7 @@ class Node:
         self.session = session
         self.run = run
         self.bad_messages = 0
+        self._counting = threading.Lock()
         self._name = f"{role}/{incarnation:x}"
         self._threads: list[threading.Thread] = []
         self._closing = False
@@ -177,7 +178,8 @@ class Node:
                 try:
                     reply = answer(self.read(query.payload))
                 except CoopError as error:
-                    self.bad_messages += isinstance(error, BadMessage)
+                    if isinstance(error, BadMessage):
+                        self.count_bad()
                     with contextlib.suppress(zenoh.ZError):
                         query.reply_err(messages.encode_error(self.run, error))
                     continue
@@ -190,6 +192,11 @@ class Node:
         if message.run != self.run:
             raise BadMessage("run", f"{message.run!r}; this is run {self.run!r}")
         return message
+
+    def count_bad(self) -> None:
+        """Count a message that was refused; safe for threads."""
+        with self._counting:
+            self.bad_messages += 1
 
     def publish(self, key: str, payload: bytearray) -> None:
         """Broadcast a value of which only the latest matters; never blocks."""
@@ -224,7 +231,7 @@ class Node:
             try:
                 stop.set(messages.decode_stop(self.read(sample.payload)))
             except BadMessage:
-                self.bad_messages += 1
+                self.count_bad()
 
         def learner(sample: zenoh.Sample) -> None:
             while timers:
@@ -272,7 +279,7 @@ class Latest:
         try:
             return self._node.read(sample.payload)
         except BadMessage:
-            self._node.bad_messages += 1
+            self._node.count_bad()
             return None
 
 

@@ -1,0 +1,109 @@
+"""Starts the roles of a run for the scripts beside this file, asks them how they are, and ends them."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from common import messages
+from common.clients import replay_key
+from common.errors import RunError
+from common.messages import ReplayStats
+from common.processes import ChildProcess, command
+from common.transport import Node
+
+GRACE = 60.0  # seconds that a role gets to end
+
+
+class Roles:
+    """The processes of one run, by name: learner, replay, actor 1, actor 2 and so on.
+
+    Args:
+        folder: run directory; logs go to its logs/.
+        at: endpoints of learner and replay service.
+        inside: command that a role's own is started through ("ip netns exec NAME"), by the role's first word.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        run: str,
+        at: tuple[str, str],
+        flags: Sequence[str],
+        actors: int,
+        inside: Callable[[str], list[str]] = lambda role: [],
+    ) -> None:
+        logs = folder / "logs"
+        logs.mkdir(parents=True)
+        self.folder = folder
+        learner_at, replay_at = at
+        joining = (f"--run={run}", "--connect", learner_at, "--join-timeout=60")
+        own = {
+            "learner": (f"--run={run}", f"--run-dir={folder}", "--listen", learner_at, *flags),
+            "replay": (*joining, "--listen", replay_at, f"--run-dir={folder}"),
+            **{f"actor {number + 1}": joining for number in range(actors)},
+        }
+        self.processes = {
+            name: ChildProcess(
+                name,
+                [*inside(name.split()[0]), *command(f"coop-{name.split()[0]}", *arguments)],
+                logs / f"{name.replace(' ', '-')}.log",
+            )
+            for name, arguments in own.items()
+        }
+
+    def check(self, *names: str) -> None:
+        """Raise RunError if one of these processes has ended."""
+        for name in names:
+            if self.processes[name].exit_status() is not None:
+                raise RunError(self.processes[name].why())
+
+    def finish(self) -> dict[str, Any]:
+        """Interrupt the learner, wait for everybody; the run's summary.
+
+        Raises:
+            RunError: a role did not end well.
+        """
+        self.processes["learner"].interrupt()
+        for process in self.processes.values():
+            process.end(GRACE)
+            if process.exit_status():
+                raise RunError(process.why())
+        summary: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
+        return summary
+
+
+@contextmanager
+def running(roles: Roles) -> Iterator[Roles]:
+    """Every role started; those that are left at the end are killed."""
+    try:
+        for process in roles.processes.values():
+            process.start()
+        yield roles
+    finally:
+        for process in roles.processes.values():
+            process.end(0.0)
+
+
+def replay_stats(node: Node, timeout: float = 5.0) -> ReplayStats:
+    """The replay service's counters; raises as `Node.ask`."""
+    question = messages.encode_question(node.run, "stats")
+    return messages.decode_stats(node.ask(replay_key(node, "stats"), question, timeout))
+
+
+def wait_until(what: str, reached: Callable[[], bool], seconds: float = 60.0) -> float:
+    """Seconds that it took.
+
+    Raises:
+        RunError: it did not come.
+    """
+    began = time.monotonic()
+    while not reached():
+        if time.monotonic() - began > seconds:
+            raise RunError(f"{what}: not within {seconds:g} s")
+        time.sleep(0.05)
+    return time.monotonic() - began
