@@ -7,7 +7,7 @@ READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: run test check
+.PHONY: run test check fuzz
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -20,6 +20,10 @@ check: $(READY)
 	@$(BIN)/ruff format --check . > $(VENV)/format.log 2>&1 || { cat $(VENV)/format.log; exit 1; }
 	@$(BIN)/mypy --no-error-summary
 	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.log || { cat $(VENV)/lint-imports.log; exit 1; }
+
+# Checks that take longer; see docs/security.md.
+fuzz: $(READY)
+	@$(BIN)/python benchmarks/fuzz.py
 
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV)"

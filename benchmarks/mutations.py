@@ -70,7 +70,9 @@ def _header(rng: random.Random, payload: bytes, others: Sequence[bytes]) -> byte
             continue
         break
     how = rng.random()
-    if how < 0.8:
+    if how < 0.3 and type(place[key]) is int:
+        place[key] += rng.choice((-1, 1, 7))
+    elif how < 0.8:
         place[key] = rng.choice(_NASTY)
     elif how < 0.9:
         del place[key]

@@ -1,0 +1,40 @@
+"""Broken messages against live processes (`make fuzz` in short), and a checkpoint that would execute something."""
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from learner.epochs import load_learner
+
+FUZZ = Path(__file__).parents[1] / "benchmarks" / "fuzz.py"
+
+
+def test_broken_messages_change_nothing() -> None:
+    done = subprocess.run(
+        [sys.executable, str(FUZZ), "--messages=6000", "--seed=7"],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "at rest; changed: nothing" in done.stdout
+    assert "lost 0, duplicated 0" in done.stdout
+
+
+class _Trap:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, ("sprung",)
+
+
+def test_a_checkpoint_executes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.save({"agent": _Trap()}, tmp_path / "learner.pt")
+    with pytest.raises(pickle.UnpicklingError):
+        load_learner(tmp_path)
+    assert not (tmp_path / "sprung").exists()
