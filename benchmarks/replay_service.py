@@ -30,6 +30,7 @@ from common import experience
 from common.clients import InsertClient, SampleClient
 from common.config import validated
 from common.lifecycle import Stop
+from common.memory import keep_freed_memory
 from common.processes import ChildProcess, command, free_endpoint
 from common.transport import Node, new_incarnation, open_session
 from learner.reception import Reception
@@ -55,6 +56,7 @@ CONFIG = validated(
 def bare_server(endpoint: str, shared_memory: bool, end: Connection) -> None:
     """Gather and copy with numpy behind two queryables, each with a thread of its own (Zenoh's callbacks)."""
     ring = np.ones((CAPACITY, FRAME_BYTES), np.uint8)
+    keep_freed_memory()
     rng = np.random.default_rng(0)
     picks = rng.integers(0, CAPACITY - ATARI.stack, (1000, BATCH, 1)) + np.arange(ATARI.stack + 1)
     payload = bytearray(FRAMES * FRAME_BYTES)
@@ -146,6 +148,7 @@ class Bench:
     """
 
     def __init__(self, stack: ExitStack, shared_memory: bool, folder: Path) -> None:
+        keep_freed_memory()
         head, replay, bare = (free_endpoint() for _ in range(3))
         spawn = multiprocessing.get_context("spawn")
         self._ends: list[Connection] = []

@@ -123,7 +123,7 @@ class Schema:
         lengths: dict[str, int] = {}
         for name, (dtype, shape) in self.arrays.items():
             array = message.arrays[name]
-            if array.dtype.name != dtype:
+            if array.dtype != dtype:
                 raise BadMessage(f"arrays.{name}", f"dtype {array.dtype.name} instead of {dtype}")
             expected = tuple(
                 lengths.setdefault(n, have) if isinstance(n, str) else n

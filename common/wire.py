@@ -28,6 +28,9 @@ MAX_ARRAYS = 64
 MAX_DIMENSIONS = 8
 MAX_NAME = 64
 DTYPES = frozenset({"uint8", "bool", "int32", "int64", "uint64", "float32", "float64"})
+# Looked up, because numpy works out the name of a dtype anew each time, in the time of a small message.
+_DTYPES = {name: np.dtype(name).newbyteorder("<") for name in DTYPES}
+_NAMES = {np.dtype(name): name for name in DTYPES}
 
 _PREFIX = struct.Struct("<II")
 
@@ -46,23 +49,21 @@ def encode(kind: str, run: str, fields: Mapping[str, Any], arrays: Mapping[str, 
     """Build one message; each array is copied once, into its place."""
     arrays = arrays or {}
     table: list[tuple[str, str, tuple[int, ...], int]] = []
+    data: list[memoryview | bytes] = []
     offset = 0
     for name, array in arrays.items():
-        offset = _aligned(offset)
-        table.append((name, array.dtype.name, array.shape, offset))
+        padding = -offset % ALIGNMENT
+        offset += padding
+        dtype = _NAMES[array.dtype]
+        table.append((name, dtype, array.shape, offset))
         offset += array.nbytes
+        data += (bytes(padding), np.ascontiguousarray(array, _DTYPES[dtype]).data)
     header = msgpack.packb(
         {"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": table}, use_bin_type=True
     )
-    start = _aligned(_PREFIX.size + len(header))
-    payload = bytearray(start + offset)
-    _PREFIX.pack_into(payload, 0, MAGIC, len(header))
-    payload[_PREFIX.size : _PREFIX.size + len(header)] = header
-    for (_, dtype, shape, at), array in zip(table, arrays.values(), strict=True):
-        if array.nbytes:
-            place = np.frombuffer(payload, dtype=np.dtype(dtype).newbyteorder("<"), count=array.size, offset=start + at)
-            np.copyto(place.reshape(shape), array)
-    return payload
+    start = _PREFIX.size + len(header)
+    # Joined, because a payload of zeros to write into would be written twice.
+    return bytearray().join((_PREFIX.pack(MAGIC, len(header)), header, bytes(-start % ALIGNMENT), *data))
 
 
 def decode(payload: bytes) -> Message:
@@ -126,14 +127,14 @@ def _view(payload: bytes, start: int, entry: Any) -> tuple[str, Array]:  # noqa:
     size = math.prod(shape)
     if not _is_length(offset) or offset % ALIGNMENT:
         raise BadMessage(f"arrays.{name}", f"offset {shown(offset)}; a multiple of {ALIGNMENT}")
-    kind = np.dtype(dtype)
+    kind = _DTYPES[dtype]
     if size and start + offset + size * kind.itemsize > len(payload):
         raise BadMessage(
             f"arrays.{name}", f"{dtype}{shape} at {offset} reaches beyond the payload's {len(payload)} bytes"
         )
     if not size:
         return name, np.empty(shape, kind)
-    return name, np.frombuffer(payload, kind.newbyteorder("<"), size, start + offset).reshape(shape)
+    return name, np.frombuffer(payload, kind, size, start + offset).reshape(shape)
 
 
 def _is_length(value: Any) -> bool:  # noqa: ANN401 (whatever the peer sent)

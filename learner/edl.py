@@ -24,8 +24,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from common.memory import keep_freed_memory
 from learner.backprop import Chain, Tape
-from learner.memory import keep_freed_memory
 from learner.polar import polar, polar_of_product
 from learner.transforms import Transforms
 

@@ -10,6 +10,7 @@ from common import cli
 from common.errors import PeerLost, RunError
 from common.joining import join
 from common.lifecycle import Stop, run_main
+from common.memory import keep_freed_memory
 from common.messages import Join, Joined
 from common.options import RoleOptions
 from common.transport import Node, locators, new_incarnation, open_session
@@ -37,6 +38,7 @@ def _run() -> None:
     options = cli.parse(
         ReplayOptions, "coop-replay", "Serve the replay table of a run; the rest comes from its learner."
     )
+    keep_freed_memory()
     stop = Stop()
     stop.on_signals()
     incarnation = new_incarnation()

@@ -15,8 +15,6 @@ from replay.dedup import SeenWindow
 from replay.limiter import RateLimiter
 from replay.table import Table
 
-REPLIES_KEPT = 64  # draws whose answer is kept for a repeated request
-
 
 @dataclass(frozen=True, slots=True)
 class Wait:
@@ -51,6 +49,8 @@ class ReplayCore:
             settings.ratio, settings.start, settings.tolerance, config.total_steps, settings.capacity
         )
         self.batch_size = config.learner.batch_size
+        # A learner repeats only what it has under way. Keeping more costs memory and the processor's caches.
+        self._replies_kept = config.learner.prefetch
         self.drawn = 0
         self.duplicates = 0
         self.inserts_wait_for = ""
@@ -112,7 +112,7 @@ class ReplayCore:
             episodes=tuple(self._episodes[episodes_from : episodes_from + MAX_EPISODES]),
         )
         self._replies[incarnation, sequence] = batch, drawn
-        if len(self._replies) > REPLIES_KEPT:
+        if len(self._replies) > self._replies_kept:
             self._replies.popitem(last=False)
         return batch, drawn
 

@@ -11,10 +11,10 @@ _KEEP = 2**30  # bytes
 
 @cache
 def keep_freed_memory() -> None:
-    """Let this process keep what it frees, for the next update; where the C library is not glibc, nothing happens.
+    """Let this process keep what it frees; where the C library is not glibc, nothing happens.
 
-    An update allocates and frees tensors of ten megabytes and more. glibc hands them back to the kernel each time, and
-    their pages, mapped in and zeroed again, cost a third of an update of a convolutional network.
+    Updates allocate and free tensors of ten megabytes and more, messages a megabyte. glibc hands them back to the
+    kernel each time, and their pages, mapped in and zeroed again, cost a third of an update of a convolutional network.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
