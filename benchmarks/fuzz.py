@@ -30,7 +30,7 @@ from common import experience, messages, wire
 from common.clients import replay_key
 from common.errors import BadMessage, CoopError, RunError
 from common.experience import SegmentReader
-from common.joining import join
+from common.joining import join, join_key
 from common.lifecycle import Stop
 from common.messages import Join, Joined
 from common.processes import free_endpoint
@@ -134,6 +134,10 @@ def targets(node: Node, joined: Joined) -> list[Target]:
         if experience.decode_sample(message)[2] != batch_size:
             raise BadMessage("fields.batch_size", "not this run's")
 
+    def joining(role: str, message: Message) -> None:
+        if messages.decode_join(message).role != role:
+            raise BadMessage("fields.role", "not this key's")
+
     question = partial(messages.encode_question, RUN)
     current = partial(messages.decode_question, "current")
     made: list[tuple[str, bytearray, str, Callable[[Message], Any]]] = [
@@ -146,7 +150,10 @@ def targets(node: Node, joined: Joined) -> list[Target]:
             "replay",
             messages.decode_snapshot,
         ),
-        (node.key("config"), messages.encode_join(RUN, Join("actor", 5, [])), "learner", messages.decode_join),
+        *(
+            (join_key(node, role), messages.encode_join(RUN, Join(role, 5, [])), "learner", partial(joining, role))
+            for role in ("actor", "replay")
+        ),
         (node.key("weights", "1"), question("current"), "learner", current),
         (node.key("weights", "2"), question("current"), "learner", current),
         (node.key("role"), question("current"), "learner", current),

@@ -14,6 +14,11 @@ from common.transport import NoAnswer, Node, Refused
 RETRY_PAUSE = 0.1  # seconds
 
 
+def join_key(node: Node, role: str) -> str:
+    """Where a role asks: the replay service, which all others are sent to, at a key that access control can keep."""
+    return node.key("config", "replay") if role == "replay" else node.key("config")
+
+
 def join(
     node: Node, stop: Stop, request: Join, connect: Sequence[str], timeout: float, *, need_replay: bool = False
 ) -> Joined | None:
@@ -29,7 +34,7 @@ def join(
     answered = False
     while not stop.is_set():
         try:
-            joined = messages.decode_joined(node.ask(node.key("config"), payload, timeout=1.0))
+            joined = messages.decode_joined(node.ask(join_key(node, request.role), payload, timeout=1.0))
         except NoAnswer:
             pass
         except (Refused, BadMessage) as error:

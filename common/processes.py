@@ -88,8 +88,10 @@ def command(name: str, *flags: str) -> list[str]:
     return [str(path), *flags]
 
 
-def free_endpoint() -> str:
-    """A TCP endpoint on loopback whose port is free now."""
+def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
+    """An endpoint of the same protocol and address as another one, with a port that is free now (plain TCP on loopback
+    where that one has no port).
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return f"{like.rpartition(':')[0] or 'tcp/127.0.0.1'}:{probe.getsockname()[1]}"

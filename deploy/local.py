@@ -54,7 +54,7 @@ class Topology:
         self.learner = ChildProcess("learner", command("coop-learner", *files), logs / "learner.log")
         self._replay = ChildProcess(
             "replay",
-            command("coop-replay", *joining, "--listen", free_endpoint(), f"--run-dir={directory}"),
+            command("coop-replay", *joining, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}"),
             logs / "replay.log",
         )
         self._actors = [
@@ -130,7 +130,7 @@ def _run() -> None:
     stop.on_signals()
     topology = Topology(options, config, directory)
     topology.start()
-    status = RunStatus(config.run, topology.endpoint, new_incarnation())
+    status = RunStatus(config.run, topology.endpoint, new_incarnation(), options.zenoh_config)
     title = f"{config.env.id}, {config.method}, seed {config.seed}: {directory}"
     interrupted = False
     try:

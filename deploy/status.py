@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
@@ -38,10 +39,11 @@ class RunStatus:
 
     Args:
         endpoint: of the learner, or of any process that is connected to it and forwards.
+        zenoh_config: as for every role of the run.
     """
 
-    def __init__(self, run: str, endpoint: str, incarnation: int) -> None:
-        self._node = Node(open_session((), (endpoint,)), run, "watch", incarnation)
+    def __init__(self, run: str, endpoint: str, incarnation: int, zenoh_config: Path | None = None) -> None:
+        self._node = Node(open_session((), (endpoint,), zenoh_config), run, "watch", incarnation)
         self._learner = self._node.latest(self._node.key("metrics", "learner", "*"))
         self.learner: dict[str, Any] = {}
 

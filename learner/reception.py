@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from functools import partial
 
 from common import messages
 from common.config import RunConfig
+from common.errors import BadMessage
+from common.joining import join_key
 from common.messages import Joined
 from common.transport import Node
 from common.types import EnvSpec
@@ -20,16 +22,16 @@ class Reception:
         self._spec = spec
         self._layout = layout
         self._replay_endpoints: list[str] = []
-        self._indices: dict[int, int] = {}
-        self._joined: Counter[str] = Counter()
-        node.serve(node.key("config"), self._answer)
+        self._indices: dict[str, dict[int, int]] = {"replay": {}, "actor": {}}
+        for role in self._indices:  # each answered by a thread of its own
+            node.serve(join_key(node, role), partial(self._answer, role))
 
-    def _answer(self, message: Message) -> bytearray:
+    def _answer(self, role: str, message: Message) -> bytearray:
         request = messages.decode_join(message)
-        if request.role == "replay":
+        if request.role != role:
+            raise BadMessage("fields.role", f"{request.role!r}; this key is for {role!r}")
+        if role == "replay":
             self._replay_endpoints = request.endpoints
-        if request.incarnation not in self._indices:
-            self._indices[request.incarnation] = self._joined[request.role]
-            self._joined[request.role] += 1
-        index = self._indices[request.incarnation]
-        return messages.encode_joined(Joined(self._config, self._spec, self._layout, index, self._replay_endpoints))
+        index = self._indices[role].setdefault(request.incarnation, len(self._indices[role]))
+        joined = Joined(self._config, self._spec, self._layout, index, self._replay_endpoints)
+        return messages.encode_joined(joined)

@@ -1,0 +1,161 @@
+"""The mutual-TLS set-up of deploy/zenoh: who is let in, and what an actor's certificate may do."""
+
+import json
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from common import experience, messages
+from common.clients import replay_key
+from common.joining import join_key
+from common.messages import Join, ReplayStats
+from common.processes import ChildProcess, command, free_endpoint
+from common.transport import NoAnswer, Node, new_incarnation, open_session
+
+MAKE_KEYS = Path(__file__).parents[1] / "deploy" / "zenoh" / "make_keys.sh"
+RUN = "trusted"
+CA_LINE = re.compile(r'root_ca_certificate_base64: ".*"')
+
+
+def make_keys(folder: Path) -> Path:
+    subprocess.run([str(MAKE_KEYS), str(folder)], check=True, capture_output=True)
+    return folder
+
+
+@contextmanager
+def joined(at: tuple[str, str], config: Path | None, role: str = "actor") -> Iterator[Node]:
+    with Node(open_session((), at, config), RUN, role, new_incarnation()) as node:
+        yield node
+
+
+def stats(node: Node) -> ReplayStats:
+    return messages.decode_stats(node.ask(replay_key(node, "stats"), messages.encode_question(RUN, "stats")))
+
+
+def training(node: Node) -> bool:
+    try:
+        return stats(node).drawn > 0
+    except NoAnswer:
+        return False
+
+
+def wait_for_more(node: Node) -> None:
+    """The run goes on: transitions and batches."""
+    before = stats(node)
+    deadline = time.monotonic() + 30
+    while (now := stats(node)).inserted <= before.inserted + 100 or now.drawn <= before.drawn + 100:
+        assert time.monotonic() < deadline, now
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_keys(tmp_path_factory.mktemp("trust") / "keys")
+
+
+@pytest.fixture(scope="module")
+def run(keys: Path) -> Iterator[tuple[str, str]]:
+    """Endpoints of learner and replay service of a run that goes on before and after each test, and ends well."""
+    learner_at, replay_at = (free_endpoint("tls/127.0.0.1:0") for _ in range(2))
+    folder = keys.parent / "run"
+    joining = (f"--run={RUN}", "--connect", learner_at)
+    files = f"--run-dir={folder}"
+    commands = {
+        "learner": command("coop-learner", f"--run={RUN}", files, "--listen", learner_at, "--total-steps=10000000"),
+        "replay": command("coop-replay", *joining, files, "--listen", replay_at),
+        "actor": command("coop-actor", *joining),
+    }
+    with ExitStack() as stack:
+        roles = []
+        for name, line in commands.items():
+            role = ChildProcess(name, [*line, f"--zenoh-config={keys / name}.json5"], keys.parent / f"{name}.log")
+            role.start()
+            stack.callback(role.end, 0.0)
+            roles.append(role)
+        with joined((learner_at, replay_at), keys / "replay.json5", "watch") as node:
+            deadline = time.monotonic() + 60
+            while not training(node):
+                assert time.monotonic() < deadline, [role.last_line() for role in roles]
+                time.sleep(0.1)
+        yield learner_at, replay_at
+        roles[0].interrupt()
+        for role in roles:
+            role.end(60.0)
+        assert [role.exit_status() for role in roles] == [0, 0, 0], [role.last_line() for role in roles]
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["transitions_lost"], summary["exit"]) == (0, "interrupted")
+
+
+def assert_outside(at: tuple[str, str], config: Path | None) -> None:
+    with joined(at, config) as stranger:
+        time.sleep(1.5)
+        assert stranger.session.info.peers_zid() == []
+        with pytest.raises(NoAnswer):
+            stranger.ask(join_key(stranger, "actor"), messages.encode_join(RUN, Join("actor", 1, [])))
+
+
+def test_strangers_stay_outside(run: tuple[str, str], keys: Path, tmp_path: Path) -> None:
+    mine = (keys / "actor.json5").read_text()
+    bare = tmp_path / "bare.json5"
+    bare.write_text(re.sub(r'connect_\w+: ".*",\n', "", mine))
+    foreign = tmp_path / "foreign.json5"
+    other = (make_keys(tmp_path / "other") / "actor.json5").read_text()
+    ours = CA_LINE.search(mine)
+    assert ours is not None
+    foreign.write_text(CA_LINE.sub(ours[0], other))
+    plain = (run[0].replace("tls/", "tcp/"), run[1].replace("tls/", "tcp/"))
+    with joined(run, keys / "replay.json5", "watch") as inside:
+        for at, config in ((run, bare), (run, foreign), (plain, None)):
+            assert_outside(at, config)
+        wait_for_more(inside)
+        with joined(run, keys / "actor.json5") as actor:
+            assert actor.ask(join_key(actor, "actor"), messages.encode_join(RUN, Join("actor", 1, []))).kind == "joined"
+
+
+def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, str], keys: Path) -> None:
+    with joined(run, keys / "replay.json5", "watch") as inside, joined(run, keys / "actor.json5") as actor:
+        before = stats(inside)
+        assert actor.ask(actor.key("weights", "1"), messages.encode_question(RUN, "current")).kind == "weights"
+        for key, payload in (
+            (replay_key(actor, "sample"), experience.encode_sample(RUN, 1, 0, 32, 0)),
+            (replay_key(actor, "stats"), messages.encode_question(RUN, "stats")),
+            (replay_key(actor, "snapshot"), messages.encode_snapshot(RUN, "checkpoints/1")),
+            (join_key(actor, "replay"), messages.encode_join(RUN, Join("replay", 1, ["tls/127.0.0.1:9"]))),
+        ):
+            with pytest.raises(NoAnswer):
+                actor.ask(key, payload)
+        for _ in range(20):
+            actor.announce(actor.key("stop"), messages.encode_stop(RUN, "forged"))
+            actor.session.delete(actor.key("stop"))
+        token = actor.session.liveliness().declare_token(actor.key("alive", "learner", "0"))
+        overheard = actor.session.declare_subscriber(actor.key("metrics", "**"), zenoh.handlers.FifoChannel(8))
+        wait_for_more(inside)
+        assert inside.alive()["learner"] == 1, "an actor can't pass for a learner"
+        assert overheard.try_recv() is None
+        token.undeclare()
+        assert stats(inside).bad_messages == before.bad_messages, "nothing of it came through"
+
+
+def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys: Path) -> None:
+    """Not even as a Zenoh client, whose messages the learner would forward to the other actors."""
+    config = zenoh.Config.from_file(str(keys / "actor.json5"))
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps(run[:1]))
+    with joined(run, keys / "actor.json5") as actor, zenoh.open(config) as forger:
+        key = actor.key("weights", "1")
+        received = actor.session.declare_subscriber(key, zenoh.handlers.FifoChannel(10_000))
+        time.sleep(0.5)
+        for _ in range(100):
+            forger.put(key, b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
+            time.sleep(0.01)
+        payloads = []
+        while (sample := received.try_recv()) is not None:
+            payloads.append(sample.payload.to_bytes())
+        assert payloads
+        assert b"forged" not in payloads
