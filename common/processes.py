@@ -89,9 +89,7 @@ def command(name: str, *flags: str) -> list[str]:
 
 
 def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
-    """An endpoint of the same protocol and address as another one, with a port that is free now (plain TCP on loopback
-    where that one has no port).
-    """
+    """An endpoint with the protocol and address of another one (TCP on loopback if that has no port), its port free."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"{like.rpartition(':')[0] or 'tcp/127.0.0.1'}:{probe.getsockname()[1]}"
