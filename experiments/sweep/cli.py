@@ -1,0 +1,118 @@
+"""`coop-sweep`: a grid of runs, here or as a job array; started again, it goes on where it was."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from common.cli import parse
+from common.errors import RunError, UsageError
+from common.lifecycle import Stop, run_main
+from experiments.sweep import slurm
+from experiments.sweep.display import SweepDisplay
+from experiments.sweep.folder import CellFolder
+from experiments.sweep.grid import Grid, load_grid
+from experiments.sweep.runner import Runner
+
+TICK = 0.2  # seconds
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Flags of `coop-sweep`."""
+
+    grid: Positional[str]
+    """A grid that comes with the package, or a TOML file."""
+    quick: bool = False
+    """The grid's small size, for two cores."""
+    jobs: int | None = None
+    """Cells at once; as many as there are cores if not given."""
+    dir: Path | None = None
+    """Folder of the sweep; runs/sweeps/GRID if not given."""
+    cell: str | None = None
+    """Run this cell only."""
+    slurm: bool = False
+    """Submit the cells as a Slurm job array instead of running them here."""
+
+    def folder(self) -> Path:
+        """The sweep's folder."""
+        named = Path(self.grid).stem + ("-quick" if self.quick else "")
+        return self.dir or Path("runs") / "sweeps" / named
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop-sweep", _run)
+
+
+def _run() -> None:
+    options = parse(SweepOptions, "coop-sweep", "Run every cell of a grid, each one once.")
+    if options.jobs is not None and options.jobs < 1:
+        raise UsageError(f"--jobs {options.jobs}: must be at least 1")
+    grid = load_grid(options.grid, options.quick)
+    folder = options.folder()
+    cells = _chosen(options, grid, folder)
+    _settle(grid, cells, folder)
+    if options.slurm:
+        left = [cell.cell.name for cell in cells if not cell.finished()]
+        print(slurm.submit(grid.file, folder, left, options.jobs) if left else "every cell is finished")
+        return
+    # The libraries below a run start a thread for each core unless told otherwise, and runs side by side starve.
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    _work(Runner(grid.file, cells, options.jobs or len(os.sched_getaffinity(0))), folder)
+
+
+def _chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
+    cells = [CellFolder(folder, cell) for cell in grid.cells if options.cell in (None, cell.name)]
+    if not cells:
+        raise UsageError(f"--cell {options.cell}: not in the grid; its first one is {grid.cells[0].name}")
+    return cells
+
+
+def _settle(grid: Grid, cells: list[CellFolder], folder: Path) -> None:
+    """Make the folder this sweep's, or refuse it before anything runs."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for cell in cells:
+            cell.check()
+        held, text = folder / "sweep.toml", grid.to_toml()
+        if not held.exists() or held.read_text(encoding="utf-8") != text:
+            part = folder / "sweep.toml.part"
+            part.write_text(text, encoding="utf-8")
+            part.replace(held)
+    except OSError as error:
+        raise UsageError(f"--dir {folder}: {error.strerror}") from error
+
+
+def _work(runner: Runner, folder: Path) -> None:
+    """Run until no cell is left or somebody asks to stop.
+
+    Raises:
+        RunError: interrupted, or cells have failed.
+    """
+    stop = Stop()
+    stop.on_signals()
+    with SweepDisplay(runner) as display:
+        display.say(f"{len(runner.folders)} cells in {folder}, {runner.tally.skipped} of them finished before")
+        try:
+            while not runner.done and not stop.wait(TICK):
+                for text in runner.tick():
+                    display.say(text)
+                display.update()
+            if not runner.done:
+                display.say(f"{stop.reason}: the running cells save themselves")
+        finally:
+            runner.abort()
+        line = display.line()
+    for name, why in runner.tally.failed.items():
+        print(f"failed: {name}: {why}")
+    if not runner.done:
+        raise RunError(f"{stop.reason} with {line}; the same command goes on from here")
+    if runner.tally.failed:
+        count = len(runner.tally.failed)
+        raise RunError(f"{count} of {len(runner.folders)} cells failed; the same command tries them again")
+    print(f"all {len(runner.folders)} cells are finished; coop-report {folder}")

@@ -1,0 +1,110 @@
+"""A cell's folder: what it tells of its run, the config it must hold, and the lock that lets one process run it."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import fcntl
+import io
+import json
+import os
+import shutil
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.config import resolve, to_toml
+from common.errors import UsageError
+from experiments.sweep.grid import Cell
+
+TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
+WINDOW = 100  # episodes
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is: environment steps at its last episode's end, mean return of the last 100 episodes."""
+
+    step: int
+    mean_return: float
+
+
+class CellFolder:
+    """One cell's folder under the sweep's."""
+
+    def __init__(self, sweep: Path, cell: Cell) -> None:
+        self.cell = cell
+        self.path = sweep / cell.name
+
+    def check(self) -> None:
+        """Raises UsageError where the folder holds a run of another config."""
+        held = self.path / "config.toml"
+        text = held.read_text(encoding="utf-8") if held.exists() else ""
+        try:
+            # An empty file is what a kill left while the run wrote it.
+            same = not text or resolve(tomllib.loads(text)) == self.cell.config
+        except (tomllib.TOMLDecodeError, UsageError):
+            same = False
+        if not same:
+            raise UsageError(f"{held}: not the config of this grid's cell; give another --dir")
+
+    def finished(self) -> bool:
+        """True once its run has gone through to the end."""
+        return self.outcome().startswith("complete")
+
+    def outcome(self) -> str:
+        """How its run ended, in the words of summary.json; empty while there is none."""
+        try:
+            return str(json.loads((self.path / "summary.json").read_text(encoding="utf-8"))["exit"])
+        except FileNotFoundError:
+            return ""
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[int | None]:
+        """Hold the cell's lock; None if another process has it. A child that inherits the descriptor keeps the lock."""
+        self.path.mkdir(exist_ok=True)
+        descriptor = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            yield descriptor if _lock(descriptor) else None
+        finally:
+            os.close(descriptor)
+
+    def prepare(self, afresh: bool) -> None:
+        """Write the config that the run starts from; `afresh`: first clear away what a torn run has left."""
+        if afresh:
+            for entry in self.path.iterdir():
+                if entry.is_dir():
+                    shutil.rmtree(entry)
+                elif entry.name != "lock":
+                    entry.unlink()
+        (self.path / "config.toml").write_text(to_toml(self.cell.config), encoding="utf-8")
+
+    def tidy(self) -> None:
+        """Keep only the last checkpoint of a finished run: a grid's epochs fill disks."""
+        epochs = (self.path / "checkpoints").glob("[0-9]*")
+        for epoch in sorted(epochs, key=lambda path: int(path.name))[:-1]:
+            shutil.rmtree(epoch)
+
+    def progress(self) -> Progress:
+        """Read from the end of episodes.csv; zeros before the first episode has ended."""
+        try:
+            with (self.path / "episodes.csv").open("rb") as file:
+                header = file.readline().decode()
+                file.seek(max(len(header), os.fstat(file.fileno()).st_size - TAIL))
+                # The first line of the tail may be half a one, and the last one too.
+                lines = file.read().decode().rpartition("\n")[0].splitlines()[-WINDOW:]
+        except FileNotFoundError:
+            return Progress(0, 0.0)
+        rows = list(csv.DictReader(io.StringIO("\n".join([header.strip(), *lines]))))
+        if not rows:
+            return Progress(0, 0.0)
+        return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
+
+
+def _lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -1,0 +1,204 @@
+"""A grid of runs: the TOML file that describes it, checked and expanded into cells before anything runs."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+import tomli_w
+from pydantic import ConfigDict, Field
+
+from common.config import (
+    Count,
+    Method,
+    Positive,
+    RunConfig,
+    first_problem,
+    load_tables,
+    resolve,
+    to_tables,
+    validated,
+)
+from common.environments import EnvSettings, env_spec
+from common.errors import UsageError
+
+FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
+
+
+@dataclass(frozen=True)
+class GridFile:
+    """What a grid's file may hold."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+    methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("coop",)
+    seeds: Annotated[tuple[Count, ...], Field(min_length=1)] = (0,)
+    title: str = ""
+    """The question, in one line."""
+    preset: str = "cartpole"
+    """Settings that every cell starts from."""
+    mode: Literal["lockstep", "distributed"] = "lockstep"
+    """A cell is one coop-lockstep, or one coop-local."""
+    actors: Positive = 1
+    """Actor processes of a distributed cell."""
+    fixed: dict[str, Any] = field(default_factory=dict)
+    """Config fields that all cells share."""
+    vary: dict[str, Any] = field(default_factory=dict)
+    """Config fields with the list of values that each one takes."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of a grid; `name` is its folder's."""
+
+    name: str
+    config: RunConfig
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A checked grid: its file's content and its cells, those of the first seed first."""
+
+    file: GridFile
+    cells: tuple[Cell, ...]
+
+    def to_toml(self) -> str:
+        """The grid as a file that `load_grid` takes."""
+        return tomli_w.dumps(asdict(self.file))
+
+
+def shipped_grids() -> list[str]:
+    """The grids that come with the package."""
+    return sorted(entry.name.removesuffix(".toml") for entry in files("experiments").joinpath("grids").iterdir())
+
+
+def load_grid(name: str, quick: bool = False) -> Grid:
+    """Read, check and expand a grid.
+
+    Args:
+        name: of a grid that comes with the package, or a TOML file.
+        quick: take the small size that the file's table `quick` describes.
+
+    Raises:
+        UsageError: the grid can't be right; names the file, the field and what is allowed.
+    """
+    try:
+        tables = tomllib.loads(_text(name))
+        small = tables.pop("quick", None)
+        if quick:
+            if not isinstance(small, dict):
+                raise UsageError("--quick: it has no table [quick]")
+            tables = _merged(tables, small)
+        try:
+            file = pydantic.TypeAdapter(GridFile).validate_python(tables)
+        except pydantic.ValidationError as error:
+            raise UsageError(first_problem(error, GridFile())) from error
+        return Grid(file, _cells(file))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, UsageError) as error:
+        raise UsageError(f"grid {name}: {error}") from error
+
+
+def _text(name: str) -> str:
+    if name in shipped_grids():
+        return files("experiments").joinpath("grids", f"{name}.toml").read_text(encoding="utf-8")
+    if not name.endswith(".toml"):
+        raise UsageError(f"unknown; give a .toml file or one of {', '.join(shipped_grids())}")
+    return Path(name).read_text(encoding="utf-8")
+
+
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `over`, table by table; UsageError where a value stands in a table's place."""
+    merged = dict(base)
+    for key, value in over.items():
+        if isinstance(merged.get(key), Mapping):
+            if not isinstance(value, Mapping):
+                raise UsageError(f"{key} = {value!r}: must be a table")
+            merged[key] = _merged(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _leaves(tables: Mapping[str, Any], at: FieldPath = ()) -> Iterator[tuple[FieldPath, Any]]:
+    for key, value in tables.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, (*at, key))
+        else:
+            yield (*at, key), value
+
+
+def _nested(path: FieldPath, value: Any) -> dict[str, Any]:  # noqa: ANN401 (a value of any field)
+    for key in reversed(path):
+        value = {key: value}
+    return dict(value)
+
+
+def _cells(file: GridFile) -> tuple[Cell, ...]:
+    axes = _axes(file)
+    names = _short_names(tuple(axes))
+    bases = {method: to_tables(resolve(load_tables(file.preset, None), method)) for method in file.methods}
+    cells = []
+    for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
+        tables = _merged(bases[method], file.fixed)
+        for path, value in zip(axes, values, strict=True):
+            tables = _merged(tables, _nested(path, value))
+        parts = [f"{name}={_word(value)}" for name, value in zip(names, values, strict=True)]
+        config = validated({**tables, "method": method, "seed": seed})
+        cells.append(Cell("-".join([method, *parts, f"seed={seed}"]), config))
+    _check_environments(file, cells)
+    _check_collisions(cells)
+    return tuple(cells)
+
+
+def _axes(file: GridFile) -> dict[FieldPath, list[Any]]:
+    """The fields that vary, each with its values."""
+    axes, fixed = dict(_leaves(file.vary)), dict(_leaves(file.fixed))
+    for path, values in axes.items():
+        if not isinstance(values, list) or not values:
+            raise UsageError(f"vary.{'.'.join(path)} = {values!r}: must be a list of at least one value")
+    for name in ("method", "seed"):
+        if (name,) in axes.keys() | fixed.keys():
+            raise UsageError(f"{name}: list it as `{name}s`, outside of [fixed] and [vary]")
+    if twice := axes.keys() & fixed.keys():
+        raise UsageError(f"{', '.join('.'.join(path) for path in sorted(twice))}: both in [fixed] and in [vary]")
+    return axes
+
+
+def _short_names(paths: tuple[FieldPath, ...]) -> list[str]:
+    """The last word of each path, or all of it where two share that word."""
+    last = [path[-1] for path in paths]
+    return [path[-1] if last.count(path[-1]) == 1 else ".".join(path) for path in paths]
+
+
+def _word(value: Any) -> str:  # noqa: ANN401 (a value of any field)
+    """A value as it stands in a folder's name."""
+    text = ".".join(map(str, value)) if isinstance(value, list) else str(value)
+    return re.sub(r"[^A-Za-z0-9.]+", "_", text)
+
+
+def _check_environments(file: GridFile, cells: list[Cell]) -> None:
+    known: list[EnvSettings] = []
+    for cell in cells:
+        if cell.config.env not in known:
+            env_spec(cell.config.env)  # refuses what can't be played
+            known.append(cell.config.env)
+        envs = cell.config.actor.envs
+        if file.mode == "lockstep" and envs != 1:
+            raise UsageError(f"actor.envs = {envs}: lockstep cells play one emulator; put envs = 1 under [fixed.actor]")
+
+
+def _check_collisions(cells: list[Cell]) -> None:
+    by_name: dict[str, Cell] = {}
+    by_config: dict[RunConfig, Cell] = {}
+    for cell in cells:
+        if cell.name in by_name:
+            raise UsageError(f"two cells collide: both are called {cell.name}")
+        if other := by_config.get(cell.config):
+            raise UsageError(f"two cells collide: {other.name} and {cell.name} are the same run")
+        by_name[cell.name] = by_config[cell.config] = cell

@@ -1,0 +1,155 @@
+"""Runs a grid's cells as child processes, as many at once as asked; what is finished is never run again."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass, field
+
+from common.processes import ChildProcess, command
+from experiments.sweep.folder import CellFolder, Progress
+from experiments.sweep.grid import GridFile
+
+GRACE = 60.0  # seconds that a run gets to save itself
+RETRY = 1.0  # seconds until a cell that another process holds is tried again
+EPOCHS = 5  # checkpoints of a lockstep run
+LEAST_STEPS = 1000  # between checkpoints
+
+
+@dataclass
+class Running:
+    """A cell's child process; `began` is the step that it went on from."""
+
+    folder: CellFolder
+    process: ChildProcess
+    began: int
+    progress: Progress
+
+
+@dataclass
+class Tally:
+    """What has become of the cells, for displays.
+
+    skipped: finished before. elsewhere: finished by another process meanwhile. failed: name and reason.
+    steps: environment steps done by the finished runs of this process.
+    """
+
+    skipped: int = 0
+    finished: int = 0
+    elsewhere: int = 0
+    failed: dict[str, str] = field(default_factory=dict)
+    steps: int = 0
+
+
+class Runner:
+    """Starts, watches and ends the cells' processes.
+
+    A process holds its cell's lock for as long as it lives, also when the sweep that started it has been killed. So a
+    cell is never run by two at once: a second sweep, and the tasks of a job array, share the work.
+    """
+
+    def __init__(self, grid: GridFile, folders: list[CellFolder], jobs: int) -> None:
+        self.folders = folders
+        self.running: list[Running] = []
+        self.tally = Tally()
+        self.waiting: deque[CellFolder] = deque()
+        self._grid = grid
+        self._jobs = jobs
+        self._retry_at: dict[str, float] = {}
+        for folder in folders:
+            if folder.finished():
+                self.tally.skipped += 1
+            else:
+                self.waiting.append(folder)
+
+    def tick(self) -> list[str]:
+        """Collect what has ended and start what may start; what happened, in words."""
+        return [*self._collect(), *self._fill()]
+
+    @property
+    def done(self) -> bool:
+        """True once no cell is left."""
+        return not self.running and not self.waiting
+
+    def steps_left(self) -> int:
+        """Environment steps that the running and the waiting cells still have to do."""
+        waiting = sum(folder.cell.config.total_steps for folder in self.waiting)
+        return waiting + sum(run.folder.cell.config.total_steps - run.progress.step for run in self.running)
+
+    def steps_done(self) -> int:
+        """Environment steps that this process has seen done."""
+        return self.tally.steps + sum(max(0, run.progress.step - run.began) for run in self.running)
+
+    def abort(self, seconds: float = GRACE) -> None:
+        """Ask every run to stop, and wait; a run that does not stop in `seconds` is killed."""
+        for run in self.running:
+            run.process.interrupt()
+        deadline = time.monotonic() + seconds
+        for run in self.running:
+            run.process.end(max(0.0, deadline - time.monotonic()))
+            if run.folder.finished():
+                self.tally.finished += 1
+            else:
+                self.waiting.append(run.folder)
+        self.running.clear()
+
+    def _collect(self) -> list[str]:
+        happened = []
+        for run in list(self.running):
+            run.progress = run.folder.progress()
+            status = run.process.exit_status()
+            if status is None:
+                continue
+            self.running.remove(run)
+            name = run.folder.cell.name
+            if run.folder.finished() and status == 0:
+                self.tally.finished += 1
+                self.tally.steps += max(0, run.folder.cell.config.total_steps - run.began)
+                run.folder.tidy()
+                happened.append(f"{name}: return {run.progress.mean_return:.1f}")
+            else:
+                why = run.process.why() if status else f"stopped early: {run.folder.outcome() or 'no summary.json'}"
+                self.tally.failed[name] = why
+                happened.append(f"{name}: FAILED, {why}")
+        return happened
+
+    def _fill(self) -> list[str]:
+        happened = []
+        for _ in range(len(self.waiting)):
+            if len(self.running) >= self._jobs:
+                break
+            folder = self.waiting.popleft()
+            if (problem := self._start(folder)) is not None:
+                self.tally.failed[folder.cell.name] = problem
+                happened.append(f"{folder.cell.name}: FAILED, {problem}")
+        return happened
+
+    def _start(self, folder: CellFolder) -> str | None:
+        """Start a cell, or put it back where another process holds it; what is wrong if it can't be started."""
+        name, now = folder.cell.name, time.monotonic()
+        if now < self._retry_at.get(name, 0.0):
+            self.waiting.append(folder)
+            return None
+        try:
+            with folder.locked() as lock:
+                if lock is None:
+                    self._retry_at[name] = now + RETRY
+                    self.waiting.append(folder)
+                elif folder.finished():
+                    self.tally.elsewhere += 1
+                else:
+                    began = folder.progress().step
+                    folder.prepare(afresh=self._grid.mode == "distributed")
+                    process = ChildProcess(name, self._command(folder), folder.path / "run.log", (lock,))
+                    process.start()
+                    self.running.append(Running(folder, process, began, Progress(began, 0.0)))
+        except OSError as error:
+            return f"{error.filename or folder.path}: {error.strerror}"
+        return None
+
+    def _command(self, folder: CellFolder) -> list[str]:
+        flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}"]
+        if self._grid.mode == "distributed":
+            return command("coop-local", *flags, f"--actors={self._grid.actors}")
+        every = max(LEAST_STEPS, folder.cell.config.total_steps // EPOCHS)
+        return command("coop-lockstep", *flags, "--resume", f"--checkpoint-every={every}")
