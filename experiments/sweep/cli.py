@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from tyro.conf import Positional
 
 from common.cli import parse
@@ -25,7 +27,7 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 class SweepOptions:
     """Flags of `coop-sweep`."""
 
-    grid: Positional[str]
+    grid: Annotated[Positional[str], tyro.conf.arg(metavar="GRID")]
     """A grid that comes with the package, or a TOML file."""
     quick: bool = False
     """The grid's small size, for two cores."""
@@ -79,11 +81,9 @@ def _settle(grid: Grid, cells: list[CellFolder], folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for cell in cells:
             cell.check()
-        held, text = folder / "sweep.toml", grid.to_toml()
-        if not held.exists() or held.read_text(encoding="utf-8") != text:
-            part = folder / "sweep.toml.part"
-            part.write_text(text, encoding="utf-8")
-            part.replace(held)
+        part = folder / f"sweep.toml.{os.getpid()}"  # the tasks of a job array write it side by side
+        part.write_text(grid.to_toml(), encoding="utf-8")
+        part.replace(folder / "sweep.toml")
     except OSError as error:
         raise UsageError(f"--dir {folder}: {error.strerror}") from error
 

@@ -100,7 +100,9 @@ def load_grid(name: str, quick: bool = False) -> Grid:
         except pydantic.ValidationError as error:
             raise UsageError(first_problem(error, GridFile())) from error
         return Grid(file, _cells(file))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, UsageError) as error:
+    except OSError as error:
+        raise UsageError(f"grid {name}: {error.strerror}") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, UsageError) as error:
         raise UsageError(f"grid {name}: {error}") from error
 
 

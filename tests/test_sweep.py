@@ -1,0 +1,184 @@
+"""Sweeps: bad grids are refused, kills and Ctrl-C lose nothing, failures are listed, job arrays run the same cells."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sysconfig
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from common.config import resolve
+from common.errors import UsageError
+from experiments.sweep.cli import main
+from experiments.sweep.grid import load_grid, shipped_grids
+
+SCRIPTS = Path(sysconfig.get_path("scripts"))
+TINY = 'methods = ["dqn", "coop"]\n[fixed]\ntotal_steps = 1200\nreplay.capacity = 300\nlearner.swap_every = 10\n'
+
+
+def sweep(*flags: str, path: str = os.environ["PATH"]) -> subprocess.CompletedProcess[str]:
+    command = [str(SCRIPTS / "coop-sweep"), *flags]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=90, check=False, env={**os.environ, "PATH": path}
+    )
+
+
+def summaries(folder: Path) -> dict[str, bytes]:
+    return {path.parent.name: path.read_bytes() for path in folder.glob("*/summary.json")}
+
+
+@pytest.mark.parametrize("name", shipped_grids())
+@pytest.mark.parametrize("quick", [False, True])
+def test_shipped_grids(name: str, quick: bool, tmp_path: Path) -> None:
+    grid = load_grid(name, quick)
+    assert grid.file.title
+    (tmp_path / "sweep.toml").write_text(grid.to_toml())
+    assert load_grid(str(tmp_path / "sweep.toml")) == grid
+
+
+def test_cells_of_the_small_buffers() -> None:
+    cells = load_grid("small-buffers").cells
+    capacities = {cell.config.replay.capacity for cell in cells}
+    ratios = {cell.config.replay.ratio for cell in cells}
+    assert (min(capacities), max(capacities), min(ratios), max(ratios)) == (50, 5000, 0.25, 4.0)
+    assert {cell.config.replay.eviction for cell in cells} == {"fifo", "reservoir", "prioritized"}
+    assert {cell.config.method for cell in cells} == {"dqn", "edql", "g-coop", "coop"}
+    # What the preset says for one method holds there, and what the grid says holds over it.
+    assert {cell.config.learner.optimizer for cell in cells if cell.config.method == "g-coop"} == {"adam"}
+    assert {cell.config.replay.start for cell in cells} == {50}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("vary.replay.capcity = [5]", "replay.capcity = 5: no such field; allowed: capacity"),
+        ("fixed.speed = 5", "speed = 5: no such field; allowed: run"),
+        ("sedes = [1]", "sedes = [1]: no such field; allowed: methods, seeds"),
+        ("vary.replay.capacity = []", "vary.replay.capacity = []: must be a list of at least one"),
+        ("vary.replay.capacity = 500", "vary.replay.capacity = 500: must be a list"),
+        ("methods = []", "methods = []"),
+        ('methods = ["sarsa"]', "'sarsa'"),
+        ("seeds = [-1]", "-1"),
+        ('preset = "cartpol"', "cartpol: unknown; allowed: "),
+        ('mode = "both"', "mode = 'both'"),
+        ("vary.replay.capacity = [50]", "replay.start = 128: must not exceed replay.capacity = 50"),
+        ("vary.replay.capacity = [500, 500]", "two cells collide: both are called coop-capacity=500-seed=0"),
+        ("vary.replay.ratio = [1, 1.0]", "two cells collide: coop-ratio=1-seed=0 and coop-ratio=1.0-seed=0"),
+        ("seeds = [3, 3]", "two cells collide: both are called coop-seed=3"),
+        ("vary.seed = [1]", "seed: list it as `seeds`"),
+        ("fixed.edl.rate = 0.1\nvary.edl.rate = [0.1]", "edl.rate: both in [fixed] and in [vary]"),
+        ("fixed.replay = 5", "replay = 5: must be a table"),
+        ('fixed.env.id = "CartPoles-v0"', "CartPoles-v0"),
+        ('preset = "catch"', "actor.envs = 4: lockstep cells play one emulator"),
+        ("a = = 1", "line 1"),
+    ],
+)
+def test_a_bad_grid_is_refused(text: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "g.toml"
+    path.write_text(text)
+    with pytest.raises(UsageError) as caught:
+        load_grid(str(path))
+    told = str(caught.value)
+    assert told.startswith(f"grid {path}: ")
+    assert words in told
+    assert "\n" not in told
+
+
+def test_bad_flags_are_refused_before_anything_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid = tmp_path / "g.toml"
+    grid.write_text(TINY)
+    (tmp_path / "file").touch()
+    held = tmp_path / "held" / "dqn-seed=0"
+    held.mkdir(parents=True)
+    (held / "config.toml").write_text("seed = 0\ntotal_steps = 999\n")
+    for flags, words in (
+        ([str(grid), "--dir", str(tmp_path / "file" / "sub")], "Not a directory"),
+        ([str(grid), "--dir", str(tmp_path / "held")], "not the config of this grid's cell"),
+        ([str(grid), "--quick"], "it has no table [quick]"),
+        ([str(grid), "--cell", "x"], "--cell x: not in the grid"),
+        ([str(grid), "--jobs", "0"], "--jobs 0: must be at least 1"),
+        ([str(tmp_path / "none.toml")], "No such file"),
+        (["small-bufers"], "small-buffers"),
+    ):
+        monkeypatch.setattr("sys.argv", ["coop-sweep", *flags])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        told = capsys.readouterr()
+        assert (caught.value.code, told.out) == (2, "")
+        assert words in told.err
+        assert told.err.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "g.toml", "held"]
+    assert [path.name for path in held.parent.iterdir()] == ["dqn-seed=0"]
+
+
+def test_interrupted_killed_and_started_again(tmp_path: Path) -> None:
+    (tmp_path / "g.toml").write_text(TINY)
+    folder = tmp_path / "d"
+    command = [str(SCRIPTS / "coop-sweep"), str(tmp_path / "g.toml"), "--dir", str(folder), "--jobs", "1"]
+    first, second = folder / "dqn-seed=0", folder / "coop-seed=0"
+
+    def until(path: Path, how: signal.Signals) -> str:
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+            while not (path.exists() and path.stat().st_size):
+                assert process.poll() is None
+                time.sleep(0.02)
+            process.send_signal(how)
+            return process.communicate(timeout=60)[1]
+
+    told = until(first / "episodes.csv", signal.SIGINT)
+    assert told.startswith("coop-sweep: error: interrupted with 0 of 2 cells finished")
+    assert told.count("\n") == 1
+    assert json.loads((first / "summary.json").read_text())["exit"] == "interrupted"
+    until(second / "metrics.jsonl", signal.SIGKILL)
+    before = summaries(folder)["dqn-seed=0"]
+    done = sweep(*command[1:])
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "2 cells in" in done.stdout
+    assert "1 of them finished before" in done.stdout
+    assert summaries(folder)["dqn-seed=0"] == before
+    for path in (first, second):
+        log = (path / "run.log").read_text()
+        assert log.count("\ncomplete: 1,200 steps") + log.startswith("complete: 1,200 steps") == 1
+        episodes = list(csv.DictReader((path / "episodes.csv").read_text().splitlines()))
+        assert [int(row["episode"]) for row in episodes] == list(range(len(episodes)))
+        assert resolve(tomllib.loads((path / "config.toml").read_text())).replay.capacity == 300
+        assert [epoch.name for epoch in (path / "checkpoints").iterdir()] == ["1200"]
+
+
+def test_a_failing_cell_does_not_stop_the_rest(tmp_path: Path) -> None:
+    (tmp_path / "g.toml").write_text(TINY.replace("1200", "300"))
+    broken = tmp_path / "d" / "dqn-seed=0"
+    (broken / "metrics.jsonl").mkdir(parents=True)
+    done = sweep(str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"))
+    assert done.returncode == 1
+    assert done.stderr == "coop-sweep: error: 1 of 2 cells failed; the same command tries them again\n"
+    assert "failed: dqn-seed=0: dqn-seed=0 ended (exit status 1): coop-lockstep: error: run directory" in done.stdout
+    assert list(summaries(tmp_path / "d")) == ["coop-seed=0"]
+
+
+def test_a_job_array_of_distributed_cells(tmp_path: Path) -> None:
+    """The submission is to a stand-in for sbatch; the submitted script runs in earnest, as one task would run it."""
+    (tmp_path / "g.toml").write_text(f'mode = "distributed"\n{TINY.replace("1200", "600")}')
+    flags = (str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--slurm", "--jobs", "7")
+    missing = sweep(*flags, path="/nowhere")
+    assert missing.returncode == 1
+    assert missing.stderr == f"coop-sweep: error: sbatch: not found here; submit {tmp_path}/d/array.sh where it is\n"
+    sbatch = tmp_path / "bin" / "sbatch"
+    sbatch.parent.mkdir()
+    sbatch.write_text('#!/bin/sh\n[ $# = 1 ] && echo "Submitted batch job 12"\n')
+    sbatch.chmod(0o755)
+    done = sweep(*flags, path=f"{sbatch.parent}:{os.environ['PATH']}")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "Submitted batch job 12\n", "")
+    script = tmp_path / "d" / "array.sh"
+    assert "#SBATCH --array=0-1%7\n#SBATCH --cpus-per-task=3\n" in script.read_text()
+    assert not summaries(tmp_path / "d")
+    task = {**os.environ, "SLURM_ARRAY_TASK_ID": "1"}
+    subprocess.run(["bash", str(script)], env=task, capture_output=True, timeout=90, check=True)
+    assert [json.loads(text)["method"] for text in summaries(tmp_path / "d").values()] == ["coop"]
