@@ -1,0 +1,222 @@
+"""The report's figures as data, from a study's runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from experiments.report.measures import (
+    Interval,
+    by_episodes,
+    by_steps,
+    diagnostic,
+    improvement,
+    iqm_by_task,
+    iqm_overall,
+    profiles,
+    q_gaps,
+    running_mean,
+)
+from experiments.report.plots import Figure, Line, Panel, counts
+from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs
+from experiments.report.study import Floats, Run, Setting, Study
+
+RATE = "edl.rate"
+EDL_METHODS = ("edql", "coop")
+MOST_PANELS = 9
+RETURN = "return, mean of the last 100 episodes"
+BANDS = " Interquartile mean over runs, band: 95 % bootstrap interval (none for a single run)."
+Curve = Callable[[Sequence[Run]], tuple[Floats, Floats]]
+
+
+def figures(study: Study) -> tuple[list[Figure], list[str]]:
+    """Every figure that the runs allow, and what can't be shown, with the reason."""
+    made = [returns_by_episodes(study), returns_by_steps(study), exploration(study), q_gap(study)]
+    lacking = []
+    if study.index(CAPACITY) is None:
+        lacking.append(f"Return against buffer size, breaking points: {CAPACITY} is the same in all finished runs.")
+    else:
+        made += [buffers(study), diagnostics(study)]
+    if len(study.environments) > 1:
+        lacking.append(f"Aggregates over settings: returns of {', '.join(study.environments)} have different scales.")
+    else:
+        made += aggregates(study)
+    lacking += [f"{figure.title}: no run has the data for it." for figure in made if not _has_lines(figure)]
+    return [figure for figure in made if _has_lines(figure)], lacking
+
+
+def returns_by_episodes(study: Study) -> Figure:
+    """Returns against episodes."""
+    return _curves(
+        study, "returns_episodes", "Returns against episodes", "episodes", RETURN,
+        lambda runs: by_episodes([running_mean(run.returns) for run in runs]),
+    )  # fmt: skip
+
+
+def returns_by_steps(study: Study) -> Figure:
+    """Returns against environment steps."""
+    return _curves(
+        study, "returns_steps", "Returns against environment steps", "environment steps", RETURN,
+        lambda runs: by_steps(runs, [running_mean(run.returns) for run in runs]),
+    )  # fmt: skip
+
+
+def q_gap(study: Study) -> Figure:
+    """The norm of Q1 - Q2 against episodes."""
+    figure = _curves(study, "q_gap", "Norm of Q1 - Q2 against episodes", "episodes", "mean norm", q_gaps, log_y=True)
+    text = f"{figure.text} On a fixed batch of states; with dqn and edql, Q2 is the copy that gives the targets."
+    return Figure(figure.name, figure.title, text, figure.counts, figure.panels)
+
+
+def exploration(study: Study) -> Figure:
+    """The exploration rate s against steps, and the returns that each rate leads to."""
+    place = study.index(RATE)
+    settings = [study.reference]
+    if place is not None:
+        settings = [setting for setting in study.settings if _agree(setting, study.reference, place)]
+    panels, used = [], []
+    for method in (name for name in study.methods if name in EDL_METHODS):
+        groups = [(method if place is None else f"s = {s[place]}", study.of(method, s)) for s in settings]
+        groups = [(text, runs) for text, runs in groups if runs]
+        used += [run for _, runs in groups for run in runs]
+        if groups:
+            rates = [_line(text, *by_steps(runs, [run.s for run in runs])) for text, runs in groups]
+            panels.append(Panel(f"{method}: s", "environment steps", "s", rates))
+        if groups and place is not None:
+            ends = [_line(text, *by_episodes([running_mean(run.returns) for run in runs])) for text, runs in groups]
+            panels.append(Panel(f"{method}: returns", "episodes", RETURN, ends))
+    text = "s is the paper's exploration rate, B = U (S + s I) V^T." + BANDS + _where(study, settings)
+    return Figure("exploration", "Exploration rates", text, _counts(used), panels)
+
+
+def buffers(study: Study) -> Figure:
+    """Mean return against buffer size, the error bars from run to run."""
+    panels = []
+    for others in other_settings(study, CAPACITY):
+        lines = []
+        for method in study.methods:
+            capacities, scores = along(study, CAPACITY, method, others)
+            if capacities:
+                mean = np.array([each.mean() for each in scores])
+                sd = np.array([each.std(ddof=1) if len(each) > 1 else 0.0 for each in scores])
+                lines.append(Line(method, np.array(capacities, np.float64), Interval(mean, mean - sd, mean + sd)))
+        panels.append(Panel(_without(study, CAPACITY, others), "capacity", "return", lines, marks=True, log_x=True))
+    text = "Mean over runs of the return of the last 100 episodes; error bars: one standard deviation over runs."
+    return Figure("buffers", "Mean return against buffer size", text, _counts(study.runs), panels)
+
+
+def diagnostics(study: Study) -> Figure:
+    """Sample age, reuse and the share evicted unsampled against capacity."""
+    names = {
+        "sample_age_mean": "sample age, steps",
+        "reuse_mean": "draws of a sample so far",
+        "evicted_unsampled": "share evicted unsampled",
+    }
+    panels = []
+    for others in other_settings(study, CAPACITY)[:MOST_PANELS]:
+        for name, words in names.items():
+            lines = []
+            for method in study.methods:
+                capacities, values = along(study, CAPACITY, method, others, partial(diagnostic, name=name))
+                points = [(c, v[~np.isnan(v)]) for c, v in zip(capacities, values, strict=True)]
+                points = [(c, v) for c, v in points if len(v)]
+                if points:
+                    ends = [[v.mean() for _, v in points], [v.min() for _, v in points], [v.max() for _, v in points]]
+                    at = np.array([c for c, _ in points], np.float64)
+                    lines.append(Line(method, at, Interval(*map(np.array, ends))))
+            title = _without(study, CAPACITY, others)
+            panels.append(Panel(title, "capacity", words, lines, marks=True, log_x=True))
+    text = "Mean over runs, of the second half of each run (share evicted: at its end); bars: least and largest run."
+    return Figure("diagnostics", "What the buffer hands out", text, _counts(study.runs), panels)
+
+
+def aggregates(study: Study) -> list[Figure]:
+    """Interquartile means, probabilities of improvement and performance profiles over all shared settings."""
+    scores = matrices(study)
+    shapes = {name: (*matrix.shape, matrix.size) for name, matrix in scores.items()}
+    seeds = "; ".join(f"{name}: {n} runs, {s} seeds x {t} settings" for name, (s, t, n) in shapes.items())
+    means = [
+        Line(name, np.array([float(place)]), iqm_overall(matrix)) for place, (name, matrix) in enumerate(scores.items())
+    ]
+    better = [
+        Line(f"{x} > {y}", np.array([float(place)]), improvement(scores[x], scores[y]))
+        for place, (x, y) in enumerate(pairs(list(scores)))
+    ]
+    every = np.concatenate([matrix.ravel() for matrix in scores.values()]) if scores else np.zeros(1)
+    levels = np.linspace(every.min() - 1e-9, every.max(), 61)
+    shares = [Line(name, levels, interval) for name, interval in profiles(scores, levels).items()] if scores else []
+    interval = " over the settings that all methods share; 95 % stratified bootstrap intervals by rliable."
+    return [
+        Figure(
+            "iqm", "Interquartile mean of the return", f"Interquartile mean{interval}", seeds,
+            [Panel("", "", "return", means, marks=True, ticks=list(scores))] if means else [],
+        ),
+        Figure(
+            "improvement", "Probability of improvement",
+            f"Probability that a run of the first returns more than one of the second{interval} 0.5: no difference.",
+            seeds,
+            [Panel("", "", "P(x > y)", better, marks=True, ticks=[line.label for line in better])] if better else [],
+        ),
+        Figure(
+            "profiles", "Performance profiles", f"Share of runs whose return is above a level{interval}", seeds,
+            [Panel("", "return", "share of runs above", shares)] if shares else [],
+        ),
+    ]  # fmt: skip
+
+
+def _curves(study: Study, name: str, title: str, x: str, y: str, curve: Curve, log_y: bool = False) -> Figure:
+    settings, panels, used = _panel_settings(study), [], []
+    for setting in settings:
+        lines = []
+        for method in study.methods:
+            runs = [run for run in study.of(method, setting) if name != "q_gap" or len(run.metrics["q_gap"])]
+            if runs:
+                lines.append(_line(method, *curve(runs)))
+                used += runs
+        if lines:
+            panels.append(Panel(label(study, setting), x, y, lines, log_y=log_y))
+    return Figure(name, title, BANDS.strip() + _where(study, settings), _counts(used), panels)
+
+
+def _line(text: str, at: Floats, curves: Floats) -> Line:
+    if len(curves) == 1:
+        nothing = np.full(len(at), np.nan)
+        return Line(text, at, Interval(curves[0], nothing, nothing))
+    return Line(text, at, iqm_by_task(curves))
+
+
+def _panel_settings(study: Study) -> list[Setting]:
+    """All settings, or where they are too many, those that differ from the reference by capacity alone."""
+    place = study.index(CAPACITY)
+    if len(study.settings) <= MOST_PANELS:
+        return study.settings
+    if place is None:
+        return [study.reference]
+    return [setting for setting in study.settings if _agree(setting, study.reference, place)]
+
+
+def _agree(one: Setting, other: Setting, but: int) -> bool:
+    return one[:but] + one[but + 1 :] == other[:but] + other[but + 1 :]
+
+
+def _where(study: Study, shown: Sequence[Setting]) -> str:
+    if len(shown) == len(study.settings):
+        return ""
+    fixed = [f"{axis} = {value}" for axis, value, *rest in zip(study.axes, *shown, strict=True) if set(rest) <= {value}]
+    return f" {len(shown)} of {len(study.settings)} settings: {', '.join(fixed)}."
+
+
+def _without(study: Study, axis: str, others: Setting) -> str:
+    names = [name.rpartition(".")[2] for name in study.axes if name != axis]
+    return ", ".join(f"{name} {value}" for name, value in zip(names, others, strict=True))
+
+
+def _counts(runs: Sequence[Run]) -> str:
+    methods = dict.fromkeys(run.config.method for run in runs)
+    return counts({method: [run.config.seed for run in runs if run.config.method == method] for method in methods})
+
+
+def _has_lines(figure: Figure) -> bool:
+    return any(panel.lines for panel in figure.panels)

@@ -1,0 +1,162 @@
+"""The numbers that a report takes from runs, and their statistics over runs (rliable's, by seeds)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rliable import library, metrics
+
+from experiments.report.study import Floats, Run
+from experiments.sweep.folder import WINDOW
+
+ENOUGH = 0.95  # of the return at the largest capacity: learning has not broken
+POINTS = 120  # of a curve
+REPS = 1000  # bootstrap samples
+DIAGNOSTICS = ("sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
+
+
+class Interval(NamedTuple):
+    """Estimates with their 95 % bootstrap intervals; float64, all of one shape."""
+
+    value: Floats
+    low: Floats
+    high: Floats
+
+
+class Breaking(NamedTuple):
+    """Where learning breaks: the smallest capacity with at least 95 % of the return at the largest.
+
+    low, high: 95 % bootstrap interval of `capacity` over runs; equal to it where there is one run only.
+    gaps: a larger capacity is below 95 % again, so the order is not plain.
+    """
+
+    capacity: int
+    low: int
+    high: int
+    gaps: bool
+
+
+def score(run: Run) -> float:
+    """Mean return of the last 100 episodes, the paper's measure."""
+    return float(run.returns[-WINDOW:].mean())
+
+
+def spread(run: Run) -> float:
+    """Standard deviation of the returns of the last 100 episodes."""
+    return float(run.returns[-WINDOW:].std())
+
+
+def running_mean(returns: Floats) -> Floats:
+    """float64 [episodes]: the mean of each episode's return and up to 99 before it."""
+    total = np.concatenate(([0.0], np.cumsum(returns)))
+    ends = np.arange(1, len(returns) + 1)
+    starts = np.maximum(0, ends - WINDOW)
+    return np.asarray((total[ends] - total[starts]) / (ends - starts))
+
+
+def diagnostic(run: Run, name: str) -> float:
+    """Mean of a diagnostic over the second half of a run; of the share evicted unsampled, a running total, the last.
+
+    nan for a run too short for a row of metrics.
+    """
+    values, steps = run.metrics[name], run.metrics["env_step"]
+    if not len(values):
+        return float("nan")
+    return float(values[-1] if name == "evicted_unsampled" else values[steps >= steps[-1] / 2].mean())
+
+
+def by_steps(runs: Sequence[Run], values: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """Curves of values per episode on common environment steps: steps float64 [points], curves [runs, points]."""
+    low, high = max(run.end_steps[0] for run in runs), min(run.end_steps[-1] for run in runs)
+    at = np.linspace(low, max(low, high), POINTS)
+    return at, np.stack([_latest(run.end_steps, each, at) for run, each in zip(runs, values, strict=True)])
+
+
+def by_episodes(values: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """Curves of values per episode, up to the shortest run: episodes float64 [points], curves [runs, points]."""
+    shortest = min(len(each) for each in values)
+    at = np.unique(np.linspace(1, shortest, min(POINTS, shortest)).round())
+    return at, np.stack([each[at.astype(np.intp) - 1] for each in values])
+
+
+def q_gaps(runs: Sequence[Run]) -> tuple[Floats, Floats]:
+    """The norm of Q1 - Q2 against episodes: episodes float64 [points], curves [runs, points].
+
+    Every run must have a row of metrics.
+    """
+    return by_episodes([_latest(run.metrics["env_step"], run.metrics["q_gap"], run.end_steps) for run in runs])
+
+
+def _latest(steps: Floats, values: Floats, at: Floats) -> Floats:
+    """The value that was the latest at each moment of `at`; the first one before there is any."""
+    return values[np.maximum(0, np.searchsorted(steps, at, side="right") - 1)]
+
+
+def iqm(scores: Floats) -> Floats:
+    """Interquartile mean over runs: float64 [runs, tasks] -> [tasks], as rliable's but for each task alone."""
+    cut = len(scores) // 4
+    return np.asarray(np.sort(scores, axis=0)[cut : len(scores) - cut].mean(axis=0))
+
+
+def iqm_by_task(scores: Floats) -> Interval:
+    """Interquartile mean over runs of each task; scores float64 [runs, tasks]."""
+    return _interval(scores, iqm)
+
+
+def iqm_overall(scores: Floats) -> Interval:
+    """Interquartile mean over all runs and tasks, float64 [1]; scores float64 [runs, tasks]."""
+    return _interval(scores, lambda sample: np.array([metrics.aggregate_iqm(sample)]))
+
+
+def improvement(x: Floats, y: Floats) -> Interval:
+    """Probability that a run of x is better than one of y, mean over tasks, float64 [1]; scores [runs, tasks]."""
+    return _interval((x, y), _share_better)
+
+
+def profiles(scores: Mapping[str, Floats], levels: Floats) -> dict[str, Interval]:
+    """Performance profiles: the share of runs above each level, float64 [levels]; scores [runs, tasks] by method."""
+    _seed()
+    shares, bounds = library.create_performance_profile(dict(scores), levels, reps=REPS)
+    return {name: Interval(shares[name], *bounds[name]) for name in scores}
+
+
+def breaking_point(capacities: NDArray[np.int64], scores: Sequence[Floats]) -> Breaking:
+    """Where learning breaks, by the mean score over runs.
+
+    Args:
+        capacities: int64 [n], ascending.
+        scores: of each capacity, float64 [runs]; the numbers of runs may differ.
+    """
+    enough = _is_enough(np.array([each.mean() for each in scores]))
+    first = int(enough.argmax())
+    generator = np.random.default_rng(0)
+    samples = [each[generator.integers(0, len(each), (REPS, len(each)))].mean(axis=1) for each in scores]
+    drawn = capacities[_is_enough(np.stack(samples, axis=1)).argmax(axis=1)]
+    low, high = np.quantile(drawn, [0.025, 0.975], method="nearest")
+    return Breaking(int(capacities[first]), int(low), int(high), not enough[first:].all())
+
+
+def _is_enough(means: Floats) -> NDArray[np.bool_]:
+    """True <bool>[..., capacities] at 95 % of the last entry and above (a negative one: less 5 % of its size)."""
+    largest = means[..., -1:]
+    return np.asarray(means >= largest - (1 - ENOUGH) * np.abs(largest))
+
+
+def _share_better(x: Floats, y: Floats) -> Floats:
+    """Do what rliable's `metrics.probability_of_improvement` does, as one array operation."""
+    difference = x[:, None] - y[None, :]
+    return np.array([((difference > 0) + 0.5 * (difference == 0)).mean()])
+
+
+def _interval(scores: Floats | tuple[Floats, Floats], function: object) -> Interval:
+    _seed()
+    values, bounds = library.get_interval_estimates({"x": scores}, function, reps=REPS)
+    return Interval(np.asarray(values["x"]), *bounds["x"])
+
+
+def _seed() -> None:
+    """Start over: rliable draws from numpy's global generator; the same runs must give the same report."""
+    np.random.seed(0)

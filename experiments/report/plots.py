@@ -1,0 +1,117 @@
+"""Figures as data, and their drawing: panels of lines, with the seeds and run counts below."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+from experiments.report.measures import Interval
+from experiments.report.study import Floats
+from experiments.report.table import ResultTable, Value
+
+# Okabe and Ito's colours, which readers who see few colours tell apart.
+COLOURS = {"dqn": "#E69F00", "edql": "#009E73", "g-coop": "#56B4E9", "coop": "#D55E00"}
+OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
+COLUMNS = 3  # of panels
+
+
+@dataclass(frozen=True)
+class Line:
+    """Points with their intervals; x float64 [n], y float64 [n] each. An interval that is all nan isn't drawn."""
+
+    label: str
+    x: Floats
+    y: Interval
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    marks: with markers and error bars instead of bands. ticks: names of the places 0, 1, ... on x.
+    """
+
+    title: str
+    x: str
+    y: str
+    lines: Sequence[Line]
+    marks: bool = False
+    log_x: bool = False
+    log_y: bool = False
+    ticks: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Panels; `name` is its files', `text` says how to read it, `counts` how many runs and seeds are in it."""
+
+    name: str
+    title: str
+    text: str
+    counts: str
+    panels: Sequence[Panel] = field(default_factory=tuple)
+
+    def points(self) -> ResultTable:
+        """Everything that is drawn, as one table."""
+        rows: list[list[Value]] = [
+            [panel.title, line.label, *(float(value) for value in point)]
+            for panel in self.panels
+            for line in panel.lines
+            for point in zip(line.x, *line.y, strict=True)
+        ]
+        return ResultTable(self.name, self.title, ["panel", "line", "x", "y", "low", "high"], rows)
+
+
+def draw(figure: Figure, path: Path) -> None:
+    """Write a figure as a PNG, the same bytes for the same data."""
+    mpl.use("Agg")
+    columns = min(COLUMNS, len(figure.panels))
+    rows = math.ceil(len(figure.panels) / columns)
+    canvas, grid = plt.subplots(
+        rows, columns, squeeze=False, figsize=(max(6.4, 4.4 * columns), 3.4 * rows + 0.9), layout="constrained"
+    )
+    colours: dict[str, str] = dict(COLOURS)
+    for axes, panel in zip(grid.flat, figure.panels, strict=False):
+        _draw_panel(axes, panel, colours)
+    for axes in grid.flat[len(figure.panels) :]:
+        axes.axis("off")
+    canvas.suptitle(figure.title)
+    canvas.supxlabel(figure.counts, fontsize="small", color="#555555")
+    canvas.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(canvas)
+
+
+def _draw_panel(axes: Axes, panel: Panel, colours: dict[str, str]) -> None:
+    for line in panel.lines:
+        colour = colours.setdefault(line.label, OTHERS[(len(colours) - len(COLOURS)) % len(OTHERS)])
+        value, low, high = line.y
+        if panel.marks:
+            below, above = (value - low).clip(0), (high - value).clip(0)
+            style = "o" if panel.ticks else "o-"
+            axes.errorbar(line.x, value, (below, above), fmt=style, capsize=3, color=colour, label=line.label)
+        else:
+            axes.plot(line.x, value, color=colour, label=line.label)
+            axes.fill_between(line.x, low, high, color=colour, alpha=0.2, linewidth=0)
+    axes.set(xlabel=panel.x, ylabel=panel.y, title=panel.title)
+    axes.grid(alpha=0.3)
+    if panel.log_x:
+        axes.set_xscale("log")
+    if panel.log_y and all((line.y.value > 0).all() for line in panel.lines):
+        axes.set_yscale("log")
+    if panel.ticks:
+        axes.set_xticks(range(len(panel.ticks)), panel.ticks, rotation=20)
+        axes.set_xlim(-0.5, len(panel.ticks) - 0.5)
+    elif panel.lines:
+        axes.legend(fontsize="small")
+
+
+def counts(runs: Mapping[str, Sequence[int]]) -> str:
+    """The text below a figure from the seeds of each method's runs: "dqn: 12 runs, 2 seeds; ..."."""
+    parts = [f"{name}: {len(seeds)} runs, {len(set(seeds))} seeds" for name, seeds in runs.items()]
+    return "; ".join(parts)

@@ -1,0 +1,167 @@
+"""The report's tables, from a study's runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from experiments.report.measures import (
+    DIAGNOSTICS,
+    breaking_point,
+    diagnostic,
+    improvement,
+    iqm_by_task,
+    iqm_overall,
+    score,
+    spread,
+)
+from experiments.report.paper import table_1
+from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
+from experiments.report.study import METHODS, Run, Setting, Study
+from experiments.report.table import ResultTable, Value
+
+
+def tables(study: Study) -> list[ResultTable]:
+    """Every table that the runs allow."""
+    made = [paper_table(study), settings_table(study)]
+    if study.index(CAPACITY) is not None:
+        made.append(breaking_table(study))
+    if len(study.environments) == 1:
+        made.append(aggregate_table(study))
+        if len(study.methods) > 1:
+            made.append(improvement_table(study))
+    return [*made, runs_table(study)]
+
+
+def paper_table(study: Study) -> ResultTable:
+    """The paper's Table 1 beside the runs at the paper's setting."""
+    rows: list[list[Value]] = []
+    for env in study.environments:
+        column = table_1(env)
+        for method in METHODS:
+            runs = [run for run in study.of(method, study.reference) if run.config.env.id == env]
+            paper = column.get(method, (None, None))
+            rows.append([env, method, *paper, *_over_runs(runs), *_lengths(runs)])
+    columns = [
+        *("environment", "method", "paper mean", "paper sd"),
+        *("mean", "sd over runs", "sd of 100 episodes", "IQM", "IQM low", "IQM high", "runs", "seeds"),
+        *("episodes", "env steps"),
+    ]
+    at = label(study, study.reference)
+    note = (
+        "Return of the last 100 training episodes. mean, sd over runs: of the runs' means; sd of 100 episodes: "
+        "within a run, then mean over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval."
+        + (f" Runs at {at}, the values nearest to the preset's." if at else "")
+    )
+    return ResultTable("table1", "The paper's Table 1 beside these runs", columns, rows, note)
+
+
+def settings_table(study: Study) -> ResultTable:
+    """Scores of every method at every setting."""
+    rows = []
+    for method in study.methods:
+        for setting in study.settings:
+            runs = study.of(method, setting)
+            if runs:
+                means = [float(np.mean([diagnostic(run, name) for run in runs])) for name in DIAGNOSTICS]
+                rows.append([method, *_plain(setting), *_over_runs(runs), *means])
+    columns = [
+        *("method", *study.axes, "mean", "sd over runs", "sd of 100 episodes", "IQM", "IQM low", "IQM high"),
+        *("runs", "seeds", *DIAGNOSTICS),
+    ]
+    note = (
+        "Return of the last 100 episodes, as above. Diagnostics: means over the second half of the runs, "
+        "evicted_unsampled at their end; sample age in environment steps."
+    )
+    return ResultTable("settings", "Every setting", columns, rows, note)
+
+
+def breaking_table(study: Study) -> ResultTable:
+    """The breaking point of each method for each setting of the other axes."""
+    place = study.index(CAPACITY)
+    assert place is not None
+    rows = []
+    for others in other_settings(study, CAPACITY):
+        for method in study.methods:
+            capacities, scores = along(study, CAPACITY, method, others)
+            if len(capacities) > 1:
+                point = breaking_point(np.array(capacities), scores)
+                runs = sorted({len(each) for each in scores})
+                many = str(runs[0]) if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
+                row = [point.capacity, point.low, point.high, "yes" if point.gaps else "no"]
+                rows.append([*_plain(others), method, *row, float(scores[-1].mean()), capacities[-1], many])
+    names = [axis for axis in study.axes if axis != CAPACITY]
+    columns = [*names, "method", "breaking point", "low", "high", "gaps", "return at largest", "largest", "runs each"]
+    note = (
+        "Breaking point: the smallest capacity with at least 95 % of the return at the largest, by the mean over runs; "
+        "low and high: its 95 % bootstrap interval over runs. gaps: some larger capacity falls below 95 %. Where the "
+        "return at the largest is poor, nothing was learnt that could break."
+    )
+    return ResultTable("breaking_points", "Breaking points", columns, rows, note)
+
+
+def aggregate_table(study: Study) -> ResultTable:
+    """Interquartile mean over all settings."""
+    rows: list[list[Value]] = []
+    for method, scores in matrices(study).items():
+        interval = iqm_overall(scores)
+        values = [float(interval.value[0]), float(interval.low[0]), float(interval.high[0])]
+        rows.append([method, *values, len(scores), scores.shape[1], scores.size])
+    columns = ["method", "IQM", "low", "high", "seeds", "settings", "runs"]
+    return ResultTable("aggregate", "Over all settings", columns, rows, _matrix_note(study))
+
+
+def improvement_table(study: Study) -> ResultTable:
+    """Probability that a run of one method is better than one of another."""
+    rows: list[list[Value]] = []
+    scores = matrices(study)
+    for x, y in pairs(list(scores)):
+        interval = improvement(scores[x], scores[y])
+        values = [float(interval.value[0]), float(interval.low[0]), float(interval.high[0])]
+        rows.append([x, y, *values, len(scores[x]), len(scores[y]), scores[x].shape[1]])
+    columns = ["x", "y", "P(x > y)", "low", "high", "seeds of x", "seeds of y", "settings"]
+    return ResultTable("improvement", "Probability of improvement", columns, rows, _matrix_note(study))
+
+
+def runs_table(study: Study) -> ResultTable:
+    """Every run."""
+    rows: list[list[Value]] = [
+        [
+            *(run.name, run.config.method, run.config.seed, *_plain(study.setting(run))),
+            *(int(run.end_steps[-1]), len(run.returns), score(run), spread(run)),
+            *(diagnostic(run, name) for name in DIAGNOSTICS),
+        ]
+        for run in study.runs
+    ]
+    columns = ["run", "method", "seed", *study.axes, "last step", "episodes", "mean", "sd", *DIAGNOSTICS]
+    return ResultTable("runs", "Every run", columns, rows, "mean and sd: of the returns of the last 100 episodes.")
+
+
+def _plain(setting: Setting) -> list[Value]:
+    return [value if isinstance(value, int | float | str) else str(value) for value in setting]
+
+
+def _over_runs(runs: Sequence[Run]) -> list[Value]:
+    """mean, sd over runs, sd within a run, IQM, low, high, runs, seeds."""
+    if not runs:
+        return [None, None, None, None, None, None, 0, "none"]
+    scores = np.array([[score(run)] for run in runs])
+    interval = iqm_by_task(scores)
+    sd = float(scores.std(ddof=1)) if len(runs) > 1 else None
+    within = float(np.mean([spread(run) for run in runs]))
+    bounds = [float(interval.low[0]), float(interval.high[0])] if len(runs) > 1 else [None, None]
+    return [float(scores.mean()), sd, within, float(interval.value[0]), *bounds, len(runs), seeds_of(runs)]
+
+
+def _lengths(runs: Sequence[Run]) -> list[Value]:
+    if not runs:
+        return [None, None]
+    return [float(np.mean([len(run.returns) for run in runs])), float(np.mean([run.end_steps[-1] for run in runs]))]
+
+
+def _matrix_note(study: Study) -> str:
+    return (
+        f"Over those of the {len(study.settings)} settings that every method has been run at, and the seeds that a "
+        "method has at all of them; by rliable, with 95 % stratified bootstrap intervals (void for one seed)."
+    )

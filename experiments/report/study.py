@@ -1,0 +1,190 @@
+"""The finished runs of a folder, and by which fields of their configs they differ."""
+
+from __future__ import annotations
+
+import csv
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.config import RunConfig, load_tables, resolve, to_tables
+from common.errors import RunError, UsageError
+from experiments.sweep.folder import CellFolder
+from experiments.sweep.grid import Grid, load_grid
+
+Floats = NDArray[np.float64]
+Setting = tuple[Any, ...]  # a value for each axis
+
+METHODS = ("dqn", "edql", "g-coop", "coop")
+METRICS = ("env_step", "q_gap", "sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
+NOT_AXES = {"run", "method", "seed"}
+PRESET = "cartpole"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One finished run with at least one episode.
+
+    end_steps: float64 [episodes], environment steps when each episode ended. returns, s: float64 [episodes].
+    metrics: float64 [rows] of each name of METRICS.
+    """
+
+    name: str
+    config: RunConfig
+    end_steps: Floats
+    returns: Floats
+    s: Floats
+    metrics: Mapping[str, Floats]
+
+
+@dataclass(frozen=True)
+class Study:
+    """The runs of one folder.
+
+    axes: dotted names of the fields that differ between runs of one method.
+    missing: names of runs that are expected or begun but not finished, each with what there is of it.
+    reference: the value of each axis that is nearest to the preset's.
+    """
+
+    title: str
+    runs: tuple[Run, ...]
+    missing: Mapping[str, str]
+    axes: tuple[str, ...]
+    reference: Setting
+
+    @property
+    def methods(self) -> list[str]:
+        """Those with a finished run, in the order of the paper's table."""
+        return [method for method in METHODS if any(run.config.method == method for run in self.runs)]
+
+    @property
+    def environments(self) -> list[str]:
+        """The environments played."""
+        return sorted({run.config.env.id for run in self.runs})
+
+    def setting(self, run: Run) -> Setting:
+        """The run's value on each axis."""
+        return tuple(field_of(run.config, axis) for axis in self.axes)
+
+    @cached_property
+    def settings(self) -> list[Setting]:
+        """Every setting that a run has, in order."""
+        return sorted({place for _, place in self._places}, key=lambda setting: [_order(value) for value in setting])
+
+    def of(self, method: str, setting: Setting) -> list[Run]:
+        """The runs of one method at one setting, by seed."""
+        return self._places.get((method, setting), [])
+
+    @cached_property
+    def _places(self) -> dict[tuple[str, Setting], list[Run]]:
+        places: dict[tuple[str, Setting], list[Run]] = {}
+        for run in sorted(self.runs, key=lambda run: run.config.seed):
+            places.setdefault((run.config.method, self.setting(run)), []).append(run)
+        return places
+
+    def index(self, axis: str) -> int | None:
+        """The place of an axis in a setting; None if the runs do not differ by it."""
+        return self.axes.index(axis) if axis in self.axes else None
+
+
+def load_study(folder: Path) -> Study:
+    """Read a sweep's folder, or any folder of run directories.
+
+    Raises:
+        UsageError: the folder holds no run.
+        RunError: no run in it is finished, or a file is torn.
+    """
+    grid = load_grid(str(folder / "sweep.toml")) if (folder / "sweep.toml").exists() else None
+    paths = _expected(folder, grid)
+    if not paths:
+        raise UsageError(f"{folder}: holds no run and no sweep.toml")
+    runs, missing = [], {}
+    for path in paths:
+        state = _state(path)
+        run = None if state else _read(path)
+        if run is None:
+            missing[path.name] = state
+        elif not len(run.returns):
+            missing[path.name] = "finished without a finished episode"
+        else:
+            runs.append(run)
+    if not runs:
+        raise RunError(f"{folder}: none of its {len(paths)} runs is finished")
+    axes = _axes(runs)
+    preset = resolve(load_tables(grid.file.preset if grid else PRESET, None))
+    reference = tuple(_nearest(field_of(preset, axis), {field_of(run.config, axis) for run in runs}) for axis in axes)
+    return Study(grid.file.title if grid else "", tuple(runs), missing, axes, reference)
+
+
+def field_of(config: RunConfig, axis: str) -> Any:  # noqa: ANN401 (a value of any field)
+    """The value of a field by its dotted name."""
+    value: Any = config
+    for name in axis.split("."):
+        value = getattr(value, name)
+    return value
+
+
+def _expected(folder: Path, grid: Grid | None) -> list[Path]:
+    if grid is not None:
+        return [CellFolder(folder, cell).path for cell in grid.cells]
+    return sorted(path.parent for path in folder.glob("*/config.toml"))
+
+
+def _state(path: Path) -> str:
+    """What is missing of a run; empty if it is finished."""
+    try:
+        outcome = str(json.loads((path / "summary.json").read_text(encoding="utf-8"))["exit"])
+    except FileNotFoundError:
+        return "begun, not finished" if (path / "episodes.csv").exists() else "not begun"
+    return "" if outcome.startswith("complete") else f"begun, not finished: {outcome}"
+
+
+def _read(path: Path) -> Run:
+    try:
+        config = resolve(tomllib.loads((path / "config.toml").read_text(encoding="utf-8")))
+        with (path / "episodes.csv").open(encoding="utf-8") as file:
+            episodes = [(row["env_step"], row["return"], row["s"]) for row in csv.DictReader(file)]
+        rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+        ends, returns, s = np.array(episodes, np.float64).reshape(-1, 3).T
+        metrics = {name: np.array([row[name] for row in rows], np.float64) for name in METRICS}
+    except (OSError, ValueError, KeyError, UsageError) as error:
+        raise RunError(f"{path}: a finished run with a file that can't be read: {error!r}") from error
+    return Run(path.name, config, ends, returns, s, metrics)
+
+
+def _axes(runs: list[Run]) -> tuple[str, ...]:
+    """Fields that differ within a method; what differs between methods alone is part of the method."""
+    values: dict[tuple[str, str], set[Any]] = {}
+    for run in runs:
+        for name, value in _flat(to_tables(run.config)):
+            values.setdefault((run.config.method, name), set()).add(value)
+    names = dict.fromkeys(name for (_, name), found in values.items() if len(found) > 1)
+    return tuple(name for name in names if name not in NOT_AXES)
+
+
+def _flat(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tables.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _order(value: Any) -> tuple[int, float, str]:  # noqa: ANN401
+    """Numbers by size, the rest by its text."""
+    return (0, float(value), "") if isinstance(value, int | float) else (1, 0.0, str(value))
+
+
+def _nearest(wanted: Any, values: set[Any]) -> Any:  # noqa: ANN401
+    if wanted in values:
+        return wanted
+    if isinstance(wanted, int | float):
+        return min(sorted(values), key=lambda value: abs(value - wanted))
+    return min(values, key=_order)
