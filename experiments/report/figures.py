@@ -19,8 +19,8 @@ from experiments.report.measures import (
     q_gaps,
     running_mean,
 )
-from experiments.report.plots import Figure, Line, Panel, counts
-from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs
+from experiments.report.plots import Figure, Line, Panel
+from experiments.report.slices import CAPACITY, along, counts, label, matrices, other_settings, pairs
 from experiments.report.study import Floats, Run, Setting, Study
 
 RATE = "edl.rate"
@@ -88,7 +88,7 @@ def exploration(study: Study) -> Figure:
             ends = [_line(text, *by_episodes([running_mean(run.returns) for run in runs])) for text, runs in groups]
             panels.append(Panel(f"{method}: returns", "episodes", RETURN, ends))
     text = "s is the paper's exploration rate, B = U (S + s I) V^T." + BANDS + _where(study, settings)
-    return Figure("exploration", "Exploration rates", text, _counts(used), panels)
+    return Figure("exploration", "Exploration rates", text, counts(used), panels)
 
 
 def buffers(study: Study) -> Figure:
@@ -102,9 +102,9 @@ def buffers(study: Study) -> Figure:
                 mean = np.array([each.mean() for each in scores])
                 sd = np.array([each.std(ddof=1) if len(each) > 1 else 0.0 for each in scores])
                 lines.append(Line(method, np.array(capacities, np.float64), Interval(mean, mean - sd, mean + sd)))
-        panels.append(Panel(_without(study, CAPACITY, others), "capacity", "return", lines, marks=True, log_x=True))
+        panels.append(Panel(_without(study, CAPACITY, others), "capacity", "return", lines, marks=True, wide_x=True))
     text = "Mean over runs of the return of the last 100 episodes; error bars: one standard deviation over runs."
-    return Figure("buffers", "Mean return against buffer size", text, _counts(study.runs), panels)
+    return Figure("buffers", "Mean return against buffer size", text, counts(study.runs), panels)
 
 
 def diagnostics(study: Study) -> Figure:
@@ -126,10 +126,10 @@ def diagnostics(study: Study) -> Figure:
                     ends = [[v.mean() for _, v in points], [v.min() for _, v in points], [v.max() for _, v in points]]
                     at = np.array([c for c, _ in points], np.float64)
                     lines.append(Line(method, at, Interval(*map(np.array, ends))))
-            title = _without(study, CAPACITY, others)
-            panels.append(Panel(title, "capacity", words, lines, marks=True, log_x=True))
+            title, share = _without(study, CAPACITY, others), name == "evicted_unsampled"
+            panels.append(Panel(title, "capacity", words, lines, marks=True, wide_x=True, share=share))
     text = "Mean over runs, of the second half of each run (share evicted: at its end); bars: least and largest run."
-    return Figure("diagnostics", "What the buffer hands out", text, _counts(study.runs), panels)
+    return Figure("diagnostics", "What the buffer hands out", text, counts(study.runs), panels)
 
 
 def aggregates(study: Study) -> list[Figure]:
@@ -157,11 +157,11 @@ def aggregates(study: Study) -> list[Figure]:
             "improvement", "Probability of improvement",
             f"Probability that a run of the first returns more than one of the second{interval} 0.5: no difference.",
             seeds,
-            [Panel("", "", "P(x > y)", better, marks=True, ticks=[line.label for line in better])] if better else [],
+            [Panel("", "", "P(x > y)", better, True, share=True, ticks=[line.label for line in better])] if better else [],
         ),
         Figure(
             "profiles", "Performance profiles", f"Share of runs whose return is above a level{interval}", seeds,
-            [Panel("", "return", "share of runs above", shares)] if shares else [],
+            [Panel("", "return", "share of runs above", shares, share=True)] if shares else [],
         ),
     ]  # fmt: skip
 
@@ -177,7 +177,7 @@ def _curves(study: Study, name: str, title: str, x: str, y: str, curve: Curve, l
                 used += runs
         if lines:
             panels.append(Panel(label(study, setting), x, y, lines, log_y=log_y))
-    return Figure(name, title, BANDS.strip() + _where(study, settings), _counts(used), panels)
+    return Figure(name, title, BANDS.strip() + _where(study, settings), counts(used), panels)
 
 
 def _line(text: str, at: Floats, curves: Floats) -> Line:
@@ -211,11 +211,6 @@ def _where(study: Study, shown: Sequence[Setting]) -> str:
 def _without(study: Study, axis: str, others: Setting) -> str:
     names = [name.rpartition(".")[2] for name in study.axes if name != axis]
     return ", ".join(f"{name} {value}" for name, value in zip(names, others, strict=True))
-
-
-def _counts(runs: Sequence[Run]) -> str:
-    methods = dict.fromkeys(run.config.method for run in runs)
-    return counts({method: [run.config.seed for run in runs if run.config.method == method] for method in methods})
 
 
 def _has_lines(figure: Figure) -> bool:

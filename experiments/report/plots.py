@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from experiments.report.table import ResultTable, Value
 COLOURS = {"dqn": "#E69F00", "edql": "#009E73", "g-coop": "#56B4E9", "coop": "#D55E00"}
 OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
 COLUMNS = 3  # of panels
+DECADE = 10
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Line:
 class Panel:
     """One pair of axes.
 
-    marks: with markers and error bars instead of bands. ticks: names of the places 0, 1, ... on x.
+    marks: with markers and error bars instead of bands. share: y runs from 0 to 1. wide_x: on a logarithmic scale
+    where the numbers span more than a decade. ticks: names of the places 0, 1, ... on x.
     """
 
     title: str
@@ -42,8 +44,9 @@ class Panel:
     y: str
     lines: Sequence[Line]
     marks: bool = False
-    log_x: bool = False
+    wide_x: bool = False
     log_y: bool = False
+    share: bool = False
     ticks: Sequence[str] = ()
 
 
@@ -100,8 +103,10 @@ def _draw_panel(axes: Axes, panel: Panel, colours: dict[str, str]) -> None:
             axes.fill_between(line.x, low, high, color=colour, alpha=0.2, linewidth=0)
     axes.set(xlabel=panel.x, ylabel=panel.y, title=panel.title)
     axes.grid(alpha=0.3)
-    if panel.log_x:
-        axes.set_xscale("log")
+    if panel.wide_x:
+        _spread_x(axes, panel)
+    if panel.share:
+        axes.set_ylim(-0.03, 1.03)
     if panel.log_y and all((line.y.value > 0).all() for line in panel.lines):
         axes.set_yscale("log")
     if panel.ticks:
@@ -111,7 +116,9 @@ def _draw_panel(axes: Axes, panel: Panel, colours: dict[str, str]) -> None:
         axes.legend(fontsize="small")
 
 
-def counts(runs: Mapping[str, Sequence[int]]) -> str:
-    """The text below a figure from the seeds of each method's runs: "dqn: 12 runs, 2 seeds; ..."."""
-    parts = [f"{name}: {len(seeds)} runs, {len(set(seeds))} seeds" for name, seeds in runs.items()]
-    return "; ".join(parts)
+def _spread_x(axes: Axes, panel: Panel) -> None:
+    values = sorted({float(x) for line in panel.lines for x in line.x})
+    if values and values[-1] > DECADE * values[0]:
+        axes.set_xscale("log")
+        axes.set_xticks(values, [f"{value:g}" for value in values], rotation=45)
+        axes.minorticks_off()

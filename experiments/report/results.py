@@ -39,8 +39,11 @@ def paper_table(study: Study) -> ResultTable:
     rows: list[list[Value]] = []
     for env in study.environments:
         column = table_1(env)
+        setting = tuple(
+            env if axis == "env.id" else value for axis, value in zip(study.axes, study.reference, strict=True)
+        )
         for method in METHODS:
-            runs = [run for run in study.of(method, study.reference) if run.config.env.id == env]
+            runs = study.of(method, setting)
             paper = column.get(method, (None, None))
             rows.append([env, method, *paper, *_over_runs(runs), *_lengths(runs)])
     columns = [

@@ -54,6 +54,14 @@ def pairs(methods: Sequence[str]) -> list[tuple[str, str]]:
     return [(x, y) for i, x in enumerate(methods) for y in methods[:i]]
 
 
+def counts(runs: Sequence[Run]) -> str:
+    """How many runs of which seeds: "dqn: 12 runs, seeds 0,1; coop: 6 runs, seeds 0-2"."""
+    by_method: dict[str, list[Run]] = {}
+    for run in runs:
+        by_method.setdefault(run.config.method, []).append(run)
+    return "; ".join(f"{method}: {len(group)} runs, seeds {seeds_of(group)}" for method, group in by_method.items())
+
+
 def seeds_of(runs: Sequence[Run]) -> str:
     """Seeds in few characters: "0-9", "0,2,5"."""
     seeds = sorted({run.config.seed for run in runs})
