@@ -148,6 +148,7 @@ def aggregates(study: Study) -> list[Figure]:
     levels = np.linspace(every.min() - 1e-9, every.max(), 61)
     shares = [Line(name, levels, interval) for name, interval in profiles(scores, levels).items()] if scores else []
     interval = " over the settings that all methods share; 95 % stratified bootstrap intervals by rliable."
+    names = [line.label for line in better]
     return [
         Figure(
             "iqm", "Interquartile mean of the return", f"Interquartile mean{interval}", seeds,
@@ -157,7 +158,7 @@ def aggregates(study: Study) -> list[Figure]:
             "improvement", "Probability of improvement",
             f"Probability that a run of the first returns more than one of the second{interval} 0.5: no difference.",
             seeds,
-            [Panel("", "", "P(x > y)", better, True, share=True, ticks=[line.label for line in better])] if better else [],
+            [Panel("", "", "P(x > y)", better, True, share=True, ticks=names)] if better else [],
         ),
         Figure(
             "profiles", "Performance profiles", f"Share of runs whose return is above a level{interval}", seeds,
