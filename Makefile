@@ -7,7 +7,7 @@ READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: run test check fuzz
+.PHONY: run test check fuzz netns
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -21,9 +21,12 @@ check: $(READY)
 	@$(BIN)/mypy --no-error-summary
 	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.log || { cat $(VENV)/lint-imports.log; exit 1; }
 
-# Checks that take longer; see docs/security.md.
+# Checks that take longer; docs/robustness.md says what each shows.
 fuzz: $(READY)
 	@$(BIN)/python benchmarks/fuzz.py
+
+netns: $(READY)
+	@$(BIN)/python benchmarks/netns.py
 
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV)"

@@ -7,9 +7,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from common import messages
+import zenoh
+
+from common import messages, wire
 from common.clients import replay_key
 from common.errors import RunError
 from common.messages import ReplayStats
@@ -87,6 +89,35 @@ def running(roles: Roles) -> Iterator[Roles]:
     finally:
         for process in roles.processes.values():
             process.end(0.0)
+
+
+class ActorWatch:
+    """Transitions that each actor holds receipts for, by its own word.
+
+    Actors tell learner and replay service; the latter passes on what it is told to its Zenoh clients, like this one.
+    """
+
+    def __init__(self, run: str, replay_at: str) -> None:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([replay_at]))
+        config.insert_json5("connect/timeout_ms", "-1")
+        self._run = run
+        self._session = zenoh.open(config)
+        self._acked: dict[str, int] = {}
+        self._told = self._session.declare_subscriber(f"coop/{run}/metrics/actor/*", zenoh.handlers.FifoChannel(256))
+
+    def acked(self) -> dict[str, int]:
+        """By incarnation, as told last."""
+        while (sample := self._told.try_recv()) is not None:
+            self._acked[str(sample.key_expr)] = wire.decode(sample.payload.to_bytes()).fields["acked"]
+        return dict(self._acked)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._session.close()
 
 
 def replay_stats(node: Node, timeout: float = 5.0) -> ReplayStats:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import time
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from common.processes import ChildProcess, command, free_endpoint
 from common.transport import NoAnswer, Node, new_incarnation, open_session
 
 MAKE_KEYS = Path(__file__).parents[1] / "deploy" / "zenoh" / "make_keys.sh"
+pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="the script that makes keys needs openssl")
 RUN = "trusted"
 CA_LINE = re.compile(r'root_ca_certificate_base64: ".*"')
 

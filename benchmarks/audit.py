@@ -1,0 +1,34 @@
+"""Counts what is missing and what is there twice in a CartPole run's table, not by its books but by what it holds.
+
+The table of the closing epoch must hold the whole run (a capacity that was never reached).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from common.types import Array
+
+RESET = 0.05  # CartPole begins an episode with all four numbers within this
+
+
+def audit(run_dir: Path) -> tuple[int, int]:
+    """(gaps, transitions held more than once).
+
+    A gap is an observation that no transition leads to and that begins no episode: something before it is missing.
+    """
+    (table,) = run_dir.glob("checkpoints/*/replay")
+    slots, frames = np.load(table / "slots.npy"), np.load(table / "frames.npy")
+    obs, next_obs = frames[slots[:, 0]], frames[slots[:, 1]]
+    begins = (np.abs(obs) <= RESET).all(1)
+    led_to = np.isin(_rows(obs), _rows(next_obs))
+    distinct = np.unique(_rows(np.hstack((obs, next_obs))))
+    return int((~begins & ~led_to).sum()), len(slots) - len(distinct)
+
+
+def _rows(values: Array) -> Array:
+    """Each row as one comparable item of its bytes."""
+    rows = np.ascontiguousarray(values)
+    return rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
