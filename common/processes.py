@@ -44,6 +44,11 @@ class ChildProcess:
                 env={**os.environ, SUPERVISED: str(os.getpid())},
             )
 
+    @property
+    def pid(self) -> int:
+        """Process id; 0 before the start."""
+        return self._process.pid if self._process is not None else 0
+
     def exit_status(self) -> int | None:
         """None while it runs."""
         return None if self._process is None else self._process.poll()

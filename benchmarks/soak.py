@@ -1,0 +1,86 @@
+"""Watches a run at full rate for as long as you like: `python benchmarks/soak.py --seconds 900`.
+
+Memory, threads and file descriptors of every role must stay flat after the first minute: the last quarter of the time
+is compared with the first one. Exit status 1 if they do not. Further flags go to the learner; the table must be full
+within the minute (`--preset catch --replay.capacity 2000 --replay.start 1000`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+
+from roles import Roles, running
+
+from common.errors import CoopError, RunError
+from common.processes import free_endpoint
+
+ACTORS = 2
+WARM_UP = 60.0  # seconds
+EVERY = 1.0  # seconds
+ALLOWED = {"MiB": 0.02, "threads": 0.0, "descriptors": 0.0}  # growth, as a share
+
+Sample = dict[str, float]
+
+
+def measure(pid: int) -> Sample:
+    """What a process holds now."""
+    proc = Path("/proc") / str(pid)
+    status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
+    return {
+        "MiB": int(status["VmRSS"].split()[0]) / 1024,
+        "threads": int(status["Threads"]),
+        "descriptors": len(list((proc / "fd").iterdir())),
+    }
+
+
+def soak(seconds: float, folder: Path, flags: Sequence[str]) -> None:
+    """Print the table; raise a CoopError where something grows, or ends."""
+    roles = Roles(folder, "soak", (free_endpoint(), free_endpoint()), ("--total-steps=1000000000", *flags), ACTORS)
+    samples: dict[str, list[Sample]] = defaultdict(list)
+    with running(roles):
+        began = time.monotonic()
+        while time.monotonic() - began < WARM_UP + seconds:
+            time.sleep(EVERY)
+            roles.check(*roles.processes)
+            if time.monotonic() - began >= WARM_UP:
+                for name, process in roles.processes.items():
+                    samples[name].append(measure(process.pid))
+        summary = roles.finish()
+    grown = []
+    print(f"{'':10}" + "".join(f"{what:>28}" for what in ALLOWED))
+    for name, taken in samples.items():
+        quarter = -(-len(taken) // 4)
+        cells = ""
+        for what, share in ALLOWED.items():
+            values = [sample[what] for sample in taken]
+            first, last = median(values[:quarter]), median(values[-quarter:])
+            cells += f"{first:10.1f} -> {last:6.1f} (<= {max(values):5.1f})"
+            if last > first * (1 + share):
+                grown.append(f"{what} of {name}")
+        print(f"{name:10}{cells}")
+    print(f"{summary['env_steps']:,} steps, {summary['updates']:,} updates, {summary['wall_seconds']:.0f} s")
+    if grown:
+        raise RunError(f"not flat: {', '.join(grown)}")
+
+
+def main() -> None:
+    """Parse flags and run."""
+    parser = argparse.ArgumentParser(description="Watch memory, threads and descriptors of a run at full rate.")
+    parser.add_argument("--seconds", type=float, default=900.0, help="after the first minute")
+    options, flags = parser.parse_known_args()
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            soak(options.seconds, Path(folder) / "run", flags)
+        except CoopError as error:
+            sys.exit(f"soak: error: {error}")
+
+
+if __name__ == "__main__":
+    main()
