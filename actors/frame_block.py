@@ -26,6 +26,7 @@ class FrameBlock:
         # Row numbers, in `_free` and `_pushed`, count through all streams: stream * capacity + row.
         self._free = np.arange(num_envs) * self._capacity
         self._pushed = np.empty((max_steps, num_envs), np.int64)
+        self._windows = np.arange(max_steps + 1)[:, None] + np.arange(spec.stack)
         self._steps = 0
         self._most = 0  # at least the longest stream's rows, known without looking at arrays
         self._current: Rows = np.zeros((spec.stack, num_envs), np.int32)  # stacks at the start of the round
@@ -87,8 +88,8 @@ class FrameBlock:
         stack = self._spec.stack
         pushed = self._pushed[: self._steps] - np.arange(self._num_envs) * self._capacity
         rows = np.concatenate([self._current, pushed.astype(np.int32)])
-        windows = np.lib.stride_tricks.sliding_window_view(rows, stack, axis=0).swapaxes(0, 1)
-        obs_index, next_index = windows.copy(), windows[:, 1:].copy()
+        windows = rows.T.take(self._windows[: self._steps + 1], axis=1)
+        obs_index, next_index = windows, windows[:, 1:].copy()
         for steps, stream, stacked in self._restarts:
             # After `later` more steps the stack still begins with the new stack's frames from `later` on.
             for later in range(min(stack, self._steps + 1 - steps)):

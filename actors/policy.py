@@ -25,11 +25,13 @@ class Policy:
 
     def act(self, obs: Array, epsilon: float) -> NDArray[np.int32]:
         """Actions, int32 [envs], for <frame_dtype>[envs, *obs_shape]."""
-        random = self._rng.random(len(obs)) < epsilon
-        actions = self._rng.integers(self._spec.num_actions, size=len(obs), dtype=np.int32)
-        if not random.all():
-            greedy = self._values(self.acting, obs).argmax(1).numpy()
-            np.copyto(actions, greedy, where=~random, casting="same_kind")
+        random = np.flatnonzero(self._rng.random(len(obs)) < epsilon)
+        if len(random) < len(obs):
+            actions = self._values(self.acting, obs).argmax(1).numpy().astype(np.int32)
+        else:
+            actions = np.empty(len(obs), np.int32)
+        if len(random):
+            actions[random] = self._rng.integers(self._spec.num_actions, size=len(random), dtype=np.int32)
         return actions
 
     def mean_values(self, obs: Array) -> tuple[float, float]:

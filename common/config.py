@@ -16,6 +16,7 @@ from pydantic import ConfigDict, Field
 from common.environments import EnvSettings
 from common.errors import UsageError
 
+OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 Method = Literal["dqn", "edql", "g-coop", "coop"]
 Positive = Annotated[int, Field(gt=0)]
 Count = Annotated[int, Field(ge=0)]
@@ -53,7 +54,7 @@ class LearnerSettings:
     loss: Literal["squared", "huber"] = "squared"
     double: bool = False
     """Take the target's value at the action that the trained network prefers, as in double Q-learning."""
-    optimizer: Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"] = "rmsprop"
+    optimizer: OptimizerName = "rmsprop"
     """rmsprop is PyTorch's; rmsprop-mnih is centred, with the constant inside the root."""
     learning_rate: PositiveFloat = 1e-3
     learning_rate_final: Annotated[float, Field(gt=0, le=1)] = 1.0

@@ -93,7 +93,7 @@ class Lockstep:
         batch = table.sample(self.config.learner.batch_size)
         result = agent.update(batch)
         if self.config.replay.sampling == "prioritized" or self.config.replay.eviction == "prioritized":
-            table.update_priorities(batch.ids, result.td_errors.abs().cpu().numpy())
+            table.update_priorities(batch.ids, np.abs(result.td_errors))
         self.telemetry.add(agent, batch, result)
         if agent.updates % METRICS_EVERY == 0:
             drawn = Drawn(0, self.step, len(table), table.evicted, table.evicted_unsampled, 0, ())

@@ -11,12 +11,12 @@ The four methods differ by config only:
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from common import schedules
@@ -36,7 +36,7 @@ class UpdateResult:
     s: the exploration rate used. swapped: the roles changed after this update.
     """
 
-    td_errors: Tensor
+    td_errors: NDArray[np.float32]
     s: float
     swapped: bool
 
@@ -64,7 +64,7 @@ class Agent:
         self.updates = 0
         self.versions = [0, 0]
         trained = self.networks if config.two_networks else self.networks[:1]
-        self.optimizers = [make_optimizer(settings, network.flat) for network in trained]
+        self.optimizers = [make_optimizer(settings, network.flat, network.gradient) for network in trained]
         self._rules = [FeedbackRule(network.module, config.feedback, config.seed) for network in self.networks]
         self._noise = np.random.default_rng([config.seed, 2])
         self._decay = _decay_vector(settings.weight_decay, self.networks[0])
@@ -78,20 +78,20 @@ class Agent:
         settings, acting = self.config.learner, self.acting
         network, rule = self.networks[acting], self._rules[acting]
         s = self._draw_s()
-        with torch.no_grad():
-            obs, next_obs, actions, targets, weights = self._tensors(batch)
-            values = self._next_values(next_obs)
-            targets.addcmul_(values, self._discounts(batch))
-            tape = rule.forward(obs)
-            errors = tape.output.gather(1, actions).squeeze(1).sub_(targets)
-            scaled = errors.clamp(-1.0, 1.0) if settings.loss == "huber" else errors
-            output_error = torch.zeros_like(tape.output)
-            output_error.scatter_(1, actions, (scaled * weights).unsqueeze(1))
+        with torch.inference_mode():
+            states = self._states(batch)
+            obs, next_obs = states[: len(batch)], states[len(batch) :]
+            # One pass of the acting network over both where its choice of next actions is asked for.
+            tape = rule.forward(states if settings.double else obs)
+            td_errors, output_error = self._errors(batch, tape.output, self.networks[1 - acting](next_obs))
+            if settings.double:
+                tape = tape.head(len(batch))
             rule.backward(tape, output_error, s, network.gradients)
             if self._decay is not None:
                 network.gradient.addcmul_(self._decay, network.flat)
-        self._step(acting)
-        return UpdateResult(errors, s, self._count())
+            progress = self.updates / max(1, self.config.planned_updates)
+            self.optimizers[acting].step(schedules.learning_rate(settings, progress))
+        return UpdateResult(td_errors, s, self._count())
 
     def swap(self) -> None:
         """Change the acting role; for the one-network methods, copy the network to its target."""
@@ -105,11 +105,12 @@ class Agent:
         """The rate that s is now drawn from; 0 for the gradient methods."""
         return 0.0 if self.config.feedback == "none" else schedules.exploration_rate(self.config.edl, self.updates)
 
-    def losses(self, errors: Tensor) -> Tensor:
+    def losses(self, errors: NDArray[np.float32]) -> NDArray[np.float32]:
         """The cost of each TD error: 1/2 e^2, or Huber's."""
+        size = np.abs(errors)
         if self.config.learner.loss == "huber":
-            return torch.nn.functional.huber_loss(errors, torch.zeros_like(errors), reduction="none")
-        return 0.5 * errors.square()
+            return np.where(size < 1, np.float32(0.5) * size * size, size - np.float32(0.5))
+        return np.float32(0.5) * size * size
 
     def q_values(self, obs: Array) -> tuple[Tensor, Tensor]:
         """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
@@ -122,7 +123,7 @@ class Agent:
         generator = self._noise.bit_generator.state
         return {
             "networks": [network.flat.detach().cpu().clone() for network in self.networks],
-            "optimizers": [copy.deepcopy(optimizer.state_dict()) for optimizer in self.optimizers],
+            "optimizers": [optimizer.state() for optimizer in self.optimizers],
             "acting": self.acting,
             "updates": self.updates,
             "versions": list(self.versions),
@@ -134,7 +135,7 @@ class Agent:
         for network, flat in zip(self.networks, state["networks"], strict=True):
             network.load(flat)
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
-            optimizer.load_state_dict(saved)
+            optimizer.load_state(saved)
         self.acting, self.updates, self.versions = state["acting"], state["updates"], list(state["versions"])
         noise = state["noise"]
         self._noise.bit_generator.state = {
@@ -146,33 +147,28 @@ class Agent:
         s = self.exploration_rate()
         return s * float(self._noise.standard_normal()) if self.config.edl.noise == "normal" and s else s
 
-    def _tensors(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Inputs of the networks, actions int64 [batch, 1], a copy of the rewards, weights with the batch mean."""
+    def _states(self, batch: Batch) -> Tensor:
+        """Inputs of the networks [2 batch, *input]: obs, then next_obs."""
+        # Copies: arrays from the wire are read-only, and PyTorch warns of viewing those.
         frames = torch.tensor(batch.frames, device=self.device)
-        index = torch.as_tensor(np.stack((batch.obs_index, batch.next_index)), device=self.device)
-        both = frames[index.long()].view(2, len(batch), *self.spec.obs_shape)
-        actions = torch.tensor(batch.actions, device=self.device).long().unsqueeze(1)
-        rewards = torch.tensor(batch.rewards, device=self.device)
-        weights = torch.tensor(batch.weights, device=self.device).div_(len(batch))
-        return preprocess(both[0], self.spec), preprocess(both[1], self.spec), actions, rewards, weights
+        index = torch.tensor(np.concatenate((batch.obs_index, batch.next_index)).reshape(-1), device=self.device)
+        return preprocess(frames.index_select(0, index).view(-1, *self.spec.obs_shape), self.spec)
 
-    def _discounts(self, batch: Batch) -> Tensor:
-        return torch.as_tensor(
-            self.config.learner.gamma * (1.0 - batch.terminated.astype(np.float32)), device=self.device
-        ).float()
+    def _errors(self, batch: Batch, output: Tensor, next_output: Tensor) -> tuple[NDArray[np.float32], Tensor]:
+        """TD errors of the taken actions, float32 [batch], and e with weights and batch mean in it, [batch, actions].
 
-    def _next_values(self, next_obs: Tensor) -> Tensor:
-        values = self.networks[1 - self.acting](next_obs)
-        if not self.config.learner.double:
-            return values.amax(1)
-        return values.gather(1, self.networks[self.acting](next_obs).argmax(1, keepdim=True)).squeeze(1)
-
-    def _step(self, acting: int) -> None:
-        optimizer = self.optimizers[acting]
-        progress = self.updates / max(1, self.config.planned_updates)
-        for group in optimizer.param_groups:
-            group["lr"] = schedules.learning_rate(self.config.learner, progress)
-        optimizer.step()
+        output: of the acting network for obs, and for next_obs below it with `double`. next_output: of the other one.
+        In numpy on the host, whose operations on so few numbers cost a fraction of PyTorch's.
+        """
+        settings, rows = self.config.learner, np.arange(len(batch))
+        values, next_values = output.cpu().numpy(), next_output.cpu().numpy()
+        best = values[len(batch) :].argmax(1) if settings.double else next_values.argmax(1)
+        discounts = np.float32(settings.gamma) * ~batch.terminated
+        td_errors = values[rows, batch.actions] - (batch.rewards + discounts * next_values[rows, best])
+        clipped = td_errors.clip(-1, 1) if settings.loss == "huber" else td_errors
+        output_error = np.zeros_like(next_values)
+        output_error[rows, batch.actions] = clipped * batch.weights / np.float32(len(batch))
+        return td_errors, torch.from_numpy(output_error).to(self.device)
 
     def _count(self) -> bool:
         self.updates += 1

@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself uses
 from torch import Tensor, nn
 
+from common.networks import layer_functions
+
 Parametrised = nn.Linear | nn.Conv2d
 
 
@@ -25,6 +27,10 @@ class Tape:
 
     output: Tensor
     inputs: list[Tensor]
+
+    def head(self, batch: int) -> Tape:
+        """The tape of the first `batch` samples."""
+        return Tape(self.output[:batch], [x[:batch] for x in self.inputs])
 
     def output_of(self, index: int) -> Tensor:
         """The output of step `index`: [batch, *shape]; after a ReLU that follows, its shape and sign still hold."""
@@ -44,6 +50,7 @@ class Chain:
             _check(name.rstrip("."), step)
         self.names = [name for name, _ in leaves]
         self._steps = [step for _, step in leaves]
+        self._functions = layer_functions(self._steps)
         # Module attribute look-ups cost as much as a small product, so the parameters are held here.
         self._weights = [step.weight if isinstance(step, Parametrised) else None for step in self._steps]
         self._biases = [step.bias if isinstance(step, Parametrised) else None for step in self._steps]
@@ -59,21 +66,12 @@ class Chain:
     def forward(self, x: Tensor) -> Tape:
         """Run the network on x, float [batch, *input]."""
         inputs: list[Tensor] = []
-        fresh = False  # whether x is ours to overwrite
+        if x.dim() == 4:
+            x = x.contiguous(memory_format=torch.channels_last)
         with torch.no_grad():
-            for step, weight, bias in zip(self._steps, self._weights, self._biases, strict=True):
-                if isinstance(step, nn.Conv2d):
-                    x = x.contiguous(memory_format=torch.channels_last)
+            for function in self._functions:
                 inputs.append(x)
-                if isinstance(step, nn.ReLU):
-                    x = x.relu_() if fresh else x.relu()
-                elif isinstance(step, nn.Linear):
-                    x = F.linear(x, weight, bias)  # type: ignore[arg-type]
-                elif isinstance(step, nn.Conv2d):
-                    x = F.conv2d(x, weight, bias, step.stride, step.padding, step.dilation, step.groups)  # type: ignore[arg-type]
-                else:
-                    x = x.flatten(1)
-                fresh = isinstance(step, Parametrised)
+                x = function(x)
         return Tape(x, inputs)
 
     def walk(self, tape: Tape, cotangent: Tensor, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Tensor]]:

@@ -7,7 +7,7 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 
 from common.experience import Drawn
 from common.types import Array, Batch
@@ -27,7 +27,7 @@ class Telemetry:
         self.returns: deque[float] = deque(maxlen=RETURN_WINDOW)
         self.episodes = 0
         self.fixed: Array | None = None
-        self._errors: list[torch.Tensor] = []
+        self._errors: list[NDArray[np.float32]] = []
         self._batches: list[tuple[Array, Array, Array]] = []
         self._began = (time.monotonic(), 0, 0)
 
@@ -42,7 +42,7 @@ class Telemetry:
 
     def row(self, agent: Agent, drawn: Drawn, epsilon: float) -> dict[str, Any]:
         """The metrics of the updates since the last row."""
-        errors = torch.cat(self._errors) if self._errors else torch.zeros(1)
+        errors = np.concatenate(self._errors) if self._errors else np.zeros(1, np.float32)
         age, reuse, lag = (
             np.concatenate([arrays[i] for arrays in self._batches]) if self._batches else np.zeros(1) for i in range(3)
         )
@@ -58,7 +58,7 @@ class Telemetry:
             "env_step": drawn.inserted,
             "update": agent.updates,
             "acting": agent.acting + 1,
-            "td_error": float(errors.abs().mean()),
+            "td_error": float(np.abs(errors).mean()),
             "loss": float(agent.losses(errors).mean()),
             "s": agent.exploration_rate(),
             "epsilon": epsilon,

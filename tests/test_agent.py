@@ -1,5 +1,6 @@
 """The four methods: who is trained, who gives the targets, and what happens every C updates."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -7,11 +8,11 @@ import pytest
 import torch
 from samples import make_segment
 
-from common.config import EdlSettings, LearnerSettings, Method, NetworkSettings, RunConfig
+from common.config import EdlSettings, LearnerSettings, Method, NetworkSettings, OptimizerName, RunConfig
 from common.errors import UsageError
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
-from learner.optimizers import MnihRMSProp
+from learner.optimizers import MnihRMSProp, make_optimizer
 from replay.table import Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
@@ -98,7 +99,7 @@ def test_an_update_by_autograd(double: bool, loss: str) -> None:
     expected = online.snapshot() - 1e-3 * torch.cat([g.flatten() for g in gradients]).numpy()
     result = agent.update(batch)
     np.testing.assert_allclose(agent.networks[0].snapshot(), expected, rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(result.td_errors, errors.detach())
+    np.testing.assert_allclose(result.td_errors, errors.detach().numpy(), rtol=1e-5, atol=1e-6)
 
 
 def test_weight_decay_by_layer() -> None:
@@ -118,17 +119,47 @@ def test_weight_decay_by_layer() -> None:
 
 def test_rmsprop_of_mnih() -> None:
     rng = np.random.default_rng(1)
-    theta = torch.nn.Parameter(torch.tensor([1.0, -2.0, 3.0]))
-    optimizer = MnihRMSProp([theta], lr=0.1, momentum=0.95, decay=0.9, constant=0.01)
-    expected, mean, square = theta.detach().numpy().astype(np.float64), np.zeros(3), np.zeros(3)
+    theta, gradient = torch.tensor([1.0, -2.0, 3.0]), torch.zeros(3)
+    optimizer = MnihRMSProp(theta, gradient, decay=0.9, constant=0.01, momentum=0.95)
+    expected, mean, square = theta.numpy().astype(np.float64), np.zeros(3), np.zeros(3)
     for _ in range(5):
         g = rng.standard_normal(3)
-        theta.grad = torch.tensor(g, dtype=torch.float32)
-        optimizer.step()
+        gradient.copy_(torch.tensor(g))
+        optimizer.step(0.1)
         mean = 0.95 * mean + 0.05 * g
         square = 0.9 * square + 0.1 * g * g
         expected = expected - 0.1 * g / np.sqrt(square - mean * mean + 0.01)
-    np.testing.assert_allclose(theta.detach().numpy(), expected, rtol=1e-5)
+    np.testing.assert_allclose(theta.numpy(), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("momentum", [0.0, 0.8])
+@pytest.mark.parametrize(
+    ("name", "reference"),
+    [
+        ("sgd", lambda p, momentum: torch.optim.SGD(p, 0.1, momentum=momentum)),
+        ("rmsprop", lambda p, momentum: torch.optim.RMSprop(p, 0.1, alpha=0.9, eps=1e-3, momentum=momentum)),
+        ("adam", lambda p, momentum: torch.optim.Adam(p, 0.1, betas=(momentum or 0.9, 0.9), eps=1e-3)),
+    ],
+)
+def test_optimizers_are_pytorchs(
+    name: OptimizerName, momentum: float, reference: Callable[[list[torch.nn.Parameter], float], torch.optim.Optimizer]
+) -> None:
+    settings = LearnerSettings(optimizer=name, momentum=momentum, squared_decay=0.9, denominator=1e-3)
+    parameter = torch.nn.Parameter(torch.linspace(-1, 1, 50))
+    theta, gradient = parameter.detach().clone(), torch.zeros(50)
+    other = reference([parameter], momentum)
+    optimizer = make_optimizer(settings, theta, gradient)
+    for k in range(20):
+        parameter.grad = gradient.copy_(parameter.detach().roll(k).sin())
+        rate = 0.1 / (k + 1)
+        other.param_groups[0]["lr"] = rate
+        other.step()
+        optimizer.step(rate)
+        torch.testing.assert_close(theta, parameter.detach(), rtol=1e-6, atol=1e-6)
+        if k == 10:
+            state = optimizer.state()
+            optimizer = make_optimizer(settings, theta, gradient)
+            optimizer.load_state(state)
 
 
 def test_a_restored_agent_goes_on_to_the_bit() -> None:
