@@ -30,7 +30,7 @@ class ActorService:
         self._env = env
         self._policy = policy
         self._weights = WeightsFollower(node, policy)
-        self._inserts = InsertClient(node, stop, settings.window * env.num_envs)
+        self._inserts = InsertClient(node, stop, settings.window * env.num_envs, self._tell)
         self._segments = SegmentAssembler(env.spec, env.num_envs, incarnation, settings.segment_steps)
         self._episodes = EpisodeTracker(env.num_envs)
         self._steps = 0
@@ -46,8 +46,7 @@ class ActorService:
         self._segments.begin(obs)
         while not self._stop.is_set():
             obs = self._turn(obs)
-            if time.monotonic() >= self._status_due:
-                self._tell()
+            self._tell()
 
     def _turn(self, obs: Array) -> Array:
         """One step of all emulators; what they see next."""
@@ -72,7 +71,11 @@ class ActorService:
         return ends
 
     def _tell(self) -> None:
-        self._status_due = time.monotonic() + STATUS_EVERY
+        """Publish the status if it is due; while an insert waits, too."""
+        now = time.monotonic()
+        if now < self._status_due:
+            return
+        self._status_due = now + STATUS_EVERY
         self._node.publish_status(
             {"steps": self._steps, "acked": self._inserts.acked, "waiting": self._inserts.waiting}
         )

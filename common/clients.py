@@ -6,6 +6,7 @@ Neither has a thread of its own: Zenoh works in the background, and the caller s
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from common import experience, messages
@@ -53,17 +54,23 @@ class _Sent:
 class InsertClient:
     """Sends segments until each is acknowledged, at most `window` of them at a time.
 
-    acked: transitions acknowledged. inserted: the table's count of accepted transitions, as last told.
-    waiting: why nothing moves, in words; empty while it does.
+    Args:
+        on_wait: called again and again while nothing moves.
+
+    Attributes:
+        acked: transitions acknowledged.
+        inserted: the table's count of accepted transitions, as last told.
+        waiting: why nothing moves, in words; empty while it does.
     """
 
-    def __init__(self, node: Node, stop: Stop, window: int) -> None:
+    def __init__(self, node: Node, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
         self.acked = 0
         self.inserted = 0
         self.waiting = ""
         self._node = node
         self._stop = stop
         self._window = window
+        self._on_wait = on_wait
         self._key = replay_key(node, "insert")
         self._outstanding: deque[_Sent] = deque()
         self._backoff = Backoff()
@@ -117,6 +124,7 @@ class InsertClient:
                 self.waiting = NO_ANSWER
             except BadMessage as error:
                 self.waiting = f"{BAD_ANSWER}: {error}"
+            self._on_wait()
             if self._backoff.pause(self._stop):
                 return False
             sent.pending = self._node.begin(self._key, sent.payload)

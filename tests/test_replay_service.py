@@ -162,11 +162,14 @@ def test_clients_survive_a_service_that_goes_away(endpoint: str, spec: EnvSpec, 
 def test_a_stop_ends_the_waiting(endpoint: str, spec: EnvSpec) -> None:
     stop = Stop()
     with Node(open_session((endpoint,)), "test", "actor", new_incarnation()) as client:
-        inserts = InsertClient(client, stop, window=1)
+        told: list[str] = []
+        inserts = InsertClient(client, stop, window=1, on_wait=lambda: told.append(inserts.waiting))
         threading.Timer(0.3, stop.set, ("enough",)).start()
         assert inserts.submit(make_segment(spec, 0))
         assert not inserts.submit(make_segment(spec, 1))
         assert inserts.waiting == "the replay service does not answer"
+        assert len(told) > 1, "the reason is told again and again"
+        assert set(told) == {inserts.waiting}
         with pytest.raises(NoAnswer):
             client.ask(replay_key(client, "stats"), messages.encode_question("test", "stats"))
 
