@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import tyro
 
-from common.config import RunConfig, load_tables, resolve
+from common.config import RunConfig, load_tables, resolve, shortened
 from common.errors import UsageError
 
 T = TypeVar("T")
@@ -41,7 +41,7 @@ def parse(
 
 
 def base_config(args: Sequence[str] | None = None) -> RunConfig:
-    """The config that `--preset`, `--config` and `--method` name; the other flags override it.
+    """The config that `--preset`, `--config`, `--method` and `--total-steps` name; the other flags override it.
 
     Raises:
         UsageError: an unknown preset, a bad file, or both given.
@@ -50,6 +50,7 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     early.add_argument("--preset")
     early.add_argument("--config", type=Path)
     early.add_argument("--method")
+    early.add_argument("--total-steps", "--total_steps", type=int)
     try:
         known, _ = early.parse_known_args(sys.argv[1:] if args is None else args)
     except argparse.ArgumentError as error:
@@ -57,7 +58,10 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     if known.preset and known.config:
         raise UsageError("--preset and --config: give one of them")
     preset = known.preset or (None if known.config else "cartpole")
-    return resolve(load_tables(preset, known.config), known.method)
+    tables = load_tables(preset, known.config)
+    if preset and known.total_steps is not None:
+        tables = shortened(tables, known.total_steps)
+    return resolve(tables, known.method)
 
 
 def _one_line(box: str) -> str:

@@ -98,7 +98,7 @@ class ReplaySettings:
     capacity: Positive = 5000
     """Exact number of transitions held."""
     start: Positive = 500
-    """Transitions to collect before the first update."""
+    """Transitions to collect before the first update; --total-steps cuts a preset's to a tenth of the run."""
     ratio: PositiveFloat = 1.0
     """Updates per environment step."""
     tolerance: PositiveFloat = 64.0
@@ -189,6 +189,13 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
     if preset not in preset_names():
         raise UsageError(f"--preset {preset}: unknown; allowed: {', '.join(preset_names())}")
     return tomllib.loads(files("common").joinpath("presets", f"{preset}.toml").read_text(encoding="utf-8"))
+
+
+def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
+    """A preset for a run of another length: its `replay.start` is at most a tenth of the run, so that it learns."""
+    replay = tables.get("replay", {})
+    start = min(replay.get("start", ReplaySettings.start), max(1, total_steps // 10))
+    return {**tables, "total_steps": total_steps, "replay": {**replay, "start": start}}
 
 
 def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:

@@ -27,6 +27,22 @@ def test_a_method_table_overrides_the_rest() -> None:
 
 
 @pytest.mark.parametrize(
+    ("flags", "start"),
+    [
+        ([], 50_000),
+        (["--total-steps", "20_000"], 2000),
+        (["--total_steps=20000"], 2000),
+        (["--total-steps", "1000000"], 50_000),
+        (["--total-steps", "9"], 1),
+        (["--total-steps", "20000", "--replay.start", "7000"], 7000),
+    ],
+)
+def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["coop-local", "--preset", "breakout", *flags])
+    assert parse_run(RunOptions, "coop-local", "").run_config().replay.start == start
+
+
+@pytest.mark.parametrize(
     ("flags", "words"),
     [
         (["--preset", "cartpol"], ["--preset", "cartpol", "cartpole"]),
@@ -37,7 +53,9 @@ def test_a_method_table_overrides_the_rest() -> None:
         (["--method", "sarsa"], ["method", "sarsa", "g-coop"]),
         (["--edl.rate", "nan"], ["edl.rate", "nan"]),
         (["--replay.start", "400", "--replay.capacity", "300"], ["replay.start", "400", "300"]),
-        (["--total-steps", "10"], ["replay.start", "128", "10"]),
+        (["--total-steps", "100", "--replay.start", "128"], ["replay.start", "128", "100"]),
+        (["--total-steps", "0"], ["total_steps", "0", "greater than 0"]),
+        (["--total-steps", "many"], ["--total-steps", "many"]),
         (["--run", "a/b"], ["run", "a/b"]),
         (["--config", "/no/such.toml"], ["--config", "/no/such.toml"]),
         (["--preset", "cartpole", "--config", "x"], ["--preset", "--config"]),
