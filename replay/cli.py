@@ -58,9 +58,10 @@ def _run() -> None:
 
 def _check_memory(joined: Joined) -> None:
     """Refuse a table that this machine can't hold; other evictions than fifo may keep stack + 1 frames a transition."""
-    capacity = joined.config.replay.capacity
-    copies = 1 if joined.config.replay.eviction == "fifo" else joined.spec.stack + 1
-    needed = estimated_bytes(joined.spec, capacity) * copies
+    config = joined.config
+    capacity = config.replay.capacity
+    copies = 1 if config.replay.eviction == "fifo" else joined.spec.stack + 1
+    needed = estimated_bytes(joined.spec, min(capacity, config.total_steps)) * copies
     present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > present:
         raise RunError(

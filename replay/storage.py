@@ -30,15 +30,13 @@ def save_snapshot(core: ReplayCore, lock: threading.Condition, path: Path) -> No
         for name, array in snapshot.arrays.items():
             np.save(path / f"{name}.npy", array)
         count = len(snapshot.frames)
-        out = np.lib.format.open_memmap(
-            path / "frames.npy", mode="w+", dtype=frames.dtype, shape=(count, *frames.shape[1:])
-        )
-        for start in range(0, count, FRAMES_AT_ONCE):
-            stop = min(count, start + FRAMES_AT_ONCE)
-            with lock:
-                piece = snapshot.frames.read(start, stop)
-            out[start:stop] = piece
-        out.flush()
+        header = np.lib.format.header_data_from_array_1_0(frames) | {"shape": (count, *frames.shape[1:])}
+        with (path / "frames.npy").open("wb") as out:  # not mapped, which would hold the whole file in memory
+            np.lib.format.write_array_header_1_0(out, header)
+            for start in range(0, count, FRAMES_AT_ONCE):
+                with lock:
+                    piece = snapshot.frames.read(start, min(count, start + FRAMES_AT_ONCE))
+                out.write(piece.data)
     finally:
         with lock:
             snapshot.frames.release()
