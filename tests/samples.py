@@ -1,8 +1,12 @@
-"""Small valid messages for tests to send and to break."""
+"""Small valid messages for tests to send and to break, and real play cut into segments."""
 
 import numpy as np
 
-from common.types import EnvSpec, EpisodeEnd, Segment
+from actors.segments import SegmentAssembler
+from common.environments import EnvSettings, Steps, make_vector_env
+from common.types import Array, EnvSpec, EpisodeEnd, Segment
+
+INCARNATION = 77
 
 
 def make_segment(spec: EnvSpec, sequence: int = 0, steps: int = 4, incarnation: int = 7, **changes: object) -> Segment:
@@ -26,3 +30,31 @@ def make_segment(spec: EnvSpec, sequence: int = 0, steps: int = 4, incarnation: 
         "episodes": (EpisodeEnd(steps - 1, 1.5, steps, 0.1, 0.2, 0.3, 5),),
     }
     return Segment(**{**values, **changes})  # type: ignore[arg-type]
+
+
+Seen = list[tuple[Array, Array, Steps, Array]]
+
+
+def record(config: EnvSettings, num_envs: int, steps: int, seed: int = 0) -> tuple[EnvSpec, Seen]:
+    """Play at random; everything the environment said, step by step: obs, actions, steps, next_obs."""
+    env = make_vector_env(config, num_envs, seed)
+    rng = np.random.default_rng(seed)
+    obs = env.reset()
+    seen = []
+    for _ in range(steps):
+        actions = rng.integers(0, env.spec.num_actions, num_envs).astype(np.int32)
+        took = env.step(actions)
+        seen.append((obs.copy(), actions, took, took.next_obs.copy()))
+        obs = took.obs
+    env.close()
+    return env.spec, seen
+
+
+def cut(spec: EnvSpec, seen: Seen, segment_steps: int) -> list[Segment]:
+    """The segments of what was seen; three steps each share a parameter version."""
+    assembler = SegmentAssembler(spec, len(seen[0][0]), INCARNATION, segment_steps)
+    assembler.begin(seen[0][0])
+    segments = []
+    for step, (_, actions, took, _) in enumerate(seen):
+        segments += assembler.add(actions, took, step // 3, {})
+    return segments + assembler.flush()

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples import INCARNATION, cut, record
 
 from actors.segments import EpisodeTracker, FinishedEpisode, SegmentAssembler
-from common.environments import EnvSettings, Steps, make_vector_env
+from common.environments import EnvSettings, Steps
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
-
-INCARNATION = 77
 
 
 def rebuilt(segments: list[Segment], spec: EnvSpec) -> dict[int, list[Array]]:
@@ -53,27 +52,6 @@ def check_chain(segments: list[Segment], spec: EnvSpec) -> None:
         last[segment.stream] = segment
 
 
-def play(
-    config: EnvSettings, num_envs: int, steps: int, segment_steps: int, seed: int = 0
-) -> tuple[EnvSpec, list[Segment], list[tuple[Array, Array, Steps, Array]]]:
-    """Play at random; the segments, and everything the environment said, step by step."""
-    env = make_vector_env(config, num_envs, seed)
-    rng = np.random.default_rng(seed)
-    obs = env.reset()
-    assembler = SegmentAssembler(env.spec, num_envs, INCARNATION, segment_steps)
-    assembler.begin(obs)
-    segments, seen = [], []
-    for step in range(steps):
-        actions = rng.integers(0, env.spec.num_actions, num_envs).astype(np.int32)
-        took = env.step(actions)
-        seen.append((obs.copy(), actions, took, took.next_obs.copy()))
-        segments += assembler.add(actions, took, step // 3, {})
-        obs = took.obs
-    segments += assembler.flush()
-    env.close()
-    return env.spec, segments, seen
-
-
 BREAKOUT = {"id": "breakout", "clip_rewards": True}
 
 
@@ -95,7 +73,8 @@ BREAKOUT = {"id": "breakout", "clip_rewards": True}
 def test_segments_rebuild_every_observation(
     options: dict[str, Any], num_envs: int, steps: int, segment_steps: int
 ) -> None:
-    spec, segments, seen = play(EnvSettings(**options), num_envs, steps, segment_steps)
+    spec, seen = record(EnvSettings(**options), num_envs, steps)
+    segments = cut(spec, seen, segment_steps)
     check_chain(segments, spec)
     streams = rebuilt(segments, spec)
     assert sorted(streams) == list(range(num_envs))
@@ -111,7 +90,7 @@ def test_segments_rebuild_every_observation(
 
 
 def test_continuing_frames_are_stored_once() -> None:
-    _, segments, _ = play(EnvSettings(**BREAKOUT, episodic_life=True), 1, 128, 64)
+    segments = cut(*record(EnvSettings(**BREAKOUT, episodic_life=True), 1, 128), 64)
     assert [len(segment.frames) for segment in segments] == [2 + 64, 4 + 64]
     assert [segment.carried for segment in segments] == [0, 4]
 
@@ -142,9 +121,9 @@ def test_any_pattern_of_restarts_and_cuts_rebuilds(
     assembler = SegmentAssembler(spec, 2, INCARNATION, segment_steps)
     assembler.begin(observed(held))
     segments, seen = [], []
-    for step, (*cut, padding) in enumerate(restarts):
+    for step, (*ends, padding) in enumerate(restarts):
         led = np.concatenate([held[:, 1:], rng.integers(0, 256, (2, 1, 1), dtype=np.uint8)], axis=1)
-        restarted = np.array(cut)
+        restarted = np.array(ends)
         now = np.where(restarted[:, None, None], fresh(padding), led)
         seen.append((observed(held), observed(led)))
         no = np.zeros(2, bool)

@@ -1,0 +1,42 @@
+"""What can't be played or held is refused at the start, in one line with the numbers, through the console command."""
+
+import os
+import subprocess
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+LOCAL = Path(sysconfig.get_path("scripts")) / "coop-local"
+
+
+@pytest.mark.parametrize(
+    ("flags", "status", "words"),
+    [
+        ("--env.id brekout", 2, ["env.id", "unknown game 'brekout'", "breakout"]),
+        ("--env.id Blackjack-v1", 2, ["env.id", "observation space Tuple", "allowed is a one-dimensional Box"]),
+        ("--env.id CartPole-v0", 1, ["'nature' needs frames [height, width], CartPole-v0 has (4,)"]),
+        (
+            "--replay.capacity 1000000000 --total-steps 1000000000",
+            1,
+            ["replay.capacity = 1,000,000,000: needs up to 6639.4 GiB, this machine has"],
+        ),
+    ],
+)
+def test_refused(flags: str, status: int, words: list[str], tmp_path: Path) -> None:
+    check([*flags.split(), "--run-dir", str(tmp_path / "run")], status, words)
+
+
+def test_a_missing_rom_is_refused(tmp_path: Path) -> None:
+    check(["--run-dir", str(tmp_path / "run")], 2, ["the ROM of 'breakout'"], {"ALE_ROMS_DIR": str(tmp_path)})
+
+
+def check(flags: list[str], status: int, words: list[str], environment: dict[str, str] | None = None) -> None:
+    command = [str(LOCAL), "--preset", "breakout", *flags]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, env={**os.environ, **(environment or {})}
+    )
+    assert done.returncode == status, done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("coop-local: error: ")
+    assert not [word for word in words if word not in done.stderr], done.stderr
