@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from actors.policy import Policy
 from actors.segments import EpisodeTracker, SegmentAssembler
@@ -16,6 +20,15 @@ from common.transport import Node
 from common.types import Array, EpisodeEnd
 
 STATUS_EVERY = 0.5  # seconds
+
+
+class _Played(NamedTuple):
+    """One step of all emulators, and what chose its actions."""
+
+    actions: NDArray[np.int32]
+    steps: Steps
+    epsilon: float
+    version: int
 
 
 class ActorService:
@@ -33,11 +46,12 @@ class ActorService:
         self._inserts = InsertClient(node, stop, settings.window * env.num_envs, self._tell)
         self._segments = SegmentAssembler(env.spec, env.num_envs, incarnation, settings.segment_steps)
         self._episodes = EpisodeTracker(env.num_envs)
+        self._played: _Played | None = None
         self._steps = 0
         self._status_due = 0.0
 
     def run(self) -> None:
-        """Play until the stop; then hand in what is begun, if the replay service still takes it."""
+        """Play until the stop; what has not filled a segment by then is dropped."""
         while not self._weights.ready:
             self._weights.refresh()
             if self._stop.wait(0.05):
@@ -49,26 +63,29 @@ class ActorService:
             self._tell()
 
     def _turn(self, obs: Array) -> Array:
-        """One step of all emulators; what they see next."""
+        """One step of all emulators; what they see next. They work while the step before is handed in."""
         self._weights.refresh()
         epsilon = schedules.epsilon(self._settings, self._inserts.inserted)
         actions = self._policy.act(obs, epsilon)
-        steps = self._env.step(actions)
+        self._env.send(actions)
+        if self._played is not None:
+            self._hand_in(self._played)
+        steps = self._env.recv()
+        self._played = _Played(actions, steps, epsilon, self._weights.version)
         self._steps += self._env.num_envs
-        ends = self._ends(steps, epsilon)
-        for segment in self._segments.add(actions, steps, self._weights.version, ends):
-            if not self._inserts.submit(segment):
-                break
         return steps.obs
 
-    def _ends(self, steps: Steps, epsilon: float) -> dict[int, EpisodeEnd]:
+    def _hand_in(self, played: _Played) -> None:
+        """Add a step to the segments, and send those that it filled."""
         ends = {}
-        for episode in self._episodes.add(steps):
-            q1_mean, q2_mean = self._policy.mean_values(steps.next_obs[episode.stream])
+        for episode in self._episodes.add(played.steps):
+            q1_mean, q2_mean = self._policy.mean_values(played.steps.next_obs[episode.stream])
             ends[episode.stream] = EpisodeEnd(
-                0, episode.episode_return, episode.length, epsilon, q1_mean, q2_mean, self._weights.version
+                0, episode.episode_return, episode.length, played.epsilon, q1_mean, q2_mean, played.version
             )
-        return ends
+        for segment in self._segments.add(played.actions, played.steps, played.version, ends):
+            if not self._inserts.submit(segment):
+                break
 
     def _tell(self) -> None:
         """Publish the status if it is due; while an insert waits, too."""

@@ -55,15 +55,19 @@ class AtariEnv:
         self._game_start = info["frame_number"] - info["episode_frame_number"]
         return self._shape(obs)
 
-    def step(self, actions: NDArray[np.int32]) -> Steps:
-        """Play one action, int32 [envs], in every emulator.
+    def send(self, actions: NDArray[np.int32]) -> None:
+        """Let the emulators' threads begin to play one action, int32 [envs], in each.
 
         Raises:
             ValueError: an action out of range.
         """
         if actions.min() < 0 or actions.max() >= self.spec.num_actions:
             raise ValueError(f"actions: {actions.tolist()}; allowed are 0..{self.spec.num_actions - 1}")
-        obs, rewards, terminated, _, info = self._ale.step(actions)
+        self._ale.send(actions)
+
+    def recv(self) -> Steps:
+        """Wait for all emulators."""
+        obs, rewards, terminated, _, info = self._ale.recv()
         # The frames played before the current game change exactly when the emulator was reset: `terminated` is
         # also set by a lost life, and a reset with `truncated` unset is possible when both fall together.
         game_start = info["frame_number"] - info["episode_frame_number"]
@@ -76,6 +80,11 @@ class AtariEnv:
         raw_rewards = rewards.astype(np.float64)
         learned = np.clip(rewards, -1, 1) if self._clip else rewards
         return Steps(obs, next_obs, learned.astype(np.float32), raw_rewards, terminated, restarted, restarted)
+
+    def step(self, actions: NDArray[np.int32]) -> Steps:
+        """`send`, then `recv`; raises as `send`."""
+        self.send(actions)
+        return self.recv()
 
     def close(self) -> None:
         """Join the emulators' threads."""

@@ -71,8 +71,14 @@ class VectorEnv(Protocol):
     def reset(self) -> Array:
         """Start every emulator from its seed: <frame_dtype>[envs, *obs_shape]."""
 
+    def send(self, actions: NDArray[np.int32]) -> None:
+        """Begin to play one action, int32 [envs] in 0..num_actions-1, in every emulator; `recv` must follow."""
+
+    def recv(self) -> Steps:
+        """What the actions sent last led to."""
+
     def step(self, actions: NDArray[np.int32]) -> Steps:
-        """Play one action, int32 [envs] in 0..num_actions-1, in every emulator."""
+        """`send`, then `recv`."""
 
     def close(self) -> None:
         """Free the emulators."""

@@ -39,6 +39,7 @@ class GymnasiumEnv:
         self._shrink = Shrink(space.shape) if self._pictures else None
         self._lengths = [0] * self.num_envs
         self._obs = np.empty(0)
+        self._actions = np.empty(0, np.int32)
         # Shared by every step in which nothing ends, so it must stay as it is.
         self._none = np.zeros(self.num_envs, bool)
         self._none.flags.writeable = False
@@ -52,15 +53,19 @@ class GymnasiumEnv:
             self._put(self._obs, row, frame)
         return self._obs
 
-    def step(self, actions: NDArray[np.int32]) -> Steps:
-        """Play one action, int32 [envs], in every emulator."""
+    def send(self, actions: NDArray[np.int32]) -> None:
+        """Note one action, int32 [envs], for every emulator."""
+        self._actions = actions
+
+    def recv(self) -> Steps:
+        """Play the actions noted last; plain environments have no threads to do it sooner."""
         next_obs = np.empty_like(self._obs)
         if self.spec.stack > 1:
             next_obs[:, :-1] = self._obs[:, 1:]
         rewards, lengths = [], self._lengths
         terminal: list[int] = []
         over: list[int] = []
-        for row, action in enumerate(actions.tolist()):
+        for row, action in enumerate(self._actions.tolist()):
             frame, reward, terminated, truncated, _ = self._envs[row].step(action + self._first_action)
             self._put(next_obs, row, frame)
             rewards.append(reward)
@@ -74,6 +79,11 @@ class GymnasiumEnv:
         self._obs = self._restart(next_obs, over) if over else next_obs
         ended = self._mask(over)
         return Steps(self._obs, next_obs, learned.astype(np.float32), raw_rewards, self._mask(terminal), ended, ended)
+
+    def step(self, actions: NDArray[np.int32]) -> Steps:
+        """`send`, then `recv`."""
+        self.send(actions)
+        return self.recv()
 
     def close(self) -> None:
         """Close the environments."""
