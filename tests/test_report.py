@@ -1,0 +1,220 @@
+"""Reports: the numbers agree with episodes.csv by other code, the page stands alone, partial data is named."""
+
+import base64
+import csv
+import json
+import re
+import shutil
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rliable import metrics
+
+from common.errors import RunError, UsageError
+from experiments.lockstep import Lockstep, finish
+from experiments.report import cli
+from experiments.report.figures import figures
+from experiments.report.measures import breaking_point, improvement, iqm_by_task, running_mean
+from experiments.report.paper import table_1
+from experiments.report.study import load_study
+from experiments.report.writer import write_report
+from experiments.sweep.grid import load_grid
+from learner.run_directory import RunDirectory
+
+GRID = """
+title = "Small <and> smaller"
+methods = ["dqn", "edql", "coop"]
+seeds = [0, 1]
+fixed.total_steps = 2000
+fixed.replay.start = 50
+fixed.replay.ratio = 0.25
+vary.replay.capacity = [60, 300]
+"""
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep's folder with every run of dqn and coop, one of edql torn and the others not begun."""
+    folder = tmp_path_factory.mktemp("study")
+    (folder / "sweep.toml").write_text(GRID)
+    for cell in load_grid(str(folder / "sweep.toml")).cells:
+        if cell.config.method != "edql":
+            run = Lockstep(cell.config)
+            with RunDirectory(folder / cell.name, cell.config) as directory:
+                for _ in range(cell.config.total_steps):
+                    run.play(directory)
+                finish(run, directory, time.monotonic(), "complete")
+            run.env.close()
+    torn = folder / "edql-capacity=60-seed=0"
+    torn.mkdir()
+    (torn / "episodes.csv").touch()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(study: Path) -> Path:
+    write_report(study, study / "report")
+    return study / "report"
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def returns(run: Path) -> list[float]:
+    return [float(row["return"]) for row in rows(run / "episodes.csv")]
+
+
+@pytest.mark.parametrize("name", ["dqn-capacity=60-seed=1", "coop-capacity=300-seed=0"])
+def test_a_run_recomputed_from_its_episodes(name: str, study: Path, report: Path) -> None:
+    (told,) = (row for row in rows(report / "table_runs.csv") if row["run"] == name)
+    last = returns(study / name)[-100:]
+    assert len(last) == 100 < len(returns(study / name))
+    assert float(told["mean"]) == pytest.approx(sum(last) / len(last), rel=1e-9)
+    assert float(told["sd"]) == pytest.approx(statistics.pstdev(last), rel=1e-9)
+    assert int(told["episodes"]) == len(returns(study / name))
+    lines = [json.loads(line) for line in (study / name / "metrics.jsonl").read_text().splitlines()]
+    late = [line["sample_age_mean"] for line in lines if line["env_step"] >= lines[-1]["env_step"] / 2]
+    assert float(told["sample_age_mean"]) == pytest.approx(statistics.fmean(late))
+    assert float(told["evicted_unsampled"]) == pytest.approx(lines[-1]["evicted_unsampled"])
+
+
+def test_settings_and_breaking_points_recomputed(study: Path, report: Path) -> None:
+    means = {
+        (method, capacity): [
+            statistics.fmean(returns(study / f"{method}-capacity={capacity}-seed={seed}")[-100:]) for seed in (0, 1)
+        ]
+        for method in ("dqn", "coop")
+        for capacity in (60, 300)
+    }
+    for row in rows(report / "table_settings.csv"):
+        both = means[row["method"], int(row["replay.capacity"])]
+        assert float(row["mean"]) == float(row["IQM"]) == pytest.approx(statistics.fmean(both))
+        assert float(row["sd over runs"]) == pytest.approx(statistics.stdev(both))
+        assert [float(row["IQM low"]), float(row["IQM high"])] == pytest.approx(sorted(both))
+        assert (row["runs"], row["seeds"]) == ("2", "0,1")
+    for row in rows(report / "table_breaking_points.csv"):
+        small, large = (statistics.fmean(means[row["method"], capacity]) for capacity in (60, 300))
+        assert int(row["breaking point"]) == (60 if small >= 0.95 * large else 300)
+        assert float(row["return at largest"]) == pytest.approx(large)
+    (better,) = rows(report / "table_improvement.csv")
+    wins = [x > y for c in (60, 300) for x in means["coop", c] for y in means["dqn", c]]
+    assert (better["x"], better["y"], float(better["P(x > y)"])) == ("coop", "dqn", statistics.fmean(wins))
+    paper = {row["method"]: row for row in rows(report / "table_table1.csv")}
+    assert paper["dqn"]["paper mean"] == "193.6"
+    assert float(paper["coop"]["mean"]) == pytest.approx(statistics.fmean(means["coop", 300]))
+    assert (paper["g-coop"]["paper sd"], paper["g-coop"]["mean"], paper["g-coop"]["runs"]) == ("0.82", "", "0")
+
+
+def test_curves_recomputed(study: Path, report: Path) -> None:
+    both = [study / f"coop-capacity=60-seed={seed}" for seed in (0, 1)]
+    at = {
+        name: {int(float(row["x"])): float(row["y"]) for row in rows(report / f"{name}.csv") if "60" in row["panel"]
+               and row["line"] == "coop"}
+        for name in ("returns_episodes", "returns_steps", "q_gap")
+    }  # fmt: skip
+    number = max(at["returns_episodes"])
+    assert number == min(len(returns(run)) for run in both)
+    assert at["returns_episodes"][number] == pytest.approx(
+        statistics.fmean(statistics.fmean(returns(run)[:number][-100:]) for run in both)
+    )
+    step, last = max(at["returns_steps"]), []
+    for run in both:
+        until = [float(row["return"]) for row in rows(run / "episodes.csv") if int(row["env_step"]) <= step]
+        last.append(statistics.fmean(until[-100:]))
+    assert at["returns_steps"][step] == pytest.approx(statistics.fmean(last))
+    gaps = []
+    for run in both:
+        when = int(rows(run / "episodes.csv")[number - 1]["env_step"])
+        lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        gaps.append([line["q_gap"] for line in lines if line["env_step"] <= when][-1])
+    assert at["q_gap"][number] == pytest.approx(statistics.fmean(gaps))
+
+
+def test_the_page_stands_alone_and_comes_out_the_same(study: Path, report: Path, tmp_path: Path) -> None:
+    text = (report / "index.html").read_text()
+    pictures = sorted(report.glob("*.png"))
+    assert {path.stem for path in pictures} == {
+        *("returns_episodes", "returns_steps", "exploration", "q_gap", "buffers", "diagnostics"),
+        *("iqm", "improvement", "profiles"),
+    }
+    for path in pictures:
+        assert f'src="data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"' in text
+    assert not re.search(r"(src|href)=(?!\"data:)|https?:", text)
+    assert "<h1>Small &lt;and&gt; smaller</h1>" in text
+    assert "edql-capacity=60-seed=0: begun, not finished" in text
+    assert text.count(": not begun") == 3
+    assert all("seeds" in figure.counts for figure in figures(load_study(study))[0])
+    write_report(study, tmp_path / "again")
+    for path in report.iterdir():
+        assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_one_run_alone(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(study / "coop-capacity=300-seed=1", tmp_path / "runs" / "one")
+    monkeypatch.setattr("sys.argv", ["coop-report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
+    cli.main()
+    text = (tmp_path / "out" / "index.html").read_text()
+    assert "1 of 1 runs finished: coop on CartPole-v0; they differ by nothing but method and seed" in text
+    assert "Return against buffer size, breaking points: replay.capacity is the same in all finished runs" in text
+    assert not (tmp_path / "out" / "buffers.png").exists()
+    assert rows(tmp_path / "out" / "table_settings.csv")[0]["IQM low"] == ""
+
+
+def test_what_is_no_study(study: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="holds no run"):
+        write_report(tmp_path, tmp_path / "out")
+    run = tmp_path / "runs" / "a"
+    shutil.copytree(study / "dqn-capacity=60-seed=0", run)
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match=r"--out .*Not a directory"):
+        write_report(run.parent, tmp_path / "file" / "out")
+    (run / "episodes.csv").write_text("episode,return\n1,x\n")
+    with pytest.raises(RunError, match="can't be read"):
+        write_report(run.parent, tmp_path / "out")
+    (run / "summary.json").unlink()
+    with pytest.raises(RunError, match="none of its 1 runs is finished"):
+        write_report(run.parent, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("means", "capacity", "gaps"),
+    [
+        ([10, 96, 97, 100], 100, False),
+        ([95, 96, 97, 100], 50, False),
+        ([96, 10, 97, 100], 50, True),
+        ([10, 20, 30, 100], 5000, False),
+        ([-106, -105, -100, -100], 100, False),
+    ],
+)
+def test_breaking_points(means: list[float], capacity: int, gaps: bool) -> None:
+    found = breaking_point(np.array([50, 100, 500, 5000]), [np.array([mean, mean], np.float64) for mean in means])
+    assert found == (capacity, capacity, capacity, gaps)
+
+
+def test_a_breaking_point_has_an_interval() -> None:
+    found = breaking_point(np.array([50, 500]), [np.array([90.0, 100.0, 100.0, 99.0]), np.array([100.0, 101.0])])
+    assert found == (50, 50, 500, False)
+
+
+def test_statistics_agree_with_rliable() -> None:
+    generator = np.random.default_rng(3)
+    x, y = generator.integers(0, 9, (7, 3)).astype(np.float64), generator.integers(0, 9, (5, 3)).astype(np.float64)
+    assert improvement(x, y).value[0] == pytest.approx(metrics.probability_of_improvement(x, y))
+    assert np.array_equal(iqm_by_task(x), iqm_by_task(x))
+    assert iqm_by_task(x).value == pytest.approx([metrics.aggregate_iqm(column) for column in x.T])
+    mean = running_mean(np.arange(250.0))
+    assert (mean[0], mean[99], mean[249]) == (0.0, 49.5, 199.5)
+
+
+@pytest.mark.parametrize(
+    ("env", "coop"),
+    [("CartPole-v0", 200), ("space-invaders", 1144), ("ALE/SpaceInvaders-v5", 1144), ("Pong-v5", 19.15), ("x", None)],
+)
+def test_the_papers_column(env: str, coop: float | None) -> None:
+    assert table_1(env).get("coop", (None,))[0] == coop
