@@ -222,7 +222,7 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
     try:
         config = _ADAPTER.validate_python(asdict(tables) if isinstance(tables, RunConfig) else tables)
     except pydantic.ValidationError as error:
-        raise UsageError(_first_problem(error)) from error
+        raise UsageError(first_problem(error, RunConfig())) from error
     replay = config.replay
     if replay.start > replay.capacity:
         raise UsageError(f"replay.start = {replay.start}: must not exceed replay.capacity = {replay.capacity}")
@@ -250,19 +250,23 @@ def _without_none(tables: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _first_problem(error: pydantic.ValidationError) -> str:
+def first_problem(error: pydantic.ValidationError, example: Any) -> str:  # noqa: ANN401 (any nested dataclasses)
+    """What pydantic found first, in one line: the field, the value and what is allowed.
+
+    example: an instance of what was to be built, for the names of its fields.
+    """
     first, *rest = error.errors(include_url=False)
     name = ".".join(str(part) for part in first["loc"])
     if first["type"] == "unexpected_keyword_argument":
-        text = f"{name} = {first['input']!r}: no such field; allowed: {', '.join(_siblings(first['loc']))}"
+        allowed = ", ".join(_siblings(first["loc"], example))
+        text = f"{name} = {first['input']!r}: no such field; allowed: {allowed}"
     else:
         text = f"{name} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
     return f"{text} (and {len(rest)} more)" if rest else text
 
 
-def _siblings(path: tuple[int | str, ...]) -> list[str]:
+def _siblings(path: tuple[int | str, ...], example: Any) -> list[str]:  # noqa: ANN401
     """The fields that are allowed where the last name of `path` stands."""
-    place: Any = RunConfig()
     for name in path[:-1]:
-        place = getattr(place, str(name))
-    return [field.name for field in fields(place)]
+        example = getattr(example, str(name))
+    return [field.name for field in fields(example)]

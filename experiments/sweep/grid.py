@@ -6,7 +6,7 @@ import itertools
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,6 +20,7 @@ from common.config import (
     Method,
     Positive,
     RunConfig,
+    first_problem,
     load_tables,
     resolve,
     to_tables,
@@ -97,21 +98,12 @@ def load_grid(name: str, quick: bool = False) -> Grid:
         try:
             file = pydantic.TypeAdapter(GridFile).validate_python(tables)
         except pydantic.ValidationError as error:
-            raise UsageError(_problem(error)) from error
+            raise UsageError(first_problem(error, GridFile())) from error
         return Grid(file, _cells(file))
     except OSError as error:
         raise UsageError(f"grid {name}: {error.strerror}") from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, UsageError) as error:
         raise UsageError(f"grid {name}: {error}") from error
-
-
-def _problem(error: pydantic.ValidationError) -> str:
-    """What is wrong with the file's own fields, in one line."""
-    first = error.errors(include_url=False)[0]
-    text = f"{'.'.join(map(str, first['loc']))} = {first['input']!r}"
-    if first["type"] == "unexpected_keyword_argument":
-        return f"{text}: no such field; allowed: {', '.join(entry.name for entry in fields(GridFile))}"
-    return f"{text}: {first['msg'][0].lower()}{first['msg'][1:]}"
 
 
 def _text(name: str) -> str:
