@@ -12,7 +12,7 @@ from actors.service import ActorService
 from common import cli
 from common.environments import make_vector_env
 from common.errors import JoinError, PeerLost
-from common.joining import join
+from common.joining import Membership, join
 from common.lifecycle import Stop, run_main
 from common.messages import Join, Joined
 from common.networks import FlatNetwork, build_network
@@ -39,7 +39,8 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     incarnation = new_incarnation()
-    joined = _join(options, stop, incarnation)
+    request = Join("actor", incarnation, [])
+    joined = _join(options, stop, request)
     if joined is None:
         return
     config = joined.config
@@ -53,17 +54,18 @@ def _run() -> None:
     session = open_session((), endpoints, options.zenoh_config, options.shared_memory)
     with Node(session, options.run, "actor", incarnation) as node:
         node.follow_stop(stop, options.patience)
+        membership = Membership(node, stop, request, joined, options.connect, options.patience)
         ActorService(node, stop, config.actor, env, policy, incarnation).run()
+        membership.close()
     env.close()
     if stop.failed:
         raise PeerLost(stop.reason)
 
 
-def _join(options: ActorOptions, stop: Stop, incarnation: int) -> Joined | None:
+def _join(options: ActorOptions, stop: Stop, request: Join) -> Joined | None:
     """Ask over a session of its own: where the replay service is to be reached is part of the answer."""
     session = open_session((), options.connect, options.zenoh_config)
-    with Node(session, options.run, "joining", incarnation) as node:
-        request = Join("actor", incarnation, [])
+    with Node(session, options.run, "joining", request.incarnation) as node:
         return join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from common import experience, messages
 from common.errors import BadMessage
-from common.experience import BatchReader, Drawn
+from common.experience import MAX_AHEAD, BatchReader, Drawn, DrawRequest
 from common.lifecycle import Stop
 from common.transport import NoAnswer, Node, Pending
 from common.types import Batch, EnvSpec, Segment
@@ -86,7 +86,7 @@ class InsertClient:
             if not self._settle(self._outstanding[0]):
                 return False
             self._outstanding.popleft()
-        payload = experience.encode_segment(self._node.run, segment)
+        payload = experience.encode_segment(self._node.run, replace(segment, acked=self.acked))
         self._outstanding.append(_Sent(payload, segment.steps, self._node.begin(self._key, payload)))
         return True
 
@@ -143,10 +143,27 @@ class InsertClient:
 class SampleClient:
     """Draws batches, keeping `prefetch` requests under way.
 
-    waiting: why no batch comes, in words; empty while they do.
+    Args:
+        first: number of the first batch: updates that the learner has done before.
+        episodes: episodes that the learner has been told of before.
+
+    Attributes:
+        episodes: episodes told so far.
+        waiting: why no batch comes, in words; empty while they do.
     """
 
-    def __init__(self, node: Node, stop: Stop, incarnation: int, spec: EnvSpec, batch_size: int, prefetch: int) -> None:
+    def __init__(
+        self,
+        node: Node,
+        stop: Stop,
+        incarnation: int,
+        spec: EnvSpec,
+        batch_size: int,
+        prefetch: int,
+        first: int = 0,
+        episodes: int = 0,
+    ) -> None:
+        self.episodes = episodes
         self.waiting = ""
         self._node = node
         self._stop = stop
@@ -156,19 +173,33 @@ class SampleClient:
         self._read = BatchReader(spec)
         self._key = replay_key(node, "sample")
         self._outstanding: deque[tuple[int, Pending]] = deque()
-        self._next = 0
-        self._episodes = 0
+        self._next = first
+        self._done = first
+        self._pinned: int | None = None
         self._backoff = Backoff()
+
+    def pin(self) -> int:
+        """Keep every batch after the last one taken repeatable until `release`; the number of batches taken."""
+        self._pinned = self._done
+        return self._done
+
+    def release(self) -> None:
+        """End `pin`."""
+        self._pinned = None
 
     def next(self) -> tuple[Batch, Drawn] | None:
         """The next batch and the episodes that are new since the last one; None if there is none for now.
 
         Raises:
-            Refused: the replay service found a request bad.
+            Refused: the replay service found a request bad, or serves another learner now.
         """
-        while len(self._outstanding) < self._prefetch:
+        while len(self._outstanding) < self._prefetch and self._next < self._base + MAX_AHEAD:
             self._outstanding.append((self._next, self._request(self._next)))
             self._next += 1
+        if not self._outstanding:
+            self.waiting = "the replay service has not begun its part of the epoch"
+            self._backoff.pause(self._stop)
+            return None
         sequence, pending = self._outstanding[0]
         try:
             message = pending.wait()
@@ -185,11 +216,13 @@ class SampleClient:
         self._outstanding[0] = (sequence, self._request(sequence))
         return None
 
+    @property
+    def _base(self) -> int:
+        return self._done if self._pinned is None else self._pinned
+
     def _request(self, sequence: int) -> Pending:
-        request = experience.encode_sample(
-            self._node.run, self._incarnation, sequence, self._batch_size, self._episodes
-        )
-        return self._node.begin(self._key, request)
+        request = DrawRequest(self._incarnation, sequence, self._base, self._batch_size, self.episodes)
+        return self._node.begin(self._key, experience.encode_sample(self._node.run, request))
 
     def _accept(self, message: Message, sequence: int) -> tuple[Batch, Drawn]:
         batch, drawn = self._read(message)
@@ -197,7 +230,8 @@ class SampleClient:
             raise BadMessage("fields.sequence", f"{drawn.sequence} instead of {sequence}")
         self._backoff.reset()
         self.waiting = ""
-        fresh = drawn.episodes[max(0, self._episodes - drawn.first_episode) :]
-        drawn = replace(drawn, first_episode=self._episodes, episodes=fresh)
-        self._episodes += len(fresh)
-        return batch, drawn
+        self._done = sequence + 1
+        first = max(self.episodes, drawn.first_episode)
+        fresh = drawn.episodes[first - drawn.first_episode :]
+        self.episodes = first + len(fresh)
+        return batch, replace(drawn, first_episode=first, episodes=fresh)

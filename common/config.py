@@ -69,7 +69,7 @@ class LearnerSettings:
     device: str = "cpu"
     threads: Positive = 1
     """CPU threads of torch in the learner."""
-    prefetch: Positive = 4
+    prefetch: Annotated[int, Field(gt=0, le=256)] = 4
     """Sample requests under way at once."""
     publish_every: Positive = 10
     """Updates between broadcasts of the acting network; every swap is broadcast too."""
@@ -144,6 +144,8 @@ class RunConfig:
     """Stop after this many finished episodes; 0: no limit."""
     target_return: float | None = None
     """Stop once the mean return of the last 100 episodes reaches this."""
+    checkpoint_every: Count = 10_000
+    """Updates between epochs, the checkpoints of the whole system; 0: only the closing one."""
     env: EnvSettings = field(default_factory=EnvSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
     learner: LearnerSettings = field(default_factory=LearnerSettings)

@@ -8,7 +8,7 @@ batch     its answer; also carries the episodes that ended
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from common.wire import Message
 
 MAX_SEGMENT_STEPS = 4096
 MAX_EPISODES = 1000  # told with one batch; later ones come with the next
+MAX_AHEAD = 1024  # draws that a learner may be ahead of its base
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,10 @@ class EpisodeRecord:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What the table says beside a batch: its counters, and the episodes from number `first_episode` on."""
+    """What the table says beside a batch: its counters, and the episodes from number `first_episode` on.
+
+    planned: batches that the complete run will have drawn.
+    """
 
     sequence: int
     inserted: int
@@ -48,13 +52,36 @@ class Drawn:
     evicted_unsampled: int
     first_episode: int
     episodes: tuple[EpisodeRecord, ...]
+    planned: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class DrawRequest:
+    """A request for the batch of update number `sequence`; repeated, it is answered with the same batch.
+
+    base: updates that the learner has done for good: it never asks again for a batch below. A replay service that
+        has drawn less than that, or that served another incarnation, takes it for its own count of draws.
+    episodes_from: number of the first episode that the learner has not been told of.
+    """
+
+    incarnation: int
+    sequence: int
+    base: int
+    batch_size: int
+    episodes_from: int
 
 
 _EPISODE_END = Row((Int(0, MAX_SEGMENT_STEPS - 1), Real(), Int(1), Real(), Real(), Real(), Int(-1)))
 _EPISODE_RECORD = Row((Int(), Int(), Int(), _EPISODE_END))
 _SAMPLE = Schema(
     "sample",
-    {"incarnation": INCARNATION, "sequence": Int(), "batch_size": Int(1, 65_536), "episodes_from": Int()},
+    {
+        "incarnation": INCARNATION,
+        "sequence": Int(),
+        "base": Int(),
+        "batch_size": Int(1, 65_536),
+        "episodes_from": Int(),
+    },
     {},
 )
 _DRAWN_FIELDS: dict[str, Rule] = {
@@ -65,6 +92,7 @@ _DRAWN_FIELDS: dict[str, Rule] = {
     "evicted_unsampled": Int(),
     "first_episode": Int(),
     "episodes": ListOf(_EPISODE_RECORD, MAX_EPISODES),
+    "planned": Int(),
 }
 _SEGMENT_FIELDS: dict[str, Rule] = {
     "incarnation": INCARNATION,
@@ -153,22 +181,19 @@ def _within(field: str, array: Array, low: int, high: int) -> None:
         raise BadMessage(field, f"values from {array.min()} to {array.max()}; allowed: {low} to {high}")
 
 
-def encode_sample(run: str, incarnation: int, sequence: int, batch_size: int, episodes_from: int) -> bytearray:
-    """Build a draw request; a repeated (incarnation, sequence) gets the same batch again."""
-    fields = {
-        "incarnation": incarnation,
-        "sequence": sequence,
-        "batch_size": batch_size,
-        "episodes_from": episodes_from,
-    }
-    return wire.encode("sample", run, fields)
+def encode_sample(run: str, request: DrawRequest) -> bytearray:
+    """Build a draw request."""
+    return wire.encode("sample", run, asdict(request))
 
 
-def decode_sample(message: Message) -> tuple[int, int, int, int]:
-    """Read (incarnation, sequence, batch_size, episodes_from); raises BadMessage."""
+def decode_sample(message: Message) -> DrawRequest:
+    """Read a draw request; raises BadMessage."""
     _SAMPLE.check(message)
-    fields = message.fields
-    return fields["incarnation"], fields["sequence"], fields["batch_size"], fields["episodes_from"]
+    request = DrawRequest(**message.fields)
+    if not request.base <= request.sequence < request.base + MAX_AHEAD:
+        allowed = f"{request.base} to {request.base + MAX_AHEAD - 1}"
+        raise BadMessage("fields.sequence", f"{request.sequence}; with base {request.base}: {allowed}")
+    return request
 
 
 _BATCH_ARRAYS = (*_SEGMENT_ARRAYS, "weights", "ids", "age", "reuse")

@@ -12,6 +12,7 @@ from types import FrameType
 from common.errors import CoopError
 
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
+INTERRUPTED = 130  # exit status after Ctrl-C where there was nothing to stop cleanly
 
 
 class Stop:
@@ -66,4 +67,4 @@ def run_main(program: str, main: Callable[[], None]) -> None:
         sys.exit(1)
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr, flush=True)
-        sys.exit(130)
+        sys.exit(INTERRUPTED)

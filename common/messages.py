@@ -6,13 +6,13 @@ sample / batch       the learner draws; also carries the episodes that ended
 retry                the limiter's answer to an insert or a sample, with the reason in words
 weights, role, stop  the learner's broadcasts
 status               what a role is doing, for displays
-stats, snapshot      questions to the replay service
+stats                a question to the replay service
+snapshot, written    have the replay service begin its part of an epoch; ask whether it is on disk
 error                the answer to a message that is bad (names the field) or that could not be carried out
 """
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict, dataclass
 from dataclasses import fields as dataclass_fields
 from typing import Any
@@ -32,11 +32,15 @@ _ENDPOINTS = ListOf(Text(256), 16)
 
 @dataclass(frozen=True, slots=True)
 class Join:
-    """A process asks to be part of the run; `endpoints` are where others can reach it (none for actors)."""
+    """A process asks to be part of the run.
+
+    endpoints: where others can reach it; none for actors. index: the one it was given when it joined before, or -1.
+    """
 
     role: str
     incarnation: int
     endpoints: list[str]
+    index: int = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +50,8 @@ class Joined:
     replay_endpoints: where the replay service listens; empty while none has joined.
     index: how many processes of this role had joined before (tells actors' random streams apart).
     layout: digest of the network layout, to be compared with one's own.
+    run_id: drawn at random when the run began; tells it from others of its name.
+    epoch: number of the newest epoch that is finished; 0 if there is none.
     """
 
     config: RunConfig
@@ -53,6 +59,8 @@ class Joined:
     layout: str
     index: int
     replay_endpoints: list[str]
+    run_id: int
+    epoch: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +92,18 @@ class ReplayStats:
     samples_wait_for: str
 
 
-_JOIN = Schema("join", {"role": Text(16), "incarnation": INCARNATION, "endpoints": _ENDPOINTS}, {})
+_JOIN = Schema("join", {"role": Text(16), "incarnation": INCARNATION, "endpoints": _ENDPOINTS, "index": Int(-1)}, {})
 _JOINED = Schema(
     "joined",
-    {"config": Table(), "spec": Table(), "layout": Text(64), "index": Int(), "replay_endpoints": _ENDPOINTS},
+    {
+        "config": Table(),
+        "spec": Table(),
+        "layout": Text(64),
+        "index": Int(),
+        "replay_endpoints": _ENDPOINTS,
+        "run_id": INCARNATION,
+        "epoch": Int(),
+    },
     {},
 )
 _ACK = Schema("ack", {"inserted": Int()}, {})
@@ -99,9 +115,9 @@ _STATS = Schema(
     {field.name: Text() if field.name.endswith("_wait_for") else Int() for field in dataclass_fields(ReplayStats)},
     {},
 )
-_SNAPSHOT = Schema("snapshot", {"folder": Text(256)}, {})
+_SNAPSHOT = Schema("snapshot", {"number": Int(), "keep": ListOf(Int(), 16)}, {})
+_WRITTEN = Schema("written", {"number": Int()}, {})
 _STOP = Schema("stop", {"reason": Text()}, {})
-_FOLDER = re.compile(r"checkpoints/[0-9]{1,12}")
 
 
 def encode_join(run: str, join: Join) -> bytearray:
@@ -120,14 +136,9 @@ def decode_join(message: Message) -> Join:
 
 def encode_joined(joined: Joined) -> bytearray:
     """Build the learner's answer."""
-    fields = {
-        "config": to_tables(joined.config),
-        "spec": asdict(joined.spec),
-        "layout": joined.layout,
-        "index": joined.index,
-        "replay_endpoints": joined.replay_endpoints,
-    }
-    return wire.encode("joined", joined.config.run, fields)
+    fields = {field.name: getattr(joined, field.name) for field in dataclass_fields(Joined)}
+    tables = {"config": to_tables(joined.config), "spec": asdict(joined.spec)}
+    return wire.encode("joined", joined.config.run, {**fields, **tables})
 
 
 def decode_joined(message: Message) -> Joined:
@@ -138,7 +149,7 @@ def decode_joined(message: Message) -> Joined:
         config = validated(fields["config"])
     except UsageError as error:
         raise BadMessage("fields.config", str(error)) from error
-    return Joined(config, _spec(fields["spec"]), fields["layout"], fields["index"], fields["replay_endpoints"])
+    return Joined(**{**fields, "config": config, "spec": _spec(fields["spec"])})
 
 
 def _spec(table: dict[str, Any]) -> EnvSpec:
@@ -237,18 +248,26 @@ def decode_stats(message: Message) -> ReplayStats:
     return ReplayStats(**message.fields)
 
 
-def encode_snapshot(run: str, folder: str) -> bytearray:
-    """Build the request to save the table under `folder` of the run directory."""
-    return wire.encode("snapshot", run, {"folder": folder})
+def encode_snapshot(run: str, number: int, keep: list[int]) -> bytearray:
+    """Build the request to begin the replay service's part of epoch `number`; of older ones it keeps `keep` alone."""
+    return wire.encode("snapshot", run, {"number": number, "keep": keep})
 
 
-def decode_snapshot(message: Message) -> str:
-    """Read the folder of a snapshot request; raises BadMessage where it could lead elsewhere."""
+def decode_snapshot(message: Message) -> tuple[int, list[int]]:
+    """Read (number, keep); raises BadMessage."""
     _SNAPSHOT.check(message)
-    folder = str(message.fields["folder"])
-    if not _FOLDER.fullmatch(folder):
-        raise BadMessage("fields.folder", f"{folder!r}; checkpoints/NUMBER")
-    return folder
+    return message.fields["number"], message.fields["keep"]
+
+
+def encode_written(run: str, number: int) -> bytearray:
+    """Build the question whether the replay service's part of epoch `number` is on disk."""
+    return wire.encode("written", run, {"number": number})
+
+
+def decode_written(message: Message) -> int:
+    """Read the number of the epoch that is asked for; raises BadMessage."""
+    _WRITTEN.check(message)
+    return int(message.fields["number"])
 
 
 def encode_stop(run: str, reason: str) -> bytearray:

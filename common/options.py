@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from common import cli
-from common.config import RunConfig, validated
+from common.config import RunConfig, load_tables, resolve, to_tables, validated
 from common.errors import UsageError
 
 
@@ -41,6 +41,8 @@ class RunOptions(RunConfig):
     """A TOML file with the fields below, for example the config.toml of another run."""
     run_dir: Path | None = None
     """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
+    resume: bool = False
+    """Go on with the run in --run-dir, from its newest epoch."""
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
     shared_memory: bool = False
@@ -54,13 +56,28 @@ class RunOptions(RunConfig):
         """The run directory.
 
         Raises:
-            UsageError: there is a run in it already.
+            UsageError: there is a run in it already; or, with --resume, none, or one with another config.
         """
+        if self.resume:
+            return self._resumed()
         game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
         named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         path = self.run_dir or Path("runs") / named
         if (path / "episodes.csv").exists():
-            raise UsageError(f"--run-dir {path}: holds a run already; give another folder")
+            raise UsageError(f"--run-dir {path}: holds a run already; give another folder, or --resume to go on")
+        return path
+
+    def _resumed(self) -> Path:
+        path = self.run_dir
+        if path is None or not (path / "config.toml").exists():
+            raise UsageError(f"--resume: no run in --run-dir {path}")
+        saved = resolve(load_tables(None, path / "config.toml"))
+        for name, value in to_tables(self.run_config()).items():
+            if (before := to_tables(saved).get(name)) != value:
+                raise UsageError(
+                    f"--resume: {path / 'config.toml'} has {name} = {before}, the flags {value}; "
+                    f"give the same, or --config with it"
+                )
         return path
 
 

@@ -11,7 +11,7 @@ import sysconfig
 from pathlib import Path
 
 from common.errors import RunError
-from common.lifecycle import SUPERVISED
+from common.lifecycle import INTERRUPTED, SUPERVISED
 
 LAST_WORDS = 400  # characters of a log's last line
 
@@ -52,6 +52,10 @@ class ChildProcess:
     def exit_status(self) -> int | None:
         """None while it runs."""
         return None if self._process is None else self._process.poll()
+
+    def was_interrupted(self) -> bool:
+        """True where an interrupt ended it before it could stop cleanly, as while it starts."""
+        return self.exit_status() in (-signal.SIGINT, INTERRUPTED)
 
     def interrupt(self) -> None:
         """Ask it to stop cleanly."""

@@ -223,6 +223,15 @@ class Node:
                 counts[role] = counts.get(role, 0) + 1
         return counts
 
+    def on_learner(self, appeared: Callable[[], None]) -> None:
+        """Call `appeared`, in a thread of Zenoh's, for the learner that is there and whenever one comes."""
+
+        def changed(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                appeared()
+
+        self.session.liveliness().declare_subscriber(self.key("alive", "learner", "*"), changed, history=True)
+
     def follow_stop(self, stop: Stop, patience: float) -> None:
         """Stop when the learner says so, or when it has been gone for `patience` seconds."""
         timers = self._timers

@@ -37,12 +37,13 @@ _PREFIX = struct.Struct("<II")
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One decoded message; `arrays` are read-only views of the received bytes."""
+    """One decoded message; `arrays` are read-only views of `payload`, the bytes received."""
 
     kind: str
     run: str
     fields: Mapping[str, Any]
     arrays: Mapping[str, Array]
+    payload: bytes = b""
 
 
 def encode(kind: str, run: str, fields: Mapping[str, Any], arrays: Mapping[str, Array] | None = None) -> bytearray:
@@ -79,7 +80,7 @@ def decode(payload: bytes) -> Message:
         if name in arrays:
             raise BadMessage(f"arrays.{name}", "appears twice")
         arrays[name] = array
-    return Message(header["kind"], header["run"], header["fields"], arrays)
+    return Message(header["kind"], header["run"], header["fields"], arrays, payload)
 
 
 def _aligned(offset: int) -> int:

@@ -14,11 +14,10 @@ from common.options import RunOptions, parse_run
 from common.processes import ChildProcess, command, free_endpoint
 from common.transport import new_incarnation
 from deploy.status import Display, RunStatus
+from deploy.supervisor import RESTARTS, RestartPolicy
 
 TICK = 0.1  # seconds
 GRACE = 30.0  # seconds that a role gets for a clean stop
-RESTART_PAUSE = 1.0  # seconds
-RESTARTS = 20  # of one actor
 
 
 @dataclass(frozen=True)
@@ -50,19 +49,18 @@ class Topology:
         common = [f"--zenoh-config={options.zenoh_config}"] if options.zenoh_config else []
         common += ["--shared-memory"] if options.shared_memory else []
         joining = [f"--run={config.run}", "--connect", self.endpoint, *common]
-        files = [f"--config={resolved}", f"--run-dir={directory}", "--listen", self.endpoint, *common]
-        self.learner = ChildProcess("learner", command("coop-learner", *files), logs / "learner.log")
-        self._replay = ChildProcess(
-            "replay",
-            command("coop-replay", *joining, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}"),
-            logs / "replay.log",
-        )
-        self._actors = [
+        # --resume, also at the first start: one that is started again goes on from the newest epoch.
+        files = [f"--run-dir={directory}", "--resume", *common]
+        learning = [f"--config={resolved}", "--listen", self.endpoint, *files]
+        serving = [*joining, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}", "--resume"]
+        self.learner = ChildProcess("learner", command("coop-learner", *learning), logs / "learner.log")
+        self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log")]
+        self._others += [
             ChildProcess(f"actor {number}", command("coop-actor", *joining), logs / f"actor-{number}.log")
             for number in range(1, options.actors + 1)
         ]
-        self._restart_at: dict[str, float] = {}
-        self._restarts: dict[str, int] = {}
+        self._policies = {process.name: RestartPolicy() for process in self._all()}
+        self._interrupted = False
 
     def start(self) -> None:
         """Start every role."""
@@ -70,34 +68,39 @@ class Topology:
             process.start()
 
     def check(self, display: Display) -> bool:
-        """Look after the processes; True once the learner has ended well.
+        """Look after the processes, and start those again that were killed; True once the learner has ended well.
 
         Raises:
-            RunError: learner or replay service died, or an actor dies again and again.
+            RunError: a role gave up by itself, or dies again and again.
         """
-        status = self.learner.exit_status()
-        if status is not None:
-            if status:
-                raise RunError(self.learner.why())
+        if self.learner.exit_status() == 0 or (self._interrupted and self.learner.was_interrupted()):
             return True
-        if self._replay.exit_status():
-            raise RunError(self._replay.why())
-        for actor in self._actors:
-            if actor.exit_status():
-                self._revive(actor, display)
+        for process in self._all():
+            if process.exit_status() is not None and not self._interrupted:
+                self._revive(process, display)
+        if self._interrupted and self.learner.exit_status() is not None:
+            raise RunError(f"{self.learner.why()}; interrupted before it was back, --resume goes on")
         return False
 
-    def _revive(self, actor: ChildProcess, display: Display) -> None:
-        now = time.monotonic()
-        if actor.name not in self._restart_at:
-            self._restarts[actor.name] = self._restarts.get(actor.name, 0) + 1
-            if self._restarts[actor.name] > RESTARTS:
-                raise RunError(f"{actor.why()}; it has been restarted {RESTARTS} times")
-            display.say(f"{actor.why()}; starting it again")
-            self._restart_at[actor.name] = now + RESTART_PAUSE
-        elif now >= self._restart_at[actor.name]:
-            del self._restart_at[actor.name]
-            actor.start()
+    def interrupt(self) -> None:
+        """Ask the learner to stop cleanly; the others follow it, and nobody is started again."""
+        self._interrupted = True
+        self.learner.interrupt()
+
+    def _revive(self, process: ChildProcess, display: Display) -> None:
+        policy, now = self._policies[process.name], time.monotonic()
+        if policy.at is None:
+            status = process.exit_status() or 0
+            if not policy.ended(now):
+                raise RunError(f"{process.why()}; it has been started again {RESTARTS} times")
+            if status > 0 and not process.name.startswith("actor"):
+                raise RunError(process.why())
+            if status:
+                display.say(f"{process.why()}; starting it again")
+            else:
+                policy.at = now + GRACE  # it was told to stop, and the learner is likely to follow
+        elif policy.due(now):
+            process.start()
 
     def finish(self) -> None:
         """Wait for every role to stop; the others follow the learner."""
@@ -111,7 +114,7 @@ class Topology:
         self.finish()
 
     def _all(self) -> list[ChildProcess]:
-        return [self.learner, self._replay, *self._actors]
+        return [self.learner, *self._others]
 
 
 def main() -> None:
@@ -140,7 +143,7 @@ def _run() -> None:
                 display.update()
                 if stop.wait(TICK) and not interrupted:
                     interrupted = True
-                    topology.learner.interrupt()
+                    topology.interrupt()
                 elif interrupted:
                     time.sleep(TICK)
     except BaseException:
@@ -148,6 +151,10 @@ def _run() -> None:
         raise
     finally:
         status.close()
+    if topology.learner.was_interrupted():
+        topology.abort()
+        print("interrupted while the learner was starting; --resume goes on")
+        return
     topology.finish()
     print(topology.learner.last_line())
     curve = directory / "learning_curve.png"

@@ -20,7 +20,7 @@ from common.experience import Drawn, EpisodeRecord
 from common.types import EpisodeEnd
 from learner.agent import Agent
 from learner.curve import draw_learning_curve
-from learner.epochs import DONE, load_learner, save_epoch
+from learner.epochs import load_learner, save_epoch
 from learner.run_directory import RunDirectory
 from learner.telemetry import Telemetry
 from replay.table import Table
@@ -107,27 +107,26 @@ class Lockstep:
             number = self.telemetry.episode(episode.episode_return)
             directory.episode(number, EpisodeRecord(self.step, 0, 0, end), version, self.agent.exploration_rate())
 
-    def save(self, run_dir: Path) -> None:
+    def save(self, directory: RunDirectory) -> None:
         """Save an epoch from which `restore` goes on to the bit."""
         generator = self._policy_rng.bit_generator.state
         state = {
             "agent": self.agent.state(),
-            "returns": list(self.telemetry.returns),
-            "episodes": self.telemetry.episodes,
+            "telemetry": self.telemetry.state(),
             "step": self.step,
             "policy": {**generator, "state": {name: str(value) for name, value in generator["state"].items()}},
-            "sizes": {name: (run_dir / name).stat().st_size for name in ("episodes.csv", "metrics.jsonl")},
+            "sizes": directory.sizes(),
         }
 
         def snapshot(folder: str) -> None:
-            path = run_dir / folder / "replay"
+            path = directory.path / folder / "replay"
             path.mkdir(exist_ok=True)
             meta, arrays = self._table.state()
             (path / "state.msgpack").write_bytes(msgpack.packb({"table": meta}))
             for name, array in {**arrays, "played": np.array(self._actions, np.int32)}.items():
                 np.save(path / f"{name}.npy", array)
 
-        save_epoch(run_dir, self.step, state, snapshot)
+        save_epoch(directory.path, self.agent.updates, state, snapshot)
 
     def restore(self, epoch: Path) -> dict[str, int]:
         """Go on where `save` was called; the sizes that the run's files had.
@@ -153,17 +152,10 @@ class Lockstep:
             **generator,
             "state": {name: int(value) for name, value in generator["state"].items()},
         }
-        self.telemetry.returns.extend(state["returns"])
-        self.telemetry.episodes = state["episodes"]
+        self.telemetry.load_state(state["telemetry"])
         self.step = state["step"]
         sizes: dict[str, int] = state["sizes"]
         return sizes
-
-
-def newest_epoch(run_dir: Path) -> Path | None:
-    """The newest complete epoch of a run directory."""
-    done = [path.parent for path in (run_dir / "checkpoints").glob(f"*/{DONE}")]
-    return max(done, key=lambda path: int(path.name), default=None)
 
 
 def summary(run: Lockstep, started: float, outcome: str) -> dict[str, Any]:
@@ -188,7 +180,7 @@ def summary(run: Lockstep, started: float, outcome: str) -> dict[str, Any]:
 
 def finish(run: Lockstep, directory: RunDirectory, started: float, outcome: str) -> dict[str, Any]:
     """Write what a run leaves at its end."""
-    run.save(directory.path)
+    run.save(directory)
     values = summary(run, started, outcome)
     directory.summary(values)
     draw_learning_curve(directory.path, f"{values['env']}, {values['method']}, seed {values['seed']}, lockstep")

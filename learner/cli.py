@@ -12,6 +12,8 @@ from common.lifecycle import Stop, run_main
 from common.options import RunOptions, parse_run
 from common.transport import Node, locators, new_incarnation, open_session
 from learner.agent import Agent
+from learner.checkpoints import Checkpoints
+from learner.epochs import load_learner, newest_epoch
 from learner.reception import Reception
 from learner.run_directory import RunDirectory
 from learner.service import LearnerService
@@ -41,14 +43,25 @@ def _run() -> None:
     stop.on_signals()
     path = options.directory()
     agent = Agent(config, spec)
+    epoch = newest_epoch(path) if options.resume else None
+    state = None if epoch is None else load_learner(epoch)
+    if state is not None:
+        agent.load_state(state["agent"])
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory)
-    with Node(session, config.run, "learner", incarnation) as node, RunDirectory(path, config) as directory:
-        settings = config.learner
-        Reception(node, config, spec, agent.networks[0].layout_digest())
-        samples = SampleClient(node, stop, incarnation, spec, settings.batch_size, settings.prefetch)
+    sizes = None if state is None else state["sizes"]
+    with Node(session, config.run, "learner", incarnation) as node, RunDirectory(path, config, sizes) as directory:
+        settings, told = config.learner, 0 if state is None else state["told"]
+        samples = SampleClient(
+            node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, told
+        )
+        checkpoints = Checkpoints(node, path, samples, config.checkpoint_every, agent.updates)
+        run_id = directory.run_id()
+        Reception(node, config, spec, agent.networks[0].layout_digest(), run_id, lambda: checkpoints.newest)
         print(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}", flush=True)
-        summary = LearnerService(node, stop, agent, directory, samples).run()
+        if state is not None:
+            print(f"goes on from epoch {agent.updates}", flush=True)
+        summary = LearnerService(node, stop, agent, directory, samples, checkpoints, state).run()
     print(
         f"{summary['exit']}: {summary['env_steps']:,} steps, {summary['updates']:,} updates, return of the last "
         f"100 episodes {summary['return_mean_100']:.1f} ({summary['return_sd_100']:.1f}), "

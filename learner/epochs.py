@@ -2,38 +2,72 @@
 
 from __future__ import annotations
 
-import os
+import io
+import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from common.files import measure, write_whole
+
 DONE = "DONE"
+LEARNER = "learner.pt"
+KEPT = 2
 
 
 def save_epoch(run_dir: Path, number: int, learner_state: dict[str, Any], snapshot: Callable[[str], None]) -> Path:
-    """Save one epoch; `DONE` is written last, so that a torn epoch is recognised by its absence.
+    """Save one epoch and drop those that are too old or torn.
+
+    `DONE`, with size and checksum of learner.pt, is written last: without it an epoch is torn.
 
     snapshot: has the replay service save itself under the folder it is given, relative to the run directory.
 
     Raises:
-        OSError: the run directory can't be written.
+        OSError: the run directory can't be written; nothing is left of this epoch.
     """
     folder = f"checkpoints/{number}"
     path = run_dir / folder
-    path.mkdir(parents=True, exist_ok=True)
-    (path / DONE).unlink(missing_ok=True)
-    with (path / "learner.pt").open("wb") as file:
-        torch.save(learner_state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    snapshot(folder)
-    (path / DONE).write_text("", encoding="utf-8")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        (path / DONE).unlink(missing_ok=True)
+        content = io.BytesIO()
+        torch.save(learner_state, content)
+        data = content.getvalue()
+        checksum = write_whole(path / LEARNER, data)
+        snapshot(folder)
+        write_whole(path / DONE, json.dumps({LEARNER: [len(data), checksum]}).encode())
+    except BaseException:
+        shutil.rmtree(path, ignore_errors=True)
+        raise
+    keep = complete_epochs(run_dir)[-KEPT:]
+    for old in (run_dir / "checkpoints").iterdir():
+        if old.name not in map(str, keep):
+            shutil.rmtree(old, ignore_errors=True)
     return path
+
+
+def complete_epochs(run_dir: Path) -> list[int]:
+    """Numbers of the epochs that were finished, in ascending order."""
+    return sorted(int(path.parent.name) for path in (run_dir / "checkpoints").glob(f"*/{DONE}"))
+
+
+def newest_epoch(run_dir: Path) -> Path | None:
+    """The epoch to go on from: the newest that is finished and whole; newer ones are torn, and are dropped."""
+    for number in reversed(complete_epochs(run_dir)):
+        path = run_dir / "checkpoints" / str(number)
+        try:
+            if json.loads((path / DONE).read_text(encoding="utf-8")) == {LEARNER: list(measure(path / LEARNER))}:
+                return path
+        except (OSError, ValueError):
+            pass
+        shutil.rmtree(path, ignore_errors=True)
+    return None
 
 
 def load_learner(path: Path) -> dict[str, Any]:
     """Read learner.pt of an epoch's folder; executes nothing that it holds."""
-    state: dict[str, Any] = torch.load(path / "learner.pt", weights_only=True)
+    state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
     return state

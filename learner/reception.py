@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 from common import messages
@@ -15,12 +16,20 @@ from common.wire import Message
 
 
 class Reception:
-    """Answers join requests and remembers where the replay service listens."""
+    """Answers join requests and remembers where the replay service listens.
 
-    def __init__(self, node: Node, config: RunConfig, spec: EnvSpec, layout: str) -> None:
+    Args:
+        newest_epoch: gives the number of the newest epoch that is finished.
+    """
+
+    def __init__(
+        self, node: Node, config: RunConfig, spec: EnvSpec, layout: str, run_id: int, newest_epoch: Callable[[], int]
+    ) -> None:
         self._config = config
         self._spec = spec
         self._layout = layout
+        self._run_id = run_id
+        self._newest_epoch = newest_epoch
         self._replay_endpoints: list[str] = []
         self._indices: dict[str, dict[int, int]] = {"replay": {}, "actor": {}}
         for role in self._indices:  # each answered by a thread of its own
@@ -32,6 +41,16 @@ class Reception:
             raise BadMessage("fields.role", f"{request.role!r}; this key is for {role!r}")
         if role == "replay":
             self._replay_endpoints = request.endpoints
-        index = self._indices[role].setdefault(request.incarnation, len(self._indices[role]))
-        joined = Joined(self._config, self._spec, self._layout, index, self._replay_endpoints)
+        indices = self._indices[role]
+        if request.incarnation not in indices:
+            indices[request.incarnation] = max(indices.values(), default=-1) + 1 if request.index < 0 else request.index
+        joined = Joined(
+            self._config,
+            self._spec,
+            self._layout,
+            indices[request.incarnation],
+            self._replay_endpoints,
+            self._run_id,
+            self._newest_epoch(),
+        )
         return messages.encode_joined(joined)

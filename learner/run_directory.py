@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import secrets
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,6 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 from common.config import RunConfig, to_toml
 from common.errors import RunError
 from common.experience import EpisodeRecord
+from common.files import write_whole
 
 EPISODE_FIELDS = (
     "episode", "env_step", "update", "actor", "stream", "return", "length",
@@ -42,6 +44,16 @@ class RunDirectory:
             self._csv.writerow(EPISODE_FIELDS)
         self._board = SummaryWriter(str(path / "tb"))
 
+    def run_id(self) -> int:
+        """The random id of this run, drawn when it began, which tells it from others of its name; raises RunError."""
+        path = self.path / "run-id"
+        try:
+            if not path.exists():
+                write_whole(path, f"{secrets.randbits(63)}\n".encode())
+            return int(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise RunError(f"{path}: {error}") from error
+
     def episode(self, number: int, record: EpisodeRecord, update: int, s: float) -> None:
         """Add a line to episodes.csv."""
         end = record.end
@@ -62,6 +74,11 @@ class RunDirectory:
         part = self.path / "summary.json.part"
         part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
         part.replace(self.path / "summary.json")
+
+    def sizes(self) -> dict[str, int]:
+        """How long the files that grow are now, in bytes."""
+        self.flush()
+        return {name: (self.path / name).stat().st_size for name in ("episodes.csv", "metrics.jsonl")}
 
     def flush(self) -> None:
         """Hand everything written so far to the operating system."""

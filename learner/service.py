@@ -3,45 +3,62 @@
 from __future__ import annotations
 
 import time
+from dataclasses import asdict
 from typing import Any
 
 from common import messages, schedules
 from common.clients import SampleClient, replay_key
-from common.errors import RunError
 from common.experience import Drawn
 from common.lifecycle import Stop
 from common.messages import ReplayStats
 from common.transport import NoAnswer, Node
 from learner.agent import Agent
 from learner.broadcast import Broadcaster
+from learner.checkpoints import Checkpoints
 from learner.curve import draw_learning_curve
-from learner.epochs import save_epoch
 from learner.run_directory import RunDirectory
 from learner.telemetry import Telemetry
 
 METRICS_EVERY = 200  # updates
 STATUS_EVERY = 0.5  # seconds
 FAREWELL = 5.0  # seconds that the others get to leave
-SNAPSHOT_TIMEOUT = 600.0  # seconds
 NOTHING_DRAWN = Drawn(0, 0, 0, 0, 0, 0, ())
 
 
 class LearnerService:
-    """Trains an agent from a replay service until the run is complete or stopped."""
+    """Trains an agent from a replay service until the run is complete or stopped.
 
-    def __init__(self, node: Node, stop: Stop, agent: Agent, directory: RunDirectory, samples: SampleClient) -> None:
+    Args:
+        state: of an epoch, from which to go on; the agent and the samples have been set back to it.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        stop: Stop,
+        agent: Agent,
+        directory: RunDirectory,
+        samples: SampleClient,
+        checkpoints: Checkpoints,
+        state: dict[str, Any] | None = None,
+    ) -> None:
         self._node = node
         self._stop = stop
         self._agent = agent
         self._config = agent.config
         self._directory = directory
         self._samples = samples
+        self._checkpoints = checkpoints
         self._telemetry = Telemetry()
         self._broadcaster = Broadcaster(node, agent)
         self._drawn = NOTHING_DRAWN
         self._started = time.monotonic()
         self._status_due = 0.0
-        self._speed = (self._started, 0, 0.0)
+        self._speed = (self._started, agent.updates, 0.0)
+        if state is not None:
+            self._telemetry.load_state(state["telemetry"])
+            self._drawn = Drawn(**state["drawn"], episodes=())
+            self._started -= state["seconds"]
 
     def run(self) -> dict[str, Any]:
         """Train to the end; the summary, as it is on disk.
@@ -58,6 +75,7 @@ class LearnerService:
             outcome = f"failed: {error}"
             raise
         finally:
+            self._checkpoints.wait()
             summary = self._finish(outcome)
         return summary
 
@@ -74,6 +92,7 @@ class LearnerService:
             self._book_episodes()
             if agent.updates % METRICS_EVERY == 0:
                 self._directory.metrics(self._telemetry.row(agent, self._drawn, self._epsilon()))
+            self._checkpoints.begin_if_due(agent.updates, self._state)
         if time.monotonic() >= self._status_due:
             self._tell()
 
@@ -82,7 +101,7 @@ class LearnerService:
         config, agent, telemetry = self._config, self._agent, self._telemetry
         if self._stop.is_set():
             return self._stop.reason
-        if agent.updates >= config.planned_updates and self._drawn.inserted >= config.total_steps:
+        if agent.updates >= self._drawn.planned and self._drawn.inserted >= config.total_steps:
             return "complete"
         if 0 < config.total_updates <= agent.updates:
             return "complete: total_updates reached"
@@ -129,13 +148,8 @@ class LearnerService:
 
     def _save(self) -> None:
         """Save the closing epoch; there is none before the first update, or where the replay service is gone."""
-        updates = self._agent.updates
-        if not updates or self._replay_stats() is None:
-            return
-        try:
-            save_epoch(self._directory.path, updates, self._state(), self._snapshot)
-        except OSError as error:
-            raise RunError(f"checkpoint {updates} in {self._directory.path}: {error.strerror or error}") from error
+        if self._agent.updates and self._replay_stats() is not None:
+            self._checkpoints.save(self._state())
 
     def _finish(self, outcome: str) -> dict[str, Any]:
         """Collect the last counters, write the summary, and send everybody home."""
@@ -154,12 +168,15 @@ class LearnerService:
         except NoAnswer:
             return None
 
-    def _snapshot(self, folder: str) -> None:
-        request = messages.encode_snapshot(self._node.run, folder)
-        messages.decode_ack(self._node.ask(replay_key(self._node, "snapshot"), request, SNAPSHOT_TIMEOUT))
-
     def _state(self) -> dict[str, Any]:
-        return {"agent": self._agent.state(), "returns": list(self._telemetry.returns), "drawn": self._drawn.sequence}
+        return {
+            "agent": self._agent.state(),
+            "telemetry": self._telemetry.state(),
+            "drawn": {name: value for name, value in asdict(self._drawn).items() if name != "episodes"},
+            "told": self._samples.episodes,
+            "sizes": self._directory.sizes(),
+            "seconds": time.monotonic() - self._started,
+        }
 
     def _summary(self, outcome: str, stats: ReplayStats | None) -> dict[str, Any]:
         config, telemetry = self._config, self._telemetry

@@ -75,6 +75,17 @@ class Telemetry:
             "weight_lag_mean": float(lag.mean()),
         }
 
+    def state(self) -> dict[str, Any]:
+        """What `load_state` needs; loads with weights_only."""
+        fixed = None if self.fixed is None else torch.from_numpy(self.fixed.copy())
+        return {"returns": list(self.returns), "episodes": self.episodes, "fixed": fixed}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on where `state` was taken."""
+        self.returns.extend(state["returns"])
+        self.episodes = state["episodes"]
+        self.fixed = None if state["fixed"] is None else state["fixed"].numpy()
+
     def episode(self, episode_return: float) -> int:
         """Note a finished episode; its number, from 0."""
         self.returns.append(episode_return)

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common import cli
-from common.errors import PeerLost, RunError
-from common.joining import join
+from common.errors import PeerLost, RunError, UsageError
+from common.joining import Membership, join
 from common.lifecycle import Stop, run_main
 from common.memory import keep_freed_memory
 from common.messages import Join, Joined
 from common.options import RoleOptions
 from common.transport import Node, locators, new_incarnation, open_session
 from replay.core import ReplayCore
+from replay.epochs import ReplayEpochs
 from replay.service import ReplayService
 from replay.stats import estimated_bytes
 
@@ -26,7 +27,9 @@ class ReplayOptions(RoleOptions):
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
     """Endpoints to listen on; port 0 takes a free one."""
     run_dir: Path = Path("runs/replay")
-    """Where snapshots are written, under checkpoints/."""
+    """Where this service's part of the epochs is written, under checkpoints/."""
+    resume: bool = False
+    """Go on from what is in --run-dir, if anything is."""
 
 
 def main() -> None:
@@ -49,9 +52,17 @@ def _run() -> None:
         joined = join(node, stop, request, options.connect, options.join_timeout)
         if joined is not None:
             _check_memory(joined)
-            service = ReplayService(node, ReplayCore(joined.config, joined.spec), joined.spec, options.run_dir)
+            epochs = ReplayEpochs(options.run_dir, joined.run_id)
+            core = ReplayCore(joined.config, joined.spec)
+            if options.resume:
+                print(epochs.restore(core, joined.epoch), flush=True)
+            elif epochs.any():
+                raise UsageError(f"--run-dir {options.run_dir}: holds a run already; give another, or --resume")
+            service = ReplayService(node, core, epochs)
             service.start()
+            membership = Membership(node, stop, request, joined, options.connect, options.patience)
             service.run(stop)
+            membership.close()
     if stop.failed:
         raise PeerLost(stop.reason)
 

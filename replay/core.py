@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from dataclasses import astuple, dataclass
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, astuple, dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from common.config import RunConfig
-from common.experience import MAX_EPISODES, Drawn, EpisodeRecord
-from common.types import Batch, EnvSpec, Segment
+from common.errors import RunError
+from common.experience import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
+from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
 from replay.dedup import SeenWindow
 from replay.limiter import RateLimiter
-from replay.table import Table
+from replay.table import Table, TableSnapshot
+
+LEARNERS_KEPT = 64  # learners that others have taken over from, and that are refused
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +25,47 @@ class Wait:
     """Not now, and why."""
 
     reason: str
+
+
+class Recorder(Protocol):
+    """Takes down what changes a core, in order, before anybody hears of it."""
+
+    def insert(self, payload: bytes) -> None:
+        """An insert request that is about to be carried out.
+
+        Raises:
+            OSError: it could not be taken down, and must not be carried out.
+        """
+
+    def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
+        """A draw and the transitions that it gave; never fails, for the draw has happened."""
+
+    def limit(self, limiter: RateLimiter) -> None:
+        """New settings of the limiter; raises OSError as `insert`."""
+
+
+class Unrecorded:
+    """The recorder of a core without a journal."""
+
+    def insert(self, payload: bytes) -> None:
+        """See `Recorder`."""
+
+    def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
+        """See `Recorder`."""
+
+    def limit(self, limiter: RateLimiter) -> None:
+        """See `Recorder`."""
+
+
+class CoreSnapshot(NamedTuple):
+    """A core's state at one moment; `table` must be released.
+
+    books: everything but the table, msgpack-able. replies: the draws that the learner may ask for again.
+    """
+
+    books: dict[str, Any]
+    table: TableSnapshot
+    replies: list[tuple[Batch, Drawn]]
 
 
 @dataclass(slots=True)
@@ -32,9 +77,12 @@ class _Account:
 
 
 class ReplayCore:
-    """A table with its limiter and its books. One owner makes all calls."""
+    """A table with its limiter and its books. One owner makes all calls.
 
-    def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
+    drawn: batches drawn, as the learner counts them: one that comes back from an epoch takes the count back with it.
+    """
+
+    def __init__(self, config: RunConfig, spec: EnvSpec, recorder: Recorder | None = None) -> None:
         settings = config.replay
         self.table = Table(
             spec,
@@ -48,17 +96,18 @@ class ReplayCore:
         self.limiter = RateLimiter(
             settings.ratio, settings.start, settings.tolerance, config.total_steps, settings.capacity
         )
+        self.recorder: Recorder = recorder or Unrecorded()
         self.batch_size = config.learner.batch_size
-        # A learner repeats only what it has under way. Keeping more costs memory and the processor's caches.
-        self._replies_kept = config.learner.prefetch
         self.drawn = 0
         self.duplicates = 0
         self.inserts_wait_for = ""
         self.samples_wait_for = ""
         self._seen = SeenWindow()
+        self._first_episode = 0  # number of the first episode booked; not 0 where older books were lost
         self._episodes: list[EpisodeRecord] = []
         self._accounts: dict[int, _Account] = {}
-        self._replies: OrderedDict[tuple[int, int], tuple[Batch, Drawn]] = OrderedDict()
+        self._learners: list[int] = []  # the last one is served
+        self._replies: dict[int, tuple[Batch, Drawn]] = {}
 
     @property
     def lost(self) -> int:
@@ -68,18 +117,32 @@ class ReplayCore:
     @property
     def episodes_booked(self) -> int:
         """Episodes that ended so far."""
-        return len(self._episodes)
+        return self._first_episode + len(self._episodes)
 
-    def insert(self, segment: Segment) -> int | Wait:
-        """Take a segment, unless an earlier delivery was taken; the count of transitions accepted, or the reason."""
+    def insert(self, segment: Segment, payload: bytes = b"") -> int | Wait:
+        """Take a segment, unless an earlier delivery was taken; the count of transitions accepted, or the reason.
+
+        payload: the request that brought it, for the recorder.
+        """
         if self._seen.seen(segment.incarnation, segment.stream, segment.sequence):
             self.duplicates += 1
             return self.table.inserted
         reason = self.limiter.why_not_insert(self.table.inserted, self.drawn)
+        if not reason:
+            try:
+                self.recorder.insert(payload)
+            except OSError as error:
+                reason = f"the journal can't be written: {error.strerror or error}"
         self.inserts_wait_for = reason or ""
         if reason:
             return Wait(reason)
-        self._seen.accept(segment.incarnation, segment.stream, segment.sequence)
+        self.take(segment)
+        return self.table.inserted
+
+    def take(self, segment: Segment) -> None:
+        """Carry out an insert that was admitted, now or, according to a journal, before."""
+        if not self._seen.accept(segment.incarnation, segment.stream, segment.sequence):
+            raise RunError(f"segment {segment.sequence} of actor {segment.incarnation:x} would be taken twice")
         account = self._accounts.setdefault(segment.incarnation, _Account())
         account.accepted += segment.steps
         account.acked = max(account.acked, segment.acked)
@@ -88,40 +151,101 @@ class ReplayCore:
             for end in segment.episodes
         )
         self.table.insert(segment)
-        return self.table.inserted
 
-    def draw(self, incarnation: int, sequence: int, batch_size: int, episodes_from: int) -> tuple[Batch, Drawn] | Wait:
-        """Draw a batch, or give the one that this request drew before, or the limiter's reason."""
-        known = self._replies.get((incarnation, sequence))
+    def draw(self, request: DrawRequest) -> tuple[Batch, Drawn] | Wait:
+        """Draw a batch, or give the one that this request drew before, or the limiter's reason.
+
+        Raises:
+            RunError: another learner has taken over from the one that asks.
+        """
+        self._follow(request)
+        known = self._replies.get(request.sequence)
         if known is not None:
             return known
-        table = self.table
-        reason = self.limiter.why_not_sample(table.inserted, self.drawn, len(table))
+        reason = None
+        if request.sequence >= self.drawn:
+            reason = self.limiter.why_not_sample(self.table.inserted, self.drawn, len(self.table))
         self.samples_wait_for = reason or ""
         if reason:
             return Wait(reason)
-        batch = table.sample(batch_size)
-        self.drawn += 1
+        reply = self.give(request)
+        self.recorder.draw(request, reply[0].ids)
+        return reply
+
+    def give(self, request: DrawRequest) -> tuple[Batch, Drawn]:
+        """Carry out a draw that was admitted, now or, according to a journal, before; raises as `draw`."""
+        self._follow(request)
+        table = self.table
+        batch = table.sample(request.batch_size)
+        self.drawn = max(self.drawn, request.sequence + 1)
+        first = max(request.episodes_from, self._first_episode)
+        start = first - self._first_episode
         drawn = Drawn(
-            sequence=sequence,
+            sequence=request.sequence,
             inserted=table.inserted,
             size=len(table),
             evicted=table.evicted,
             evicted_unsampled=table.evicted_unsampled,
-            first_episode=min(episodes_from, len(self._episodes)),
-            episodes=tuple(self._episodes[episodes_from : episodes_from + MAX_EPISODES]),
+            first_episode=first,
+            episodes=tuple(self._episodes[start : start + MAX_EPISODES]),
+            planned=self.limiter.draws_total or 0,
         )
-        self._replies[incarnation, sequence] = batch, drawn
-        if len(self._replies) > self._replies_kept:
-            self._replies.popitem(last=False)
+        self._replies[request.sequence] = batch, drawn
         return batch, drawn
 
-    def books(self) -> dict[str, Any]:
-        """Everything but the table, msgpack-able."""
-        return {
+    def limit(self, limiter: RateLimiter) -> None:
+        """Go on under other settings; raises OSError where they can't be recorded."""
+        self.recorder.limit(limiter)
+        self.limiter = limiter
+
+    def snapshot(self, base: int) -> CoreSnapshot:
+        """Everything as it is now; a learner that is back at `base` updates can be served from it."""
+        books = {
             "drawn": self.drawn,
             "duplicates": self.duplicates,
             "seen": self._seen.state(),
+            "first_episode": self._first_episode,
             "episodes": [astuple(record) for record in self._episodes],
             "accounts": [[actor, account.accepted, account.acked] for actor, account in self._accounts.items()],
+            "learners": list(self._learners),
+            "limiter": asdict(self.limiter),
         }
+        replies = [reply for sequence, reply in self._replies.items() if sequence >= base]
+        return CoreSnapshot(books, self.table.snapshot(), replies)
+
+    def restore(
+        self,
+        books: Mapping[str, Any],
+        meta: dict[str, Any],
+        arrays: dict[str, Array],
+        replies: Iterable[tuple[Batch, Drawn]],
+    ) -> None:
+        """Go on where `snapshot` was called; the core must be new. Raises UsageError for a table of other settings."""
+        self.table.load_state(meta, arrays)
+        self.drawn = books["drawn"]
+        self.duplicates = books["duplicates"]
+        self._seen.load_state(books["seen"])
+        self._first_episode = books["first_episode"]
+        self._episodes = [
+            EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in books["episodes"]
+        ]
+        self._accounts = {actor: _Account(accepted, acked) for actor, accepted, acked in books["accounts"]}
+        self._learners = list(books["learners"])
+        origin = books["limiter"]["origin"]
+        self.limiter = RateLimiter(**{**books["limiter"], "origin": None if origin is None else tuple(origin)})
+        self._replies = {drawn.sequence: (batch, drawn) for batch, drawn in replies}
+
+    def _follow(self, request: DrawRequest) -> None:
+        """Let the learner's count of updates be the count of draws where one of us has come back from an epoch."""
+        known = self._learners[-1:] == [request.incarnation]
+        if not known:
+            if request.incarnation in self._learners:
+                raise RunError("another learner has taken over this run")
+            self._learners = [*self._learners[-LEARNERS_KEPT:], request.incarnation]
+            self._replies.clear()
+        if not known or request.base > self.drawn:
+            self.drawn = request.base
+            self._first_episode = max(self._first_episode, request.episodes_from - len(self._episodes))
+        # Keeping more than can be asked for again costs memory and the processor's caches.
+        for sequence in [number for number in self._replies if number < request.base]:
+            del self._replies[sequence]

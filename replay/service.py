@@ -9,20 +9,18 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TypeVar
 
 from common import experience, messages
 from common.clients import replay_key
-from common.errors import BadMessage, RunError
+from common.errors import BadMessage
 from common.experience import SegmentReader
 from common.lifecycle import Stop
 from common.messages import ReplayStats
 from common.transport import Node
-from common.types import EnvSpec
 from common.wire import Message
 from replay.core import ReplayCore, Wait
-from replay.storage import save_snapshot
+from replay.epochs import ReplayEpochs
 
 HOLD = 1.0  # seconds
 STATUS_EVERY = 0.5  # seconds
@@ -45,14 +43,14 @@ class ReplayService:
     """Serves one core on one node until the session closes.
 
     Args:
-        snapshots: folder under which a snapshot's relative path is written.
+        epochs: writes the core's part of epochs; the core may have been restored from one.
     """
 
-    def __init__(self, node: Node, core: ReplayCore, spec: EnvSpec, snapshots: Path) -> None:
+    def __init__(self, node: Node, core: ReplayCore, epochs: ReplayEpochs) -> None:
         self._node = node
         self._core = core
-        self._snapshots = snapshots
-        self._read_segment = SegmentReader(spec)
+        self._epochs = epochs
+        self._read_segment = SegmentReader(core.table.spec)
         self._changed = threading.Condition()
         self._inserts = _Gate()
         self._draws = _Gate()
@@ -83,6 +81,7 @@ class ReplayService:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
+        self._epochs.close()
 
     def stats(self) -> ReplayStats:
         """The counters, taken at one moment."""
@@ -104,16 +103,16 @@ class ReplayService:
 
     def _insert(self, message: Message) -> bytearray:
         segment = self._read_segment(message)
-        outcome = self._admit(self._inserts, lambda: self._core.insert(segment))
+        outcome = self._admit(self._inserts, lambda: self._core.insert(segment, message.payload))
         if isinstance(outcome, Wait):
             return messages.encode_retry(self._node.run, outcome.reason)
         return messages.encode_ack(self._node.run, outcome)
 
     def _sample(self, message: Message) -> bytearray:
         request = experience.decode_sample(message)
-        if request[2] != self._core.batch_size:
-            raise BadMessage("fields.batch_size", f"{request[2]}; this run draws {self._core.batch_size}")
-        outcome = self._admit(self._draws, lambda: self._core.draw(*request))
+        if request.batch_size != self._core.batch_size:
+            raise BadMessage("fields.batch_size", f"{request.batch_size}; this run draws {self._core.batch_size}")
+        outcome = self._admit(self._draws, lambda: self._core.draw(request))
         if isinstance(outcome, Wait):
             return messages.encode_retry(self._node.run, outcome.reason)
         return experience.encode_batch(self._node.run, *outcome)
@@ -137,10 +136,8 @@ class ReplayService:
         return messages.encode_stats(self._node.run, self.stats())
 
     def _snapshot(self, message: Message) -> bytearray:
-        folder = messages.decode_snapshot(message)
-        path = self._snapshots / folder / "replay"
-        try:
-            save_snapshot(self._core, self._changed, path)
-        except OSError as error:
-            raise RunError(f"snapshot {path}: {error.strerror or error}") from error
+        if message.kind == "snapshot":
+            self._epochs.begin(self._core, self._changed, *messages.decode_snapshot(message))
+        elif not self._epochs.written(messages.decode_written(message), HOLD):
+            return messages.encode_retry(self._node.run, "the replay service is writing its part of the epoch")
         return messages.encode_ack(self._node.run, self._core.table.inserted)

@@ -16,7 +16,7 @@ from samples import make_segment
 from common import experience, messages, wire
 from common.config import RunConfig, to_tables
 from common.errors import BadMessage, RunError
-from common.experience import BatchReader, Drawn, EpisodeRecord, SegmentReader
+from common.experience import BatchReader, Drawn, DrawRequest, EpisodeRecord, SegmentReader
 from common.messages import Join, Joined, ReplayStats, Role
 from common.types import Batch, EnvSpec, EpisodeEnd
 from common.wire import Message
@@ -26,7 +26,7 @@ SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]
 RECORD = [4, 7, 0, END]
 STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
-JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"])
+JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300)
 TABLES = to_tables(RunConfig())
 FLAT = np.arange(3, dtype=np.float32)
 
@@ -45,12 +45,13 @@ READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "ack": (messages.encode_ack("r", 9), messages.decode_ack),
     "retry": (messages.encode_retry("r", "later"), messages.decode_retry),
     "error": (messages.encode_error("r", BadMessage("f", "wrong")), messages.decode_error),
-    "sample": (experience.encode_sample("r", 1, 2, 3, 4), experience.decode_sample),
+    "sample": (experience.encode_sample("r", DrawRequest(1, 3, 2, 4, 5)), experience.decode_sample),
     "batch": (experience.encode_batch("r", *_batch()), BatchReader(SPEC)),
     "weights": (messages.encode_weights("r", 2, 8, FLAT), partial(messages.decode_weights, parameters=3)),
     "role": (messages.encode_role("r", Role(2, (4, 5), 6)), messages.decode_role),
     "stats": (messages.encode_stats("r", STATS), messages.decode_stats),
-    "snapshot": (messages.encode_snapshot("r", "checkpoints/12"), messages.decode_snapshot),
+    "snapshot": (messages.encode_snapshot("r", 12, [4, 8]), messages.decode_snapshot),
+    "written": (messages.encode_written("r", 12), messages.decode_written),
     "stop": (messages.encode_stop("r", "complete"), messages.decode_stop),
     "current": (messages.encode_question("r", "current"), partial(messages.decode_question, "current")),
 }
@@ -68,10 +69,11 @@ def _valid(kind: str) -> Message:
         ("ack", 9),
         ("retry", "later"),
         ("error", "f: wrong"),
-        ("sample", (1, 2, 3, 4)),
+        ("sample", DrawRequest(1, 3, 2, 4, 5)),
         ("role", Role(2, (4, 5), 6)),
         ("stats", STATS),
-        ("snapshot", "checkpoints/12"),
+        ("snapshot", (12, [4, 8])),
+        ("written", 12),
         ("stop", "complete"),
         ("current", None),
     ],
@@ -147,11 +149,15 @@ FIELDS = [
     ("stats", "lost", -1),
     ("stats", "samples_wait_for", None),
     ("stop", "reason", None),
-    ("snapshot", "folder", "../../etc"),
-    ("snapshot", "folder", "checkpoints/../12"),
-    ("snapshot", "folder", "/checkpoints/1"),
-    ("snapshot", "folder", "checkpoints/1\n"),
-    ("snapshot", "folder", "checkpoints/1\0"),
+    ("snapshot", "number", "../../etc"),
+    ("snapshot", "number", -1),
+    ("snapshot", "keep", [1, "/"]),
+    ("snapshot", "keep", [1] * 17),
+    ("written", "number", 1.0),
+    ("sample", "base", -1),
+    ("sample", "sequence", 1),
+    ("sample", "sequence", 2 + experience.MAX_AHEAD),
+    ("batch", "planned", -1),
 ]
 
 

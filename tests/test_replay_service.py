@@ -12,10 +12,12 @@ from common import experience, messages
 from common.clients import InsertClient, SampleClient, replay_key
 from common.config import LearnerSettings, ReplaySettings, RunConfig
 from common.errors import RunError
+from common.experience import DrawRequest
 from common.lifecycle import Stop
 from common.transport import NoAnswer, Node, Refused, locators, new_incarnation, open_session
 from common.types import EnvSpec
 from replay.core import ReplayCore, Wait
+from replay.epochs import ReplayEpochs
 from replay.service import ReplayService
 
 CONFIG = RunConfig(
@@ -26,8 +28,8 @@ CONFIG = RunConfig(
 )
 
 
-def _serve(node: Node, core: ReplayCore, spec: EnvSpec, folder: Path) -> ReplayService:
-    service = ReplayService(node, core, spec, folder)
+def _serve(node: Node, core: ReplayCore, folder: Path) -> ReplayService:
+    service = ReplayService(node, core, ReplayEpochs(folder, 5))
     service.start()
     return service
 
@@ -35,10 +37,10 @@ def _serve(node: Node, core: ReplayCore, spec: EnvSpec, folder: Path) -> ReplayS
 def test_receipts_duplicates_and_reasons(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
     server, client = nodes
     core = ReplayCore(CONFIG, spec)
-    service = _serve(server, core, spec, tmp_path)
+    service = _serve(server, core, tmp_path)
     key = replay_key(client, "insert")
 
-    sample = experience.encode_sample("test", 1, 0, 4, 0)
+    sample = experience.encode_sample("test", DrawRequest(1, 0, 0, 4, 0))
     began = time.monotonic()
     reply = client.ask(replay_key(client, "sample"), sample)
     assert 0.5 < time.monotonic() - began < 4
@@ -66,19 +68,19 @@ def test_a_waiting_insert_goes_in_when_updates_catch_up(
     nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path
 ) -> None:
     server, client = nodes
-    _serve(server, ReplayCore(CONFIG, spec), spec, tmp_path)
+    _serve(server, ReplayCore(CONFIG, spec), tmp_path)
     for sequence in range(5):
         client.ask(replay_key(client, "insert"), experience.encode_segment("test", make_segment(spec, sequence)))
     payload = experience.encode_segment("test", make_segment(spec, 5))
     pending = client.begin(replay_key(client, "insert"), payload)
     for number in range(4):
-        client.ask(replay_key(client, "sample"), experience.encode_sample("test", 1, number, 4, 0))
+        client.ask(replay_key(client, "sample"), experience.encode_sample("test", DrawRequest(1, number, 0, 4, 0)))
     assert messages.decode_ack(pending.wait()) == 24
 
 
 def test_bad_messages_change_nothing(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
     server, client = nodes
-    service = _serve(server, ReplayCore(CONFIG, spec), spec, tmp_path)
+    service = _serve(server, ReplayCore(CONFIG, spec), tmp_path)
     key = replay_key(client, "insert")
     wrong = make_segment(spec, actions=np.full(4, 9, np.int32))
     before = service.stats()
@@ -98,13 +100,17 @@ def test_bad_messages_change_nothing(nodes: tuple[Node, Node], spec: EnvSpec, tm
 def test_snapshot_on_disk(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
     server, client = nodes
     core = ReplayCore(CONFIG, spec)
-    _serve(server, core, spec, tmp_path)
+    _serve(server, core, tmp_path)
     client.ask(replay_key(client, "insert"), experience.encode_segment("test", make_segment(spec)))
-    client.ask(replay_key(client, "snapshot"), messages.encode_snapshot("test", "checkpoints/12"))
+    key = replay_key(client, "snapshot")
+    client.ask(key, messages.encode_snapshot("test", 12, []))
+    while client.ask(key, messages.encode_written("test", 12)).kind == "retry":
+        pass
     folder = tmp_path / "checkpoints" / "12" / "replay"
     assert np.load(folder / "rewards.npy").tolist() == [0, 1, 2, 3]
     assert np.load(folder / "frames.npy").shape == (5, 4)
-    assert (folder / "state.msgpack").stat().st_size > 0
+    with pytest.raises(Refused, match="epoch 13 was not begun"):
+        client.ask(key, messages.encode_written("test", 13))
 
 
 def test_lost_counts_receipts_without_transitions(spec: EnvSpec) -> None:
@@ -120,7 +126,7 @@ def test_lost_counts_receipts_without_transitions(spec: EnvSpec) -> None:
 def test_clients_survive_a_service_that_goes_away(endpoint: str, spec: EnvSpec, tmp_path: Path) -> None:
     core, stop, sent = ReplayCore(CONFIG, spec), Stop(), 12
     first = Node(open_session((endpoint,)), "test", "replay", new_incarnation())
-    _serve(first, core, spec, tmp_path)
+    _serve(first, core, tmp_path)
     with Node(open_session((), (endpoint,)), "test", "actor", new_incarnation()) as client:
         inserts = InsertClient(client, stop, window=2)
         samples = SampleClient(client, stop, 1, spec, batch_size=4, prefetch=2)
@@ -141,7 +147,7 @@ def test_clients_survive_a_service_that_goes_away(endpoint: str, spec: EnvSpec, 
             first.close()
             time.sleep(0.3)
             second = Node(open_session((endpoint,)), "test", "replay", new_incarnation())
-            _serve(second, core, spec, tmp_path)
+            _serve(second, core, tmp_path)
             while batches < 40:
                 if (got := samples.next()) is not None:
                     batches += 1

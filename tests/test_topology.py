@@ -93,12 +93,13 @@ def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, 
         assert isinstance(updates, int)
         assert steps <= env_steps < steps + 64
         assert abs(updates - (steps - config["replay"]["start"])) <= 0.02 * steps
-    epochs = list((path / "checkpoints").iterdir())
+    epochs = sorted((path / "checkpoints").iterdir(), key=lambda folder: int(folder.name))
+    assert 1 <= len(epochs) <= 2
     assert all((epoch / "DONE").exists() for epoch in epochs)
-    state = load_learner(epochs[0])
+    state = load_learner(epochs[-1])
     assert state["agent"]["updates"] == summary["updates"]
     assert all(torch.isfinite(flat).all() for flat in state["agent"]["networks"])
-    assert (epochs[0] / "replay" / "frames.npy").exists()
+    assert (epochs[-1] / "replay" / "frames.npy").exists()
     assert (path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     return summary
 

@@ -1,0 +1,80 @@
+"""Files that are either whole on the disk or not there under their name."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+PIECE = 1 << 24  # bytes read at once
+
+
+class SyncedFile:
+    """A new file that is on the disk when `close` returns.
+
+    size, checksum: bytes written so far, and their CRC-32.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb", buffering=0)
+        self.size = 0
+        self.checksum = 0
+
+    def write(self, data: bytes | memoryview) -> None:
+        """Append bytes; raises OSError where there is no space for all of them."""
+        view = memoryview(data)
+        self.checksum = zlib.crc32(view, self.checksum)
+        self.size += view.nbytes
+        while view:
+            view = view[self._file.write(view) :]
+
+    def close(self) -> None:
+        """Hand the file to the disk."""
+        if not self._file.closed:
+            os.fsync(self._file.fileno())
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+        self._file.close()
+
+
+def write_whole(path: Path, data: bytes) -> int:
+    """Replace a file's content; the checksum of the new one. Raises OSError, the old file being untouched then."""
+    part = path.with_name(path.name + ".part")
+    try:
+        with SyncedFile(part) as file:
+            file.write(data)
+        part.replace(path)
+        sync_folder(path.parent)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+    return file.checksum
+
+
+def measure(path: Path) -> tuple[int, int]:
+    """(size, checksum) of a file as it is; raises OSError."""
+    size = checksum = 0
+    with path.open("rb") as file:
+        while piece := file.read(PIECE):
+            size += len(piece)
+            checksum = zlib.crc32(piece, checksum)
+    return size, checksum
+
+
+def sync_folder(path: Path) -> None:
+    """Hand the names in a folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

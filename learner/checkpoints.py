@@ -1,0 +1,103 @@
+"""The epochs of a distributed run: begun between two updates, written in a thread while training goes on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from common import messages
+from common.clients import SampleClient, replay_key
+from common.errors import CoopError, RunError
+from common.transport import NoAnswer, Node
+from common.wire import Message
+from learner.epochs import complete_epochs, save_epoch
+
+PATIENCE = 5.0  # seconds that the replay service may take to answer
+PAUSE = 0.05  # seconds between questions
+
+
+class Checkpoints:
+    """Saves an epoch every so many updates.
+
+    An epoch that can't be saved is given up, with one printed line, and the run goes on to the next.
+
+    Args:
+        every: updates between epochs; 0: none but those that are asked for.
+        updates: done when this begins.
+
+    Attributes:
+        newest: number of the newest epoch that is finished; 0 if there is none.
+    """
+
+    def __init__(self, node: Node, run_dir: Path, samples: SampleClient, every: int, updates: int) -> None:
+        self.newest = max(complete_epochs(run_dir), default=0)
+        self._node = node
+        self._run_dir = run_dir
+        self._samples = samples
+        self._every = every
+        self._due = updates + every
+        self._writer: threading.Thread | None = None
+
+    def begin_if_due(self, updates: int, state: Callable[[], dict[str, Any]]) -> None:
+        """Begin an epoch between two updates if it is time and the last one is finished."""
+        if not self._every or updates < self._due or self._writing():
+            return
+        self._due = updates + self._every
+        number, frozen = self._samples.pin(), state()
+        self._writer = threading.Thread(target=self._try, args=(number, frozen), name=f"epoch {number}")
+        self._writer.start()
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Save an epoch now and wait for it.
+
+        Raises:
+            RunError: it could not be saved; says why.
+        """
+        self.wait()
+        self._save(self._samples.pin(), state)
+
+    def wait(self) -> None:
+        """Wait for the epoch that is being written, if there is one."""
+        if self._writer is not None:
+            self._writer.join()
+
+    def _writing(self) -> bool:
+        return self._writer is not None and self._writer.is_alive()
+
+    def _try(self, number: int, state: dict[str, Any]) -> None:
+        try:
+            self._save(number, state)
+        except RunError as error:
+            print(f"{error}; the run goes on without it", flush=True)
+
+    def _save(self, number: int, state: dict[str, Any]) -> None:
+        try:
+            try:
+                self._ask(messages.encode_snapshot(self._node.run, number, complete_epochs(self._run_dir)))
+            finally:
+                self._samples.release()
+            written = messages.encode_written(self._node.run, number)
+            save_epoch(self._run_dir, number, state, lambda _: self._wait_for(written))
+        except OSError as error:
+            raise RunError(f"epoch {number} in {self._run_dir}: {error.strerror or error}") from error
+        except CoopError as error:
+            raise RunError(f"epoch {number}: {error}") from error
+        self.newest = number
+
+    def _wait_for(self, question: bytearray) -> None:
+        while self._ask(question).kind == "retry":
+            time.sleep(PAUSE)
+
+    def _ask(self, question: bytearray) -> Message:
+        """Ask the replay service, which may be restarting, until it answers or `PATIENCE` is over."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            try:
+                return self._node.ask(replay_key(self._node, "snapshot"), question)
+            except NoAnswer:
+                if time.monotonic() > deadline:
+                    raise
+            time.sleep(PAUSE)

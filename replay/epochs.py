@@ -1,0 +1,99 @@
+"""The replay service's part in the epochs of a run: writes it beside the traffic, finds it again, drops old ones."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from pathlib import Path
+
+from common.errors import RunError
+from replay.core import ReplayCore
+from replay.storage import Mark, TornSnapshot, load_snapshot, save_snapshot
+
+PART = "replay"
+
+
+class ReplayEpochs:
+    """Parts of epochs under `checkpoints/` of a folder, written one at a time in a thread of their own."""
+
+    def __init__(self, folder: Path, run_id: int) -> None:
+        self._folder = folder / "checkpoints"
+        self._run_id = run_id
+        self._writer: threading.Thread | None = None
+        self._number = -1
+        self._problem = ""
+
+    def begin(self, core: ReplayCore, lock: threading.Condition, number: int, keep: list[int]) -> None:
+        """Freeze the core as it is now and begin to write it; returns before it is written.
+
+        keep: the older epochs that are still needed. Asking again for the one that is being written changes nothing.
+
+        Raises:
+            RunError: another epoch is being written.
+        """
+        if self._writer is not None and self._writer.is_alive():
+            if number == self._number:
+                return
+            raise RunError(f"epoch {number}: epoch {self._number} is still being written")
+        with lock:
+            snapshot = core.snapshot(number)
+
+        def write() -> None:
+            path = self._folder / str(number) / PART
+            try:
+                save_snapshot(snapshot, lock, path, Mark(self._run_id, 1))
+                self._drop({number, *keep})
+            except OSError as error:
+                self._problem = f"{path}: {error.strerror or error}"
+
+        self._number, self._problem = number, ""
+        self._writer = threading.Thread(target=write, name=f"epoch {number}")
+        self._writer.start()
+
+    def written(self, number: int, seconds: float) -> bool:
+        """Wait up to `seconds`; True if the part of epoch `number` is on disk, False if it is being written.
+
+        Raises:
+            RunError: it was not begun or could not be written.
+        """
+        if number != self._number or self._writer is None:
+            raise RunError(f"epoch {number} was not begun")
+        self._writer.join(seconds)
+        if self._writer.is_alive():
+            return False
+        if self._problem:
+            raise RunError(self._problem)
+        return True
+
+    def restore(self, core: ReplayCore, number: int) -> str:
+        """Let a new core go on from the newest whole part up to epoch `number`; what was found, in words.
+
+        Raises:
+            UsageError: it belongs to a table with other settings.
+        """
+        remarks = []
+        for found in sorted((n for n in self._numbers() if n <= number), reverse=True):
+            try:
+                load_snapshot(core, self._folder / str(found) / PART, self._run_id)
+            except TornSnapshot as torn:
+                remarks.append(f"passed over a torn snapshot, {torn}")
+                continue
+            remarks.append(f"restored epoch {found}: {core.table.inserted:,} transitions, {core.drawn:,} batches")
+            break
+        return "; ".join(remarks) or "nothing to restore"
+
+    def any(self) -> bool:
+        """True where the folder holds parts of epochs."""
+        return bool(self._numbers())
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        if self._writer is not None:
+            self._writer.join()
+
+    def _numbers(self) -> list[int]:
+        return [int(path.parent.name) for path in self._folder.glob(f"*/{PART}") if path.parent.name.isdigit()]
+
+    def _drop(self, keep: set[int]) -> None:
+        for number in set(self._numbers()) - keep:
+            shutil.rmtree(self._folder / str(number) / PART, ignore_errors=True)
