@@ -53,7 +53,7 @@ def _run() -> None:
     endpoints = (*options.connect, *joined.replay_endpoints)
     session = open_session((), endpoints, options.zenoh_config, options.shared_memory)
     with Node(session, options.run, "actor", incarnation) as node:
-        node.follow_stop(stop, options.patience)
+        node.follow_stop(stop)
         membership = Membership(node, stop, request, joined, options.connect, options.patience)
         ActorService(node, stop, config.actor, env, policy, incarnation).run()
         membership.close()

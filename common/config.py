@@ -243,6 +243,18 @@ def to_tables(config: RunConfig) -> dict[str, Any]:
     return _without_none(asdict(config))
 
 
+def first_difference(here: Mapping[str, Any], there: Mapping[str, Any], name: str = "") -> tuple[str, Any, Any] | None:
+    """(name, here, there) of the first field in which nested tables differ; None where they are equal."""
+    for key in {**here, **there}:
+        mine, theirs = here.get(key), there.get(key)
+        if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
+            if found := first_difference(mine, theirs, f"{name}{key}."):
+                return found
+        elif mine != theirs:
+            return f"{name}{key}", mine, theirs
+    return None
+
+
 def _without_none(tables: Mapping[str, Any]) -> dict[str, Any]:
     """TOML has no null: a field that is None is left out and comes back as its default."""
     return {

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 from common import messages
-from common.config import to_tables
+from common.config import first_difference, to_tables
 from common.errors import BadMessage, JoinError
 from common.lifecycle import Stop
 from common.messages import Join, Joined
@@ -57,60 +57,61 @@ def join(
 
 
 class Membership:
-    """Joins again whenever a learner comes back, in a thread of its own; stops the process where it is another run's.
+    """Joins again whenever a learner comes back, in a thread of its own.
+
+    Stops the process where the learner is another run's, or has been gone for `patience` seconds.
 
     Args:
         request: as this process joined first. joined: the answer that it got then.
     """
 
     def __init__(
-        self, node: Node, stop: Stop, request: Join, joined: Joined, connect: Sequence[str], timeout: float
+        self, node: Node, stop: Stop, request: Join, joined: Joined, connect: Sequence[str], patience: float
     ) -> None:
         self._node = node
         self._stop = stop
         self._request = replace(request, index=joined.index)
         self._joined = joined
         self._connect = connect
-        self._timeout = timeout
-        self._returned = threading.Event()
+        self._patience = patience
         self._thread = threading.Thread(target=self._run, name="membership", daemon=True)
         self._thread.start()
-        node.on_learner(self._returned.set)
 
     def close(self) -> None:
         """Wait for the thread; the stop must have come."""
-        self._returned.set()
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._stop.is_set():
-            if not self._returned.wait(LOOK_EVERY):
-                continue
-            self._returned.clear()
-            try:
-                again = join(self._node, self._stop, self._request, self._connect, self._timeout)
-            except JoinError as error:
-                self._stop.set(str(error), failed=True)
-                return
-            if again is not None and (problem := difference(self._joined, again)):
-                self._stop.set(problem, failed=True)
+        known: set[str] = set()
+        while not self._stop.wait(LOOK_EVERY):
+            if self._node.presence.absence("learner") > self._patience:
+                text = f"the learner of run {self._node.run!r} has been gone for {self._patience:g} s"
+                self._stop.set(text, failed=True)
+            there = self._node.presence.members("learner")
+            if there - known:
+                self._join_again()
+            known = there
+
+    def _join_again(self) -> None:
+        try:
+            again = join(self._node, self._stop, self._request, self._connect, self._patience)
+        except JoinError as error:
+            self._stop.set(str(error), failed=True)
+            return
+        if again is not None and (problem := difference(self._joined, again)):
+            self._stop.set(problem, failed=True)
 
 
 def difference(mine: Joined, theirs: Joined) -> str | None:
     """What keeps a process that has joined from following another learner, with both values; None if nothing does."""
-    for name, here, there in (
-        ("run id", mine.run_id, theirs.run_id),
-        ("environment", asdict(mine.spec), asdict(theirs.spec)),
-        ("network layout", mine.layout, theirs.layout),
-        ("config", to_tables(mine.config), to_tables(theirs.config)),
-    ):
-        if here != there:
-            return _named(name, here, there)
-    return None
+    found = first_difference(_identity(mine), _identity(theirs))
+    return found and f"{found[0]} here {found[1]}, the learner's {found[2]}"
 
 
-def _named(name: str, here: Any, there: Any) -> str:  # noqa: ANN401 (any value of a config)
-    if isinstance(here, Mapping) and isinstance(there, Mapping):
-        first = next(key for key in {**here, **there} if here.get(key) != there.get(key))
-        return _named(f"{name}.{first}", here.get(first), there.get(first))
-    return f"{name} here {here}, the learner's {there}"
+def _identity(joined: Joined) -> dict[str, Any]:
+    return {
+        "run id": joined.run_id,
+        "environment": asdict(joined.spec),
+        "network layout": joined.layout,
+        "config": to_tables(joined.config),
+    }

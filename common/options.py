@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from common import cli
-from common.config import RunConfig, load_tables, resolve, to_tables, validated
+from common.config import RunConfig, first_difference, load_tables, resolve, to_tables, validated
 from common.errors import UsageError
 
 
@@ -72,12 +72,9 @@ class RunOptions(RunConfig):
         if path is None or not (path / "config.toml").exists():
             raise UsageError(f"--resume: no run in --run-dir {path}")
         saved = resolve(load_tables(None, path / "config.toml"))
-        for name, value in to_tables(self.run_config()).items():
-            if (before := to_tables(saved).get(name)) != value:
-                raise UsageError(
-                    f"--resume: {path / 'config.toml'} has {name} = {before}, the flags {value}; "
-                    f"give the same, or --config with it"
-                )
+        if problem := first_difference(to_tables(self.run_config()), to_tables(saved)):
+            name, here, there = problem
+            raise UsageError(f"--resume: {name} = {here}, but {there} in {path / 'config.toml'}; --config takes it")
         return path
 
 

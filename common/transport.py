@@ -20,6 +20,7 @@ import zenoh
 from common import messages, wire
 from common.errors import BadMessage, CoopError, RunError, UsageError
 from common.lifecycle import Stop
+from common.presence import LEASE_MS, Presence
 from common.wire import Message
 
 ASK_TIMEOUT = 5.0  # seconds
@@ -32,6 +33,7 @@ _QUIET = {
     "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "listen/exit_on_failure": True,
+    "transport/link/tx/lease": LEASE_MS,
     "transport/link/rx/buffer_size": 4 << 20,
     "transport/link/rx/max_message_size": wire.MAX_PAYLOAD + (1 << 16),
     "transport/link/tx/queue/size/data": 16,
@@ -123,6 +125,9 @@ class Node:
         run: name of the run, the prefix of every key.
         role: "learner", "replay", "actor" or "watch".
         incarnation: the random id drawn at start.
+
+    Attributes:
+        presence: who else is connected.
     """
 
     def __init__(self, session: zenoh.Session, run: str, role: str, incarnation: int) -> None:
@@ -133,8 +138,8 @@ class Node:
         self._name = f"{role}/{incarnation:x}"
         self._threads: list[threading.Thread] = []
         self._closing = False
-        self._timers: list[threading.Timer] = []
         self._status = session.declare_publisher(self.key("metrics", self._name))
+        self.presence = Presence(session, self.key("alive"))
         self._token = session.liveliness().declare_token(self.key("alive", self._name))
 
     def key(self, *parts: str) -> str:
@@ -214,27 +219,8 @@ class Node:
         """Follow a key of which only the latest value matters."""
         return Latest(self, self.session.declare_subscriber(key, zenoh.handlers.RingChannel(1)))
 
-    def alive(self) -> dict[str, int]:
-        """How many processes of each role are connected to this one."""
-        counts: dict[str, int] = {}
-        for reply in self.session.liveliness().get(self.key("alive", "**"), timeout=1.0):
-            if reply.ok is not None:
-                role = str(reply.ok.key_expr).split("/")[-2]
-                counts[role] = counts.get(role, 0) + 1
-        return counts
-
-    def on_learner(self, appeared: Callable[[], None]) -> None:
-        """Call `appeared`, in a thread of Zenoh's, for the learner that is there and whenever one comes."""
-
-        def changed(sample: zenoh.Sample) -> None:
-            if sample.kind == zenoh.SampleKind.PUT:
-                appeared()
-
-        self.session.liveliness().declare_subscriber(self.key("alive", "learner", "*"), changed, history=True)
-
-    def follow_stop(self, stop: Stop, patience: float) -> None:
-        """Stop when the learner says so, or when it has been gone for `patience` seconds."""
-        timers = self._timers
+    def follow_stop(self, stop: Stop) -> None:
+        """Stop when the learner says so."""
 
         def stopped(sample: zenoh.Sample) -> None:
             try:
@@ -242,25 +228,12 @@ class Node:
             except BadMessage:
                 self.count_bad()
 
-        def learner(sample: zenoh.Sample) -> None:
-            while timers:
-                timers.pop().cancel()
-            if sample.kind == zenoh.SampleKind.DELETE and not self._closing:
-                text = f"the learner of run {self.run!r} has been gone for {patience:g} s"
-                timers.append(threading.Timer(patience, stop.set, (text, True)))
-                timers[0].daemon = True
-                timers[0].start()
-
         self.session.declare_subscriber(self.key("stop"), stopped)
-        self.session.liveliness().declare_subscriber(self.key("alive", "learner", "*"), learner, history=True)
 
     def close(self) -> None:
         """Close the session and wait for the serving threads."""
         self._closing = True
         self.session.close()  # type: ignore[no-untyped-call]
-        for timer in self._timers:
-            timer.cancel()
-            timer.join()
         for thread in self._threads:
             thread.join()
 

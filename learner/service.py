@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from common import messages, schedules
@@ -93,6 +93,9 @@ class LearnerService:
             if agent.updates % METRICS_EVERY == 0:
                 self._directory.metrics(self._telemetry.row(agent, self._drawn, self._epsilon()))
             self._checkpoints.begin_if_due(agent.updates, self._state)
+        elif 0 < self._drawn.planned <= agent.updates and (stats := self._replay_stats()) is not None:
+            # The last batch may have come before the last steps, and no other will tell of them.
+            self._drawn = replace(self._drawn, inserted=stats.inserted, episodes=())
         if time.monotonic() >= self._status_due:
             self._tell()
 
@@ -142,7 +145,7 @@ class LearnerService:
                 "s": self._agent.exploration_rate(),
                 "waiting": self._samples.waiting,
                 "bad_messages": self._node.bad_messages,
-                "connected": self._node.alive(),
+                "connected": self._node.presence.counts(),
             }
         )
 
@@ -203,6 +206,6 @@ class LearnerService:
         while time.monotonic() < deadline:
             self._node.announce(self._node.key("stop"), messages.encode_stop(self._node.run, outcome))
             time.sleep(0.1)
-            alive = self._node.alive()
+            alive = self._node.presence.counts()
             if not alive.get("actor") and not alive.get("replay"):
                 return

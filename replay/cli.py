@@ -47,7 +47,7 @@ def _run() -> None:
     incarnation = new_incarnation()
     session = open_session(options.listen, options.connect, options.zenoh_config, options.shared_memory)
     with Node(session, options.run, "replay", incarnation) as node:
-        node.follow_stop(stop, options.patience)
+        node.follow_stop(stop)
         request = Join("replay", incarnation, locators(session))
         joined = join(node, stop, request, options.connect, options.join_timeout)
         if joined is not None:

@@ -71,16 +71,15 @@ class ReplayEpochs:
         Raises:
             UsageError: it belongs to a table with other settings.
         """
-        remarks = []
+        torn = ""
         for found in sorted((n for n in self._numbers() if n <= number), reverse=True):
             try:
                 load_snapshot(core, self._folder / str(found) / PART, self._run_id)
-            except TornSnapshot as torn:
-                remarks.append(f"passed over a torn snapshot, {torn}")
+            except TornSnapshot as error:
+                torn += f"passed over a torn snapshot, {error}; "
                 continue
-            remarks.append(f"restored epoch {found}: {core.table.inserted:,} transitions, {core.drawn:,} batches")
-            break
-        return "; ".join(remarks) or "nothing to restore"
+            return f"{torn}restored epoch {found}: {core.table.inserted:,} transitions, {core.drawn:,} batches"
+        return f"{torn}nothing to restore"
 
     def any(self) -> bool:
         """True where the folder holds parts of epochs."""

@@ -110,7 +110,7 @@ def _read_state(path: Path) -> dict[str, Any]:
         content = path.read_bytes()
     except OSError as error:
         raise TornSnapshot(f"{path}: {error.strerror or error}") from error
-    if zlib.crc32(content[4:]) != int.from_bytes(content[:4], "little"):
+    if len(content) <= 4 or zlib.crc32(content[4:]) != int.from_bytes(content[:4], "little"):
         raise TornSnapshot(f"{path}: wrong checksum")
     state: dict[str, Any] = msgpack.unpackb(content[4:], strict_map_key=False)
     return state

@@ -79,7 +79,7 @@ def nodes(endpoint: str) -> Iterator[tuple[Node, Node]]:
         Node(open_session((), (endpoint,)), "test", "actor", new_incarnation()) as second,
     ):
         deadline = time.monotonic() + 5
-        while not second.alive().get("learner") and time.monotonic() < deadline:
+        while not second.presence.counts().get("learner") and time.monotonic() < deadline:
             time.sleep(0.02)
         yield first, second
 

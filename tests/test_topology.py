@@ -141,9 +141,10 @@ def test_three_shells_a_late_actor_and_a_kill(tmp_path: Path) -> None:
     assert len({row["actor"] for row in rows}) == 2
 
 
-def test_ctrl_c_and_a_killed_actor(tmp_path: Path) -> None:
+def test_ctrl_c_a_killed_actor_and_resume(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    with running("coop-local", "--actors", "1", "--run-dir", str(path)) as local:
+    flags = ("--actors", "1", "--total-steps", "3000", "--run-dir", str(path))
+    with running("coop-local", *flags) as local:
         wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
         roles = children(local.pid)
         assert sorted(roles) == ["coop-actor", "coop-learner", "coop-replay"]
@@ -155,19 +156,23 @@ def test_ctrl_c_and_a_killed_actor(tmp_path: Path) -> None:
         out, err = local.communicate(timeout=40)
         assert (local.returncode, err) == (0, "")
     assert re.search(r"actor 1 ended \(killed by SIGKILL\).*starting it again", out)
-    check_files(path, 50_000, "interrupted")
+    before = check_files(path, 3000, "interrupted")
+    done = run("coop-local", *flags, "--resume")
+    assert (done.returncode, done.stderr) == (0, "")
+    after = check_files(path, 3000)
+    assert int(str(after["episodes"])) > int(str(before["episodes"]))
+    assert float(str(after["wall_seconds"])) > float(str(before["wall_seconds"]))
+    refused = run("coop-local", *flags, "--resume", "--learner.gamma", "0.5")
+    assert refused.returncode == 2
+    assert "learner.gamma" in refused.stderr
 
 
-def test_a_dead_replay_service_ends_the_run_and_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "run"
-    with running("coop-local", "--actors", "1", "--run-dir", str(path)) as local:
-        wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
-        os.kill(children(local.pid)["coop-replay"], signal.SIGKILL)
-        _, err = local.communicate(timeout=60)
-        assert local.returncode == 1
-        assert children(local.pid) == {}
-    assert err.count("\n") == 1
-    assert "replay ended (killed by SIGKILL)" in err
+def test_a_role_that_gives_up_ends_the_run_and_is_named(tmp_path: Path) -> None:
+    done = run("coop-local", "--replay.capacity", str(10**12), "--run-dir", str(tmp_path / "run"))
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "replay ended (exit status 1)" in done.stderr
+    assert "replay.capacity" in done.stderr
 
 
 def test_a_port_in_use(tmp_path: Path) -> None:

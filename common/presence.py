@@ -1,0 +1,67 @@
+"""Who of a run is connected to this process, and who has gone: told by Zenoh's liveliness tokens.
+
+A token disappears within milliseconds of its process, and within the lease of a process that is frozen or cut off.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+
+import zenoh
+
+LEASE_MS = 1500
+FORGOTTEN = 60.0  # seconds after which one that has gone is no longer missed
+
+
+class Presence:
+    """The tokens of a run.
+
+    Args:
+        prefix: key under which the tokens are, as ROLE/INCARNATION.
+    """
+
+    def __init__(self, session: zenoh.Session, prefix: str) -> None:
+        self._there: set[str] = set()
+        self._gone: dict[str, float] = {}  # since when
+        self._lock = threading.Lock()
+        self._began = time.monotonic()
+        session.liveliness().declare_subscriber(f"{prefix}/*/*", self._tell, history=True)
+
+    def counts(self) -> dict[str, int]:
+        """How many processes of each role are connected."""
+        with self._lock:
+            return dict(Counter(name.split("/")[0] for name in self._there))
+
+    def missing(self) -> list[str]:
+        """Processes that have gone and that no other of their role has replaced, as "ROLE INCARNATION"."""
+        now = time.monotonic()
+        with self._lock:
+            self._gone = {name: since for name, since in self._gone.items() if now - since < FORGOTTEN}
+            return [name.replace("/", " ") for name in self._gone]
+
+    def members(self, role: str) -> set[str]:
+        """Incarnations of a role that are connected."""
+        with self._lock:
+            return {name.split("/")[1] for name in self._there if name.startswith(f"{role}/")}
+
+    def absence(self, role: str) -> float:
+        """Seconds for which nobody of this role has been connected; 0 while somebody is."""
+        with self._lock:
+            if any(name.startswith(f"{role}/") for name in self._there):
+                return 0.0
+            left = max((since for name, since in self._gone.items() if name.startswith(f"{role}/")), default=0.0)
+            return time.monotonic() - max(left, self._began)
+
+    def _tell(self, sample: zenoh.Sample) -> None:
+        name = "/".join(str(sample.key_expr).split("/")[-2:])
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._there.discard(name)
+                self._gone[name] = time.monotonic()
+                return
+            self._there.add(name)
+            role = f"{name.split('/')[0]}/"
+            replaced = name if name in self._gone else next((old for old in self._gone if old.startswith(role)), "")
+            self._gone.pop(replaced, None)

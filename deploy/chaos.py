@@ -1,0 +1,165 @@
+"""A run under fire: `python -m deploy.chaos` kills roles of a `coop-local` run and counts what is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from common import cli
+from common.errors import RunError, UsageError
+from common.lifecycle import run_main
+from common.processes import ChildProcess, command, free_endpoint
+from common.transport import new_incarnation
+from deploy.status import RunStatus
+
+TICK = 0.05  # seconds
+ROLES = ("coop-learner", "coop-replay", "coop-actor")
+SETTLED = 100  # updates of the run between two kills, at least: each kill meets a run that is at work
+
+
+@dataclass(frozen=True)
+class ChaosOptions:
+    """Flags of the run under fire."""
+
+    run_dir: Path
+    """Folder for the run's files; must be new."""
+    kills: int = 20
+    """How many processes to kill with SIGKILL."""
+    actors: int = 2
+    """Actor processes."""
+    total_steps: int = 20_000
+    """Environment steps of the run."""
+    checkpoint_every: int = 500
+    """Updates between epochs."""
+    seed: int = 0
+    """Of the run, and of who is killed when."""
+    longest_pause: float = 3.0
+    """Seconds at most between a run that is at work again and the next kill."""
+    give_up: float = 1200.0
+    """Seconds after which the run is taken to hang."""
+
+
+class Gunner:
+    """Kills one role after another, each kind as often as the others, once the run is at work again.
+
+    kills: done so far, by command. longest_stall: seconds without a step or an update.
+    """
+
+    def __init__(self, options: ChaosOptions, supervisor: int, status: RunStatus) -> None:
+        self.kills: dict[str, int] = dict.fromkeys(ROLES, 0)
+        self.longest_stall = 0.0
+        self._options = options
+        self._supervisor = supervisor
+        self._status = status
+        self._chance = random.Random(options.seed)
+        self._left = [ROLES[number % len(ROLES)] for number in range(options.kills)]
+        self._chance.shuffle(self._left)
+        self._progress = (0, 0)
+        self._moved = time.monotonic()
+        self._at_work_since = 0
+        self._next = float("inf")
+
+    def turn(self) -> None:
+        """Look at the run, and shoot if it is time."""
+        now = time.monotonic()
+        self._status.refresh()
+        told = self._status.learner
+        progress = (told.get("env_steps", 0), told.get("updates", 0))
+        if progress != self._progress:
+            if self._progress[1]:
+                self.longest_stall = max(self.longest_stall, now - self._moved)
+            self._progress, self._moved = progress, now
+        if not self._left:
+            return
+        updates = progress[1]
+        self._at_work_since = min(self._at_work_since, updates)  # the learner may be back at an epoch
+        if self._next == float("inf") and updates >= self._at_work_since + SETTLED:
+            self._next = now + self._chance.uniform(0, self._options.longest_pause)
+        if now >= self._next and self._shoot(self._left[-1]):
+            self._left.pop()
+            self._next, self._at_work_since = float("inf"), updates
+
+    def _shoot(self, name: str) -> bool:
+        alive = [pid for pid, found in _children(self._supervisor) if found == name]
+        if not alive:
+            return False
+        os.kill(self._chance.choice(alive), signal.SIGKILL)
+        self.kills[name] += 1
+        return True
+
+
+def _children(pid: int) -> list[tuple[int, str]]:
+    """(process id, command) of the direct children of a process."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
+                arguments = (entry / "cmdline").read_bytes().split(b"\0")
+                names = [Path(os.fsdecode(argument)).name for argument in arguments]
+                found += [(int(entry.name), name) for name in names if name in ROLES]
+        except (OSError, ValueError, IndexError):
+            continue
+    return found
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("chaos", _run)
+
+
+def _run() -> None:
+    options = cli.parse(ChaosOptions, "chaos", "Kill roles of a run at random moments, and count what is lost.")
+    if options.run_dir.exists():
+        raise UsageError(f"--run-dir {options.run_dir}: exists already; give a new folder")
+    options.run_dir.mkdir(parents=True)
+    endpoint = free_endpoint()
+    log = options.run_dir / "coop-local.log"
+    flags = {
+        "preset": "cartpole",
+        "run-dir": options.run_dir,
+        "listen": endpoint,
+        "run": "chaos",
+        "actors": options.actors,
+        "seed": options.seed,
+        "total-steps": options.total_steps,
+        "checkpoint-every": options.checkpoint_every,
+    }
+    local = command("coop-local", *(f"--{name}={value}" for name, value in flags.items()))
+    process = ChildProcess("coop-local", local, log)
+    process.start()
+    started = time.monotonic()
+    status = RunStatus("chaos", endpoint, new_incarnation())
+    try:
+        gunner = Gunner(options, process.pid, status)
+        while process.exit_status() is None:
+            gunner.turn()
+            time.sleep(TICK)
+            if time.monotonic() > started + options.give_up:
+                raise RunError(f"the run still goes on after {options.give_up:g} s: {status.line()}")
+    finally:
+        status.close()
+        process.interrupt()
+        process.end(60)
+    if process.exit_status():
+        raise RunError(process.why())
+    _report(options.run_dir, gunner, log.read_text(encoding="utf-8").count("starting it again"), started)
+
+
+def _report(run_dir: Path, gunner: Gunner, restarts: int, started: float) -> None:
+    summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
+    killed = ", ".join(f"{count} {name.removeprefix('coop-')}" for name, count in gunner.kills.items())
+    print(f"kills                 {sum(gunner.kills.values())} ({killed})")
+    print(f"transitions accepted  {summary['transitions_accepted']:,}")
+    print(f"lost                  {summary['transitions_lost']}")
+    print(f"restarts              {restarts}")
+    print(f"longest stall         {gunner.longest_stall:.1f} s")
+    print(f"wall time             {time.monotonic() - started:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Epochs on disk: what is restored goes on alike, torn ones are passed over, old ones go."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from samples import make_segment
+
+from common.config import LearnerSettings, ReplaySettings, RunConfig
+from common.errors import RunError, UsageError
+from common.experience import DrawRequest
+from common.types import EnvSpec
+from learner.epochs import complete_epochs, load_learner, newest_epoch, save_epoch
+from replay.core import ReplayCore, Wait
+from replay.epochs import ReplayEpochs
+
+CONFIG = RunConfig(
+    run="test",
+    total_steps=1000,
+    learner=LearnerSettings(batch_size=4),
+    replay=ReplaySettings(capacity=40, start=8, tolerance=8.0),
+)
+
+
+def _used_core(spec: EnvSpec) -> ReplayCore:
+    core = ReplayCore(CONFIG, spec)
+    drawn = 0
+    for sequence in range(15):
+        assert not isinstance(core.insert(make_segment(spec, sequence, acked=4 * sequence)), Wait)
+        while not isinstance(core.draw(DrawRequest(1, drawn, max(0, drawn - 2), 4, 0)), Wait):
+            drawn += 1
+    core.insert(make_segment(spec, 3))
+    return core
+
+
+def _save(core: ReplayCore, epochs: ReplayEpochs, number: int, *keep: int) -> None:
+    epochs.begin(core, threading.Condition(), number, list(keep))
+    assert epochs.written(number, 10)
+
+
+def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
+    core, twin = _used_core(spec), ReplayCore(CONFIG, spec)
+    base = core.drawn - 2
+    _save(core, ReplayEpochs(tmp_path, 5), base)
+    assert "restored epoch" in ReplayEpochs(tmp_path, 5).restore(twin, base)
+    for one in (core, twin):
+        assert one.insert(make_segment(spec, 14)) == 60, "a repeated delivery is still known"
+        assert one.insert(make_segment(spec, 15)) == 64
+    assert (twin.duplicates, twin.lost, twin.episodes_booked) == (2, 0, 16)
+    for sequence in (base, base + 1, core.drawn, core.drawn + 1):
+        request = DrawRequest(1, sequence, base, 4, 0)
+        first, second = core.draw(request), twin.draw(request)
+        assert not isinstance(first, Wait)
+        assert not isinstance(second, Wait)
+        np.testing.assert_array_equal(first[0].ids, second[0].ids)
+        np.testing.assert_array_equal(first[0].frames, second[0].frames)
+        assert first[1] == second[1]
+    assert twin.snapshot(base).books == core.snapshot(base).books
+
+
+def test_torn_parts_are_passed_over_and_old_ones_go(spec: EnvSpec, tmp_path: Path) -> None:
+    core, epochs = _used_core(spec), ReplayEpochs(tmp_path, 5)
+    for number in (10, 20, 30):
+        _save(core, epochs, number, number - 10)
+        core.insert(make_segment(spec, number))
+    parts = {number: tmp_path / "checkpoints" / str(number) / "replay" for number in (10, 20, 30)}
+    assert [parts[number].exists() for number in (10, 20, 30)] == [False, True, True]
+    with (parts[30] / "rewards.npy").open("r+b") as file:
+        file.seek(-1, 2)
+        file.write(b"\7")
+    assert "rewards.npy: size and checksum" in (found := epochs.restore(twin := ReplayCore(CONFIG, spec), 30))
+    assert "restored epoch 20" in found
+    assert twin.table.inserted == 60
+    assert epochs.restore(ReplayCore(CONFIG, spec), 19) == "nothing to restore", "the learner is back before it"
+    (parts[20] / "state.msgpack").write_bytes(b"")
+    assert "nothing to restore" in epochs.restore(ReplayCore(CONFIG, spec), 20)
+    (parts[30] / "rewards.npy").unlink()
+    with pytest.raises(UsageError, match="belongs to the run with id 5, the learner's has 6"):
+        ReplayEpochs(tmp_path, 6).restore(ReplayCore(CONFIG, spec), 30)
+
+
+def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
+    core = _used_core(spec)
+    drawn = core.drawn
+    assert isinstance(core.draw(DrawRequest(1, drawn, drawn, 4, 0)), Wait)
+    assert not isinstance(core.draw(DrawRequest(2, 5, 5, 4, 3)), Wait), "another learner, back at update 5"
+    assert core.drawn == 6
+    with pytest.raises(RunError, match="another learner has taken over"):
+        core.draw(DrawRequest(1, drawn, drawn, 4, 0))
+    core.draw(DrawRequest(2, 20, 20, 4, 0))
+    assert core.drawn == 21, "updates that this table was not asked for"
+    older = ReplayCore(CONFIG, spec)
+    older.insert(make_segment(spec))
+    assert isinstance(older.draw(DrawRequest(2, 20, 20, 4, 9)), Wait)
+    assert (older.drawn, older.episodes_booked) == (20, 9), "episodes that the learner knows keep their numbers"
+
+
+def test_learner_epochs(tmp_path: Path) -> None:
+    for number in (100, 200, 300):
+        save_epoch(tmp_path, number, {"flat": torch.full((3,), float(number))}, lambda _: None)
+    assert complete_epochs(tmp_path) == [200, 300]
+    torn = tmp_path / "checkpoints" / "400"
+    torn.mkdir()
+    (torn / "learner.pt").write_bytes(b"half")
+    newest = newest_epoch(tmp_path)
+    assert newest is not None
+    assert load_learner(newest)["flat"].tolist() == [300.0] * 3
+    (newest / "learner.pt").write_bytes((newest / "learner.pt").read_bytes()[:-9])
+    newest = newest_epoch(tmp_path)
+    assert newest is not None
+    assert newest.name == "200"
+    assert complete_epochs(tmp_path) == [200], "the torn one is gone, and does not count as one of two to keep"
+
+    def fails(folder: str) -> None:
+        raise RunError(f"no room for {folder}")
+
+    with pytest.raises(RunError):
+        save_epoch(tmp_path, 500, {}, fails)
+    assert complete_epochs(tmp_path) == [200]
+    assert not (tmp_path / "checkpoints" / "500").exists()
