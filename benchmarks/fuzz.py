@@ -29,7 +29,7 @@ from roles import Roles, replay_stats, running, wait_until
 from common import experience, messages, wire
 from common.clients import replay_key
 from common.errors import BadMessage, CoopError, RunError
-from common.experience import SegmentReader
+from common.experience import DrawRequest, SegmentReader
 from common.joining import join, join_key
 from common.lifecycle import Stop
 from common.messages import Join, Joined
@@ -131,25 +131,35 @@ def targets(node: Node, joined: Joined) -> list[Target]:
     )
 
     def sample(message: Message) -> None:
-        if experience.decode_sample(message)[2] != batch_size:
+        if experience.decode_sample(message).batch_size != batch_size:
             raise BadMessage("fields.batch_size", "not this run's")
+
+    def snapshot(message: Message) -> None:
+        (messages.decode_snapshot if message.kind == "snapshot" else messages.decode_written)(message)
 
     def joining(role: str, message: Message) -> None:
         if messages.decode_join(message).role != role:
             raise BadMessage("fields.role", "not this key's")
 
+    draw = DrawRequest(1, 0, 0, batch_size, 0)
     question = partial(messages.encode_question, RUN)
     current = partial(messages.decode_question, "current")
     made: list[tuple[str, bytearray, str, Callable[[Message], Any]]] = [
         (replay_key(node, "insert"), experience.encode_segment(RUN, segment), "replay", SegmentReader(spec)),
-        (replay_key(node, "sample"), experience.encode_sample(RUN, 1, 0, batch_size, 0), "replay", sample),
+        (
+            replay_key(node, "sample"),
+            experience.encode_sample(RUN, draw),
+            "replay",
+            sample,
+        ),
         (replay_key(node, "stats"), question("stats"), "replay", partial(messages.decode_question, "stats")),
         (
             replay_key(node, "snapshot"),
-            messages.encode_snapshot(RUN, "checkpoints/7"),
+            messages.encode_snapshot(RUN, 7, [3]),
             "replay",
-            messages.decode_snapshot,
+            snapshot,
         ),
+        (replay_key(node, "snapshot"), messages.encode_written(RUN, 7), "replay", snapshot),
         *(
             (join_key(node, role), messages.encode_join(RUN, Join(role, 5, [])), "learner", partial(joining, role))
             for role in ("actor", "replay")
@@ -197,8 +207,10 @@ class Watch:
 
     def everything(self, number: int) -> dict[str, bytes]:
         """The state of both roles, in bytes."""
-        snapshot = messages.encode_snapshot(RUN, f"checkpoints/{number}")
-        self._node.ask(replay_key(self._node, "snapshot"), snapshot, 60.0)
+        key = replay_key(self._node, "snapshot")
+        self._node.ask(key, messages.encode_snapshot(RUN, number, []), 60.0)
+        while self._node.ask(key, messages.encode_written(RUN, number), 60.0).kind == "retry":
+            pass
         saved = self._folder / "checkpoints" / str(number) / "replay"
         state = {path.name: path.read_bytes() for path in saved.iterdir()}
         question = messages.encode_question(RUN, "current")

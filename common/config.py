@@ -243,6 +243,11 @@ def to_tables(config: RunConfig) -> dict[str, Any]:
     return _without_none(asdict(config))
 
 
+def identity(config: RunConfig) -> dict[str, Any]:
+    """What makes two runs the same one, as nested tables: everything but how often it is saved."""
+    return {name: value for name, value in to_tables(config).items() if name != "checkpoint_every"}
+
+
 def first_difference(here: Mapping[str, Any], there: Mapping[str, Any], name: str = "") -> tuple[str, Any, Any] | None:
     """(name, here, there) of the first field in which nested tables differ; None where they are equal."""
     for key in {**here, **there}:

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from common import messages
-from common.config import first_difference, to_tables
+from common.config import first_difference, identity
 from common.errors import BadMessage, JoinError
 from common.lifecycle import Stop
 from common.messages import Join, Joined
@@ -113,5 +113,5 @@ def _identity(joined: Joined) -> dict[str, Any]:
         "run id": joined.run_id,
         "environment": asdict(joined.spec),
         "network layout": joined.layout,
-        "config": to_tables(joined.config),
+        "config": identity(joined.config),
     }

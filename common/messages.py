@@ -20,11 +20,10 @@ from typing import Any
 from common import wire
 from common.config import RunConfig, to_tables, validated
 from common.errors import BadMessage, CoopError, UsageError
+from common.presence import ROLES
 from common.schema import Int, ListOf, Row, Rule, Schema, Table, Text
 from common.types import Array, EnvSpec
 from common.wire import Message
-
-ROLES = ("learner", "replay", "actor")
 
 INCARNATION = Int(0, 2**63 - 1)
 _ENDPOINTS = ListOf(Text(256), 16)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from common import cli
-from common.config import RunConfig, first_difference, load_tables, resolve, to_tables, validated
+from common.config import RunConfig, first_difference, identity, load_tables, resolve, validated
 from common.errors import UsageError
 
 
@@ -72,7 +72,7 @@ class RunOptions(RunConfig):
         if path is None or not (path / "config.toml").exists():
             raise UsageError(f"--resume: no run in --run-dir {path}")
         saved = resolve(load_tables(None, path / "config.toml"))
-        if problem := first_difference(to_tables(self.run_config()), to_tables(saved)):
+        if problem := first_difference(identity(self.run_config()), identity(saved)):
             name, here, there = problem
             raise UsageError(f"--resume: {name} = {here}, but {there} in {path / 'config.toml'}; --config takes it")
         return path

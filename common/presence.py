@@ -11,6 +11,7 @@ from collections import Counter
 
 import zenoh
 
+ROLES = ("learner", "replay", "actor")
 LEASE_MS = 1500
 FORGOTTEN = 60.0  # seconds after which one that has gone is no longer missed
 
@@ -27,7 +28,8 @@ class Presence:
         self._gone: dict[str, float] = {}  # since when
         self._lock = threading.Lock()
         self._began = time.monotonic()
-        session.liveliness().declare_subscriber(f"{prefix}/*/*", self._tell, history=True)
+        for role in ROLES:  # one subscriber each: access control may let a process see some roles only
+            session.liveliness().declare_subscriber(f"{prefix}/{role}/*", self._tell, history=True)
 
     def counts(self) -> dict[str, int]:
         """How many processes of each role are connected."""

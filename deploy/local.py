@@ -9,6 +9,7 @@ from pathlib import Path
 from common.config import RunConfig, to_toml
 from common.environments import env_spec
 from common.errors import RunError, UsageError
+from common.files import write_whole
 from common.lifecycle import Stop, run_main
 from common.options import RunOptions, parse_run
 from common.processes import ChildProcess, command, free_endpoint
@@ -42,7 +43,7 @@ class Topology:
         try:
             logs.mkdir(parents=True, exist_ok=True)
             resolved = directory / "config.toml"
-            resolved.write_text(to_toml(config), encoding="utf-8")
+            write_whole(resolved, to_toml(config).encode())
         except OSError as error:
             raise RunError(f"run directory {directory}: {error.strerror or error}") from error
         self.endpoint = options.listen or free_endpoint()

@@ -31,7 +31,7 @@ class RunDirectory:
         self.path = path
         try:
             path.mkdir(parents=True, exist_ok=True)
-            (path / "config.toml").write_text(to_toml(config), encoding="utf-8")
+            write_whole(path / "config.toml", to_toml(config).encode())
             for name, size in (sizes or {}).items():
                 os.truncate(path / name, size)
             mode = "w" if sizes is None else "a"
@@ -71,9 +71,7 @@ class RunDirectory:
 
     def summary(self, values: dict[str, Any]) -> None:
         """Write summary.json, whole or not at all."""
-        part = self.path / "summary.json.part"
-        part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
-        part.replace(self.path / "summary.json")
+        write_whole(self.path / "summary.json", f"{json.dumps(values, indent=2)}\n".encode())
 
     def sizes(self) -> dict[str, int]:
         """How long the files that grow are now, in bytes."""

@@ -14,6 +14,7 @@ import zenoh
 
 from common import experience, messages
 from common.clients import replay_key
+from common.experience import DrawRequest
 from common.joining import join_key
 from common.messages import Join, ReplayStats
 from common.processes import ChildProcess, command, free_endpoint
@@ -125,9 +126,9 @@ def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, s
         before = stats(inside)
         assert actor.ask(actor.key("weights", "1"), messages.encode_question(RUN, "current")).kind == "weights"
         for key, payload in (
-            (replay_key(actor, "sample"), experience.encode_sample(RUN, 1, 0, 32, 0)),
+            (replay_key(actor, "sample"), experience.encode_sample(RUN, DrawRequest(1, 0, 0, 32, 0))),
             (replay_key(actor, "stats"), messages.encode_question(RUN, "stats")),
-            (replay_key(actor, "snapshot"), messages.encode_snapshot(RUN, "checkpoints/1")),
+            (replay_key(actor, "snapshot"), messages.encode_snapshot(RUN, 1, [])),
             (join_key(actor, "replay"), messages.encode_join(RUN, Join("replay", 1, ["tls/127.0.0.1:9"]))),
         ):
             with pytest.raises(NoAnswer):
@@ -138,7 +139,7 @@ def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, s
         token = actor.session.liveliness().declare_token(actor.key("alive", "learner", "0"))
         overheard = actor.session.declare_subscriber(actor.key("metrics", "**"), zenoh.handlers.FifoChannel(8))
         wait_for_more(inside)
-        assert inside.alive()["learner"] == 1, "an actor can't pass for a learner"
+        assert inside.presence.counts()["learner"] == 1, "an actor can't pass for a learner"
         assert overheard.try_recv() is None
         token.undeclare()
         assert stats(inside).bad_messages == before.bad_messages, "nothing of it came through"

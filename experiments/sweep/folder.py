@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.config import resolve, to_toml
+from common.config import identity, resolve, to_toml
 from common.errors import UsageError
 from experiments.sweep.grid import Cell
 
@@ -43,7 +43,7 @@ class CellFolder:
         text = held.read_text(encoding="utf-8") if held.exists() else ""
         try:
             # An empty file is what a kill left while the run wrote it.
-            same = not text or resolve(tomllib.loads(text)) == self.cell.config
+            same = not text or identity(resolve(tomllib.loads(text))) == identity(self.cell.config)
         except (tomllib.TOMLDecodeError, UsageError):
             same = False
         if not same:
