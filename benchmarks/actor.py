@@ -1,0 +1,147 @@
+"""An actor process beside a bare loop of the same emulators and network: `python benchmarks/actor.py`.
+
+The actor is a real `coop-actor` that publishes to a real `coop-replay`; it is stopped by signal while the bare loop, in
+a process of its own, takes its turn: emulation alone, inference alone, then both. Ratios are taken in each round, so
+that they hold on a busy machine; printed are medians with their range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import signal
+import statistics
+import subprocess
+import tempfile
+import time
+from contextlib import ExitStack
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from actors.policy import Policy
+from common import messages
+from common.clients import replay_key
+from common.config import RunConfig, load_tables, resolve
+from common.environments import env_spec, make_vector_env
+from common.networks import FlatNetwork, build_network
+from common.processes import ChildProcess, command, free_endpoint
+from common.transport import NoAnswer, Node, new_incarnation, open_session
+from learner.agent import Agent
+from learner.broadcast import Broadcaster
+from learner.reception import Reception
+
+EPSILON = 0.1
+RUN = "bench"
+
+
+def run_config(envs: int) -> RunConfig:
+    """Breakout as Mnih played it late in a run, with a limiter that never says no."""
+    tables = load_tables("breakout", None)
+    tables["replay"] |= {"capacity": 20_000, "start": 1000, "tolerance": 1e12}
+    tables["actor"] |= {"envs": envs, "epsilon_start": EPSILON, "epsilon_final": EPSILON}
+    return resolve({**tables, "run": RUN, "total_steps": 10**12})
+
+
+def bare(config: RunConfig, end: Connection) -> None:
+    """Answers each (what, seconds) with steps/s of "emulation", of "inference" or of "both" in a loop."""
+    torch.set_num_threads(1)
+    spec, envs = env_spec(config.env), config.actor.envs
+    env = make_vector_env(config.env, envs, seed=0)
+    networks = [FlatNetwork(build_network(config.network.kind, spec, (), seed)) for seed in (0, 1)]
+    policy = Policy((networks[0], networks[1]), spec, np.random.default_rng(0))
+    obs = env.reset()
+    actions = policy.act(obs, EPSILON)
+    while (work := end.recv()) is not None:
+        what, seconds = work
+        steps, begun = 0, time.perf_counter()
+        while (spent := time.perf_counter() - begun) < seconds:
+            if what != "emulation":
+                actions = policy.act(obs, EPSILON)
+            if what != "inference":
+                obs = env.step(actions).obs
+            steps += envs
+        end.send(steps / spent)
+
+
+class Topology:
+    """A learner that only talks (this process), a replay service, and one actor that is stopped between turns."""
+
+    def __init__(self, stack: ExitStack, config: RunConfig, folder: Path) -> None:
+        head, replay = free_endpoint(), free_endpoint()
+        spec = env_spec(config.env)
+        session = open_session((head,), (replay,))
+        self._node = stack.enter_context(Node(session, RUN, "learner", new_incarnation()))
+        agent = Agent(config, spec)
+        Reception(self._node, config, spec, agent.networks[0].layout_digest())
+        Broadcaster(self._node, agent)
+        joining = ["--run", RUN, "--connect", head]
+        service = command("coop-replay", *joining, "--listen", replay, "--run-dir", str(folder))
+        child = ChildProcess("replay", service, folder / "replay.log")
+        child.start()
+        stack.callback(child.end, 10)
+        stack.callback(child.interrupt)
+        self._actor = stack.enter_context(subprocess.Popen(command("coop-actor", *joining)))
+        stack.callback(self._actor.kill)
+        while not self._inserted():
+            time.sleep(0.1)
+        self._actor.send_signal(signal.SIGSTOP)
+
+    def steps_per_second(self, seconds: float) -> float:
+        """What the actor inserts, from one change of the count to another."""
+        self._actor.send_signal(signal.SIGCONT)
+        changes = [(time.perf_counter(), self._inserted())]
+        while changes[-1][0] - changes[0][0] < seconds:
+            time.sleep(0.005)
+            if (count := self._inserted()) != changes[-1][1]:
+                changes.append((time.perf_counter(), count))
+        self._actor.send_signal(signal.SIGSTOP)
+        (begun, first), (ended, last) = changes[1], changes[-1]  # the first turn after the stop is not whole
+        return (last - first) / (ended - begun)
+
+    def _inserted(self) -> int:
+        question = messages.encode_question(RUN, "stats")
+        try:
+            return messages.decode_stats(self._node.ask(replay_key(self._node, "stats"), question)).inserted
+        except NoAnswer:  # it has not begun to answer
+            return 0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement; a stop of 10 s cuts links")
+    parser.add_argument("--envs", type=int, default=8)
+    options = parser.parse_args()
+    config = run_config(options.envs)
+    figures: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        spawn = multiprocessing.get_context("spawn")
+        ours, theirs = spawn.Pipe()
+        process = spawn.Process(target=bare, args=(config, theirs))
+        process.start()
+        stack.callback(process.join)
+        stack.callback(ours.send, None)
+        topology = Topology(stack, config, Path(folder))
+        for _ in range(options.rounds):
+            speed = {}
+            for what in ("emulation", "inference", "both"):
+                ours.send((what, options.seconds))
+                speed[what] = ours.recv()
+            speed["actor"] = topology.steps_per_second(options.seconds)
+            for name, value in speed.items():
+                figures.setdefault(f"{name}: steps/s", []).append(value)
+            parts = 1 / speed["emulation"] + 1 / speed["inference"]
+            figures.setdefault("time of both / time of emulation + inference", []).append(1 / speed["both"] / parts)
+            figures.setdefault("actor / both", []).append(speed["actor"] / speed["both"])
+    print(f"{options.envs} emulators, {options.rounds} rounds of {options.seconds:g} s: median (lowest to highest)")
+    for name, values in figures.items():
+        digits = 0 if "steps/s" in name else 3
+        middle, low, high = (f"{x:,.{digits}f}" for x in (statistics.median(values), min(values), max(values)))
+        print(f"  {name:45}{middle:>9} ({low} to {high})")
+
+
+if __name__ == "__main__":
+    main()
