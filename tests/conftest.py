@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 import torch
 
@@ -14,6 +15,10 @@ from common.types import EnvSpec
 
 # Default threads of several torch processes starve each other.
 torch.set_num_threads(1)
+
+# How long an example takes says nothing on a busy machine.
+hypothesis.settings.register_profile("coop", deadline=None)
+hypothesis.settings.load_profile("coop")
 
 SETTLE = 10.0  # seconds that threads and processes get to end
 

@@ -12,7 +12,7 @@ from replay.dedup import SeenWindow
 arrivals = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(0, 30)), max_size=200)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(arrivals=arrivals)
 def test_equals_a_set(arrivals: list[tuple[int, int, int]]) -> None:
     window, seen = SeenWindow(), set()
@@ -25,7 +25,7 @@ def test_equals_a_set(arrivals: list[tuple[int, int, int]]) -> None:
     assert window.missing() == sum(highest.values()) + len(highest) - len(seen)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(before=arrivals, after=arrivals)
 def test_restored_window_goes_on_alike(before: list[tuple[int, int, int]], after: list[tuple[int, int, int]]) -> None:
     window = SeenWindow(max_streams=3, max_gaps=5)

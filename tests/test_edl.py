@@ -102,18 +102,66 @@ def test_without_s_it_is_backpropagation(kind: str, feedback: str) -> None:
     assert _relative(single, expected) < 1e-6
 
 
+def _train(network: nn.Sequential, x: Tensor) -> None:
+    """Fit fixed values, by backpropagation, so that weights and Jacobians are no longer those of a new network."""
+    target = torch.linspace(-1, 1, len(x), dtype=x.dtype)[:, None] * torch.arange(1, len(network[-1].bias) + 1)
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3)
+    for _ in range(30):
+        optimizer.zero_grad()
+        (network(x) - target).square().mean().backward()
+        optimizer.step()
+    optimizer.zero_grad()
+
+
+@pytest.mark.parametrize("trained", [False, True])
 @pytest.mark.parametrize(
     ("kind", "actions", "batch"),
-    [("mlp", 2, 64), ("mlp", 3, 16), ("mlp", 18, 4), ("nips2013", 6, 2), ("nature", 4, 2), ("nature", 18, 1)],
-)
-def test_the_equations_by_svd(kind: str, actions: int, batch: int) -> None:
+    [
+        ("mlp", 2, 64), ("mlp", 3, 16), ("mlp", 6, 1), ("mlp", 9, 33), ("mlp", 18, 4),
+        ("nips2013", 2, 5), ("nips2013", 6, 2), ("nature", 2, 3), ("nature", 4, 2), ("nature", 6, 1), ("nature", 18, 1),
+    ],
+)  # fmt: skip
+def test_the_equations_by_svd(kind: str, actions: int, batch: int, trained: bool) -> None:
     network, x, error = _case(kind, actions, batch, seed=3)
-    if actions == 18:  # enough live units that every T(i) has full rank, where B(i) is unique
+    if kind == "mlp":  # enough live units that every T(i) has full rank, where B(i) is unique
         network = build_network(kind, _spec(kind, actions), (128, 128), 3).double()
+    if trained:
+        _train(network, x)
     expected = _reference(network, x, error, 0.3)
     assert _relative(edl_gradients(network, x, error, 0.3), expected) < 1e-6
     single = edl_gradients(network.float(), x.float(), error.float(), 0.3)
     assert _relative(single, expected) < 1e-4
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**31), st.booleans(), st.integers(2, 18), st.integers(1, 64))
+def test_the_equations_on_any_mlp(seed: int, trained: bool, actions: int, batch: int) -> None:
+    network = build_network("mlp", _spec("mlp", actions), (96, 96), seed).double()
+    _, x, error = _case("mlp", actions, batch, seed)
+    if trained:
+        _train(network, x)
+    expected = _reference(network, x, error, 0.7)
+    assert _relative(edl_gradients(network, x, error, 0.7), expected) < 1e-6
+    assert _relative(edl_gradients(network.float(), x.float(), error.float(), 0.7), expected) < 1e-4
+
+
+@pytest.mark.parametrize("actions", [2, 5])
+def test_samples_without_full_rank_leave_the_others_alone(actions: int) -> None:
+    """Inputs of zero make the hidden layers of some samples die; the others still follow the equations."""
+    network, x, error = _case("mlp", actions, 12, seed=5)
+    network = build_network("mlp", _spec("mlp", actions), (128, 128), 5).double()
+    with torch.no_grad():
+        network.get_parameter("fc1.bias").fill_(-0.01)
+        network.get_parameter("fc2.bias").fill_(-0.01)
+        x[::3] = 0
+    b = feedback_matrices(network, x, 0.4)
+    live = [i for i in range(12) if i % 3]
+    expected = _reference(network, x[live], error[live], 0.4)
+    got = edl_gradients(network, x, error, 0.4)
+    dead = edl_gradients(network, x[::3], error[::3], 0.4)
+    assert _relative({name: got[name] - dead[name] for name in got}, expected) < 1e-6
+    for matrices in b.values():
+        assert float(torch.linalg.svdvals(matrices).min()) >= 0.4 * (1 - 1e-3)
 
 
 @settings(max_examples=60)

@@ -254,7 +254,7 @@ ANYTHING = st.recursive(
 
 
 @pytest.mark.parametrize("kind", READERS)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_no_value_raises_anything_else(kind: str, data: st.DataObject) -> None:
     message, read = _valid(kind), READERS[kind][1]

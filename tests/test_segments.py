@@ -101,7 +101,7 @@ def test_continuing_frames_are_stored_once() -> None:
     segment_steps=st.integers(1, 9),
     flush_at=st.integers(0, 40),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_any_pattern_of_restarts_and_cuts_rebuilds(
     stack: int, restarts: list[tuple[bool, bool, int]], segment_steps: int, flush_at: int
 ) -> None:

@@ -90,7 +90,7 @@ def test_proportional_draws_and_weights(alpha: float, beta: float) -> None:
     np.testing.assert_allclose(weights, drawn / drawn.max(), rtol=1e-5)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     capacity=st.sampled_from([1, 5, 16, 17, 40, 300, 5000]),
     updates=st.lists(st.tuples(st.integers(0, 4999), st.floats(0, 1e6)), min_size=1, max_size=60),

@@ -27,7 +27,7 @@ def played(num_envs: int) -> tuple[EnvSpec, Seen]:
     eviction=st.sampled_from(["fifo", "reservoir", "prioritized"]),
     seed=st.integers(0, 2**31),
 )
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 def test_any_draw_shows_what_was_seen(
     num_envs: int, segment_steps: int, share_held: float, eviction: str, seed: int
 ) -> None:

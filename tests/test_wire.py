@@ -115,7 +115,7 @@ def test_a_refusal_is_short() -> None:
     assert len(str(caught.value)) < 200
 
 
-@settings(max_examples=2000, deadline=None)
+@settings(max_examples=2000)
 @given(st.data())
 def test_no_mutation_raises_anything_else(data: st.DataObject) -> None:
     arrays = {"a": np.arange(9, dtype=np.float32), "b": np.zeros((2, 3), np.uint8)}
