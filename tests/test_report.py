@@ -19,6 +19,7 @@ from experiments.report import cli
 from experiments.report.figures import figures
 from experiments.report.measures import breaking_point, improvement, iqm_by_task, running_mean
 from experiments.report.paper import table_1
+from experiments.report.results import breaking_table
 from experiments.report.study import load_study
 from experiments.report.writer import write_report
 from experiments.sweep.grid import load_grid
@@ -100,7 +101,7 @@ def test_settings_and_breaking_points_recomputed(study: Path, report: Path) -> N
     for row in rows(report / "table_breaking_points.csv"):
         small, large = (statistics.fmean(means[row["method"], capacity]) for capacity in (60, 300))
         assert int(row["breaking point"]) == (60 if small >= 0.95 * large else 300)
-        assert float(row["return at largest"]) == pytest.approx(large)
+        assert float(row["return there"]) == pytest.approx(large)
     (better,) = rows(report / "table_improvement.csv")
     wins = [x > y for c in (60, 300) for x in means["coop", c] for y in means["dqn", c]]
     assert (better["x"], better["y"], float(better["P(x > y)"])) == ("coop", "dqn", statistics.fmean(wins))
@@ -163,6 +164,15 @@ def test_one_run_alone(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "Return against buffer size, breaking points: replay.capacity is the same in all finished runs" in text
     assert not (tmp_path / "out" / "buffers.png").exists()
     assert rows(tmp_path / "out" / "table_settings.csv")[0]["IQM low"] == ""
+
+
+def test_without_the_largest_capacity_there_is_no_breaking_point(study: Path, tmp_path: Path) -> None:
+    shutil.copytree(study, tmp_path / "runs")
+    for gone in (tmp_path / "runs").glob("coop-capacity=300-*"):
+        shutil.rmtree(gone)
+    dqn, coop = breaking_table(load_study(tmp_path / "runs")).rows
+    assert (dqn[0], type(dqn[1]), dqn[5]) == ("dqn", int, 300)
+    assert coop == ["coop", None, None, None, None, 300, None, None]
 
 
 def test_what_is_no_study(study: Path, tmp_path: Path) -> None:

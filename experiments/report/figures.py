@@ -64,10 +64,9 @@ def returns_by_steps(study: Study) -> Figure:
 
 
 def q_gap(study: Study) -> Figure:
-    """The norm of Q1 - Q2 against episodes."""
-    figure = _curves(study, "q_gap", "Norm of Q1 - Q2 against episodes", "episodes", "mean norm", q_gaps, log_y=True)
-    text = f"{figure.text} On a fixed batch of states; with dqn and edql, Q2 is the copy that gives the targets."
-    return Figure(figure.name, figure.title, text, figure.counts, figure.panels)
+    """The norm of Q1 - Q2 against episodes, for the methods with two networks that learn."""
+    title, y = "Norm of Q1 - Q2 against episodes", "mean norm on a fixed batch"
+    return _curves(study, "q_gap", title, "episodes", y, q_gaps, _has_gaps, log_y=True)
 
 
 def exploration(study: Study) -> Figure:
@@ -104,7 +103,7 @@ def buffers(study: Study) -> Figure:
                 lines.append(Line(method, np.array(capacities, np.float64), Interval(mean, mean - sd, mean + sd)))
         panels.append(Panel(_without(study, CAPACITY, others), "capacity", "return", lines, marks=True, wide_x=True))
     text = "Mean over runs of the return of the last 100 episodes; error bars: one standard deviation over runs."
-    return Figure("buffers", "Mean return against buffer size", text, counts(study.runs), panels)
+    return Figure("buffers", "Mean return against buffer size", text, counts(study.runs), panels, same_y=True)
 
 
 def diagnostics(study: Study) -> Figure:
@@ -128,7 +127,10 @@ def diagnostics(study: Study) -> Figure:
                     lines.append(Line(method, at, Interval(*map(np.array, ends))))
             title, share = _without(study, CAPACITY, others), name == "evicted_unsampled"
             panels.append(Panel(title, "capacity", words, lines, marks=True, wide_x=True, share=share))
-    text = "Mean over runs, of the second half of each run (share evicted: at its end); bars: least and largest run."
+    text = (
+        "Mean over runs, of the second half of each run (share evicted: at its end); bars: least and largest run. "
+        "With fifo and reservoir the buffer does not depend on the method, and the lines lie on each other."
+    )
     return Figure("diagnostics", "What the buffer hands out", text, counts(study.runs), panels)
 
 
@@ -167,18 +169,27 @@ def aggregates(study: Study) -> list[Figure]:
     ]  # fmt: skip
 
 
-def _curves(study: Study, name: str, title: str, x: str, y: str, curve: Curve, log_y: bool = False) -> Figure:
+def _curves(
+    study: Study,
+    name: str,
+    title: str,
+    x: str,
+    y: str,
+    curve: Curve,
+    usable: Callable[[Run], bool] = lambda run: True,
+    log_y: bool = False,
+) -> Figure:
     settings, panels, used = _panel_settings(study), [], []
     for setting in settings:
         lines = []
         for method in study.methods:
-            runs = [run for run in study.of(method, setting) if name != "q_gap" or len(run.metrics["q_gap"])]
+            runs = [run for run in study.of(method, setting) if usable(run)]
             if runs:
                 lines.append(_line(method, *curve(runs)))
                 used += runs
         if lines:
             panels.append(Panel(label(study, setting), x, y, lines, log_y=log_y))
-    return Figure(name, title, BANDS.strip() + _where(study, settings), counts(used), panels)
+    return Figure(name, title, BANDS.strip() + _where(study, settings), counts(used), panels, same_y=True)
 
 
 def _line(text: str, at: Floats, curves: Floats) -> Line:
@@ -212,6 +223,10 @@ def _where(study: Study, shown: Sequence[Setting]) -> str:
 def _without(study: Study, axis: str, others: Setting) -> str:
     names = [name.rpartition(".")[2] for name in study.axes if name != axis]
     return ", ".join(f"{name} {value}" for name, value in zip(names, others, strict=True))
+
+
+def _has_gaps(run: Run) -> bool:
+    return run.config.two_networks and len(run.metrics["q_gap"]) > 0
 
 
 def _has_lines(figure: Figure) -> bool:

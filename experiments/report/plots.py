@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
@@ -20,6 +21,7 @@ COLOURS = {"dqn": "#E69F00", "edql": "#009E73", "g-coop": "#56B4E9", "coop": "#D
 OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
 COLUMNS = 3  # of panels
 DECADE = 10
+LETTERS = 14  # of small print on an inch
 
 
 @dataclass(frozen=True)
@@ -52,13 +54,17 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Panels; `name` is its files', `text` says how to read it, `counts` how many runs and seeds are in it."""
+    """Panels; `name` is its files', `text` says how to read it, `counts` how many runs and seeds are in it.
+
+    same_y: the panels share their y axis.
+    """
 
     name: str
     title: str
     text: str
     counts: str
-    panels: Sequence[Panel] = field(default_factory=tuple)
+    panels: Sequence[Panel] = ()
+    same_y: bool = False
 
     def points(self) -> ResultTable:
         """Everything that is drawn, as one table."""
@@ -76,16 +82,16 @@ def draw(figure: Figure, path: Path) -> None:
     mpl.use("Agg")
     columns = min(COLUMNS, len(figure.panels))
     rows = math.ceil(len(figure.panels) / columns)
-    canvas, grid = plt.subplots(
-        rows, columns, squeeze=False, figsize=(max(6.4, 4.4 * columns), 3.4 * rows + 0.9), layout="constrained"
-    )
+    size = (max(6.4, 4.4 * columns), 3.4 * rows + 0.9)
+    canvas, grid = plt.subplots(rows, columns, squeeze=False, figsize=size, layout="constrained", sharey=figure.same_y)
     colours: dict[str, str] = dict(COLOURS)
     for axes, panel in zip(grid.flat, figure.panels, strict=False):
         _draw_panel(axes, panel, colours)
     for axes in grid.flat[len(figure.panels) :]:
         axes.axis("off")
     canvas.suptitle(figure.title)
-    canvas.supxlabel(figure.counts, fontsize="small", color="#555555")
+    below = textwrap.fill(figure.counts, round(LETTERS * size[0]))
+    canvas.supxlabel(below, fontsize="small", color="#555555")
     canvas.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(canvas)
 
@@ -118,7 +124,7 @@ def _draw_panel(axes: Axes, panel: Panel, colours: dict[str, str]) -> None:
 
 def _spread_x(axes: Axes, panel: Panel) -> None:
     values = sorted({float(x) for line in panel.lines for x in line.x})
-    if values and values[-1] > DECADE * values[0]:
+    if values and values[-1] >= DECADE * values[0]:
         axes.set_xscale("log")
         axes.set_xticks(values, [f"{value:g}" for value in values], rotation=45)
         axes.minorticks_off()

@@ -18,7 +18,7 @@ from experiments.report.measures import (
 )
 from experiments.report.paper import table_1
 from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
-from experiments.report.study import METHODS, Run, Setting, Study
+from experiments.report.study import METHODS, Floats, Run, Setting, Study
 from experiments.report.table import ResultTable, Value
 
 
@@ -84,22 +84,18 @@ def breaking_table(study: Study) -> ResultTable:
     """The breaking point of each method for each setting of the other axes."""
     place = study.index(CAPACITY)
     assert place is not None
+    largest = max(setting[place] for setting in study.settings)
     rows = []
     for others in other_settings(study, CAPACITY):
         for method in study.methods:
             capacities, scores = along(study, CAPACITY, method, others)
-            if len(capacities) > 1:
-                point = breaking_point(np.array(capacities), scores)
-                runs = sorted({len(each) for each in scores})
-                many = str(runs[0]) if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
-                row = [point.capacity, point.low, point.high, "yes" if point.gaps else "no"]
-                rows.append([*_plain(others), method, *row, float(scores[-1].mean()), capacities[-1], many])
+            rows.append([*_plain(others), method, *_breaking(capacities, scores, largest)])
     names = [axis for axis in study.axes if axis != CAPACITY]
-    columns = [*names, "method", "breaking point", "low", "high", "gaps", "return at largest", "largest", "runs each"]
+    columns = [*names, "method", "breaking point", "low", "high", "gaps", "largest", "return there", "runs each"]
     note = (
         "Breaking point: the smallest capacity with at least 95 % of the return at the largest, by the mean over runs; "
         "low and high: its 95 % bootstrap interval over runs. gaps: some larger capacity falls below 95 %. Where the "
-        "return at the largest is poor, nothing was learnt that could break."
+        "return at the largest is poor, nothing was learnt that could break. Empty: no run at the largest."
     )
     return ResultTable("breaking_points", "Breaking points", columns, rows, note)
 
@@ -146,7 +142,7 @@ def _plain(setting: Setting) -> list[Value]:
 
 
 def _over_runs(runs: Sequence[Run]) -> list[Value]:
-    """mean, sd over runs, sd within a run, IQM, low, high, runs, seeds."""
+    """Give mean, sd over runs, sd within a run, IQM, low, high, runs, seeds."""
     if not runs:
         return [None, None, None, None, None, None, 0, "none"]
     scores = np.array([[score(run)] for run in runs])
@@ -155,6 +151,17 @@ def _over_runs(runs: Sequence[Run]) -> list[Value]:
     within = float(np.mean([spread(run) for run in runs]))
     bounds = [float(interval.low[0]), float(interval.high[0])] if len(runs) > 1 else [None, None]
     return [float(scores.mean()), sd, within, float(interval.value[0]), *bounds, len(runs), seeds_of(runs)]
+
+
+def _breaking(capacities: list[int], scores: list[Floats], largest: int) -> list[Value]:
+    """Give breaking point, low, high, gaps, largest, return there, runs each."""
+    if not capacities or capacities[-1] != largest:
+        return [None, None, None, None, largest, None, None]
+    point = breaking_point(np.array(capacities), scores)
+    runs = sorted({len(each) for each in scores})
+    many = str(runs[0]) if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
+    gaps = "yes" if point.gaps else "no"
+    return [point.capacity, point.low, point.high, gaps, largest, float(scores[-1].mean()), many]
 
 
 def _lengths(runs: Sequence[Run]) -> list[Value]:
