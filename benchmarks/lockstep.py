@@ -13,6 +13,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -55,7 +56,8 @@ def rival() -> Callable[[int], None]:
 
 def ours(method: str, path: Path) -> Callable[[int], None]:
     """Plays that many steps in lockstep, files included."""
-    run = Lockstep(base_config(["--preset", "cartpole", "--method", method, "--learner.no-double"]))
+    config = base_config(["--preset", "cartpole", "--method", method])
+    run = Lockstep(replace(config, learner=replace(config.learner, double=False)))
     directory = RunDirectory(path, run.config)
 
     def play(steps: int) -> None:

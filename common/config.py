@@ -88,6 +88,8 @@ class EdlSettings:
     noise: Literal["constant", "normal"] = "constant"
     """normal: s is the rate times one draw from N(0, 1) per update."""
     feedback: Literal["transform", "weight-gradient", "random"] = "transform"
+    polar_dtype: Literal["float32", "bfloat16"] = "float32"
+    """What the s U V^T part of the transform feedback is computed in; T^T e is float32 always."""
 
 
 @dataclass(frozen=True)
@@ -231,6 +233,14 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
     if replay.start > config.total_steps:
         raise UsageError(f"replay.start = {replay.start}: must not exceed total_steps = {config.total_steps}")
     return config
+
+
+def check_distributed(config: RunConfig) -> None:
+    """Raises UsageError for what only lockstep runs can do: with many actors there is no single play or episode."""
+    if config.learner.swap_by == "plays":
+        raise UsageError("learner.swap_by = 'plays': in lockstep runs only; the roles' processes count updates")
+    if config.learner.reset_role_at_episode:
+        raise UsageError("learner.reset_role_at_episode = True: in lockstep runs only")
 
 
 def to_toml(config: RunConfig) -> str:

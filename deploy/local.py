@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.config import RunConfig, to_toml
+from common.config import RunConfig, check_distributed, to_toml
 from common.environments import env_spec
 from common.errors import RunError, UsageError
 from common.files import write_whole
@@ -128,6 +128,7 @@ def _run() -> None:
     if options.actors < 1:
         raise UsageError(f"--actors {options.actors}: must be at least 1")
     config = options.run_config()
+    check_distributed(config)
     env_spec(config.env)  # refuses what can't be played before anything starts
     directory = options.directory()
     stop = Stop()

@@ -65,7 +65,10 @@ class Agent:
         self.versions = [0, 0]
         trained = self.networks if config.two_networks else self.networks[:1]
         self.optimizers = [make_optimizer(settings, network.flat, network.gradient) for network in trained]
-        self._rules = [FeedbackRule(network.module, config.feedback, config.seed) for network in self.networks]
+        polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
+        self._rules = [
+            FeedbackRule(network.module, config.feedback, config.seed, polar_dtype) for network in self.networks
+        ]
         self._noise = np.random.default_rng([config.seed, 2])
         self._decay = _decay_vector(settings.weight_decay, self.networks[0])
 

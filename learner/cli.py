@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from common.clients import SampleClient
+from common.config import check_distributed
 from common.environments import env_spec
 from common.lifecycle import Stop, run_main
 from common.options import RunOptions, parse_run
@@ -37,6 +38,7 @@ def _run() -> None:
         LearnerOptions, "coop-learner", "Train the networks of a run; everybody else asks this process."
     )
     config = options.run_config()
+    check_distributed(config)
     spec = env_spec(config.env)
     torch.set_num_threads(config.learner.threads)
     stop = Stop()

@@ -190,6 +190,19 @@ def test_lost_rank_is_harmless(seed: int, fault: str, actions: int) -> None:
         assert float(torch.linalg.svdvals(b).min()) >= s * (1 - 1e-3)
 
 
+@pytest.mark.parametrize(("kind", "actions"), [("mlp", 2), ("mlp", 6), ("nature", 4)])
+def test_a_polar_part_in_bfloat16_leaves_the_rest_exact(kind: str, actions: int) -> None:
+    network, x, error = _case(kind, actions, 4, seed=7)
+    network, x, error = network.float(), x.float(), error.float()
+    plain, exact = edl_gradients(network, x, error, 0.0), edl_gradients(network, x, error, 0.5)
+    half = edl_gradients(network, x, error, 0.5, polar_dtype=torch.bfloat16)
+    polar_part = {name: exact[name] - plain[name] for name in plain}
+    rounding = _relative({name: half[name] - plain[name] for name in plain}, polar_part)
+    assert 1e-5 < rounding < 0.03
+    tiny = edl_gradients(network, x, error, 1e-9, polar_dtype=torch.bfloat16)
+    assert _relative(tiny, plain) < 1e-6
+
+
 def test_an_unknown_layer_is_refused_by_name() -> None:
     with pytest.raises(Exception, match="Tanh"):
         edl_gradients(nn.Sequential(nn.Linear(2, 2), nn.Tanh()), torch.zeros(1, 2), torch.zeros(1, 2), 0.1)

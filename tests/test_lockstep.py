@@ -3,6 +3,7 @@
 import subprocess
 import sysconfig
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -56,3 +57,36 @@ def test_resuming_something_else_is_refused(tmp_path: Path) -> None:
         assert done.returncode == 2
         assert done.stderr.count("\n") == 1
         assert "--resume" in done.stderr
+
+
+def test_roles_swap_by_plays_and_start_anew_with_each_episode(tmp_path: Path) -> None:
+    config = base_config(["--method", "coop"])
+    learner = replace(config.learner, swap_by="plays", swap_every=7, reset_role_at_episode=True)
+    run = Lockstep(replace(config, learner=learner))
+    acting, expected, swaps, resets = 0, [], 0, 0
+    seen = []
+    with RunDirectory(tmp_path / "run", run.config) as directory:
+        for step in range(1, 400):
+            episodes = run.telemetry.episodes
+            run.play(directory)
+            seen.append(run.agent.acting)
+            if step % 7 == 0:
+                acting, swaps = 1 - acting, swaps + 1
+            if run.telemetry.episodes > episodes:
+                resets += acting
+                acting = 0
+            expected.append(acting)
+    run.env.close()
+    assert seen == expected
+    assert swaps > 50
+    assert resets > 0
+
+
+@pytest.mark.parametrize("flags", [["--learner.swap-by", "plays"], ["--learner.reset-role-at-episode"]])
+@pytest.mark.parametrize("name", ["coop-learner", "coop-local"])
+def test_roles_in_processes_have_no_plays(name: str, flags: list[str], tmp_path: Path) -> None:
+    command = [Path(COMMAND).with_name(name), *flags, "--run-dir", tmp_path / "run"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 2
+    assert "in lockstep runs only" in result.stderr
+    assert not (tmp_path / "run").exists()
