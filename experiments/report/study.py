@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import RunConfig, load_tables, resolve, to_tables
+from common.config import RunConfig, identity, load_tables, resolve
 from common.errors import RunError, UsageError
 from experiments.sweep.folder import CellFolder
 from experiments.sweep.grid import Grid, load_grid
@@ -163,7 +163,7 @@ def _axes(runs: list[Run]) -> tuple[str, ...]:
     """Fields that differ within a method; what differs between methods alone is part of the method."""
     values: dict[tuple[str, str], set[Any]] = {}
     for run in runs:
-        for name, value in _flat(to_tables(run.config)):
+        for name, value in _flat(identity(run.config)):
             values.setdefault((run.config.method, name), set()).add(value)
     names = dict.fromkeys(name for (_, name), found in values.items() if len(found) > 1)
     return tuple(name for name in names if name not in NOT_AXES)

@@ -8,7 +8,6 @@ import fcntl
 import io
 import json
 import os
-import shutil
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -70,21 +69,9 @@ class CellFolder:
         finally:
             os.close(descriptor)
 
-    def prepare(self, afresh: bool) -> None:
-        """Write the config that the run starts from; `afresh`: first clear away what a torn run has left."""
-        if afresh:
-            for entry in self.path.iterdir():
-                if entry.is_dir():
-                    shutil.rmtree(entry)
-                elif entry.name != "lock":
-                    entry.unlink()
+    def prepare(self) -> None:
+        """Write the config that the run starts from, or goes on with."""
         (self.path / "config.toml").write_text(to_toml(self.cell.config), encoding="utf-8")
-
-    def tidy(self) -> None:
-        """Keep only the last checkpoint of a finished run: a grid's epochs fill disks."""
-        epochs = (self.path / "checkpoints").glob("[0-9]*")
-        for epoch in sorted(epochs, key=lambda path: int(path.name))[:-1]:
-            shutil.rmtree(epoch)
 
     def progress(self) -> Progress:
         """Read from the end of episodes.csv; zeros before the first episode has ended."""

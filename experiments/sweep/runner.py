@@ -12,8 +12,6 @@ from experiments.sweep.grid import GridFile
 
 GRACE = 60.0  # seconds that a run gets to save itself
 RETRY = 1.0  # seconds until a cell that another process holds is tried again
-EPOCHS = 5  # checkpoints of a lockstep run
-LEAST_STEPS = 1000  # between checkpoints
 
 
 @dataclass
@@ -105,7 +103,6 @@ class Runner:
             if run.folder.finished() and status == 0:
                 self.tally.finished += 1
                 self.tally.steps += max(0, run.folder.cell.config.total_steps - run.began)
-                run.folder.tidy()
                 happened.append(f"{name}: return {run.progress.mean_return:.1f}")
             else:
                 why = run.process.why() if status else f"stopped early: {run.folder.outcome() or 'no summary.json'}"
@@ -139,7 +136,7 @@ class Runner:
                     self.tally.elsewhere += 1
                 else:
                     began = folder.progress().step
-                    folder.prepare(afresh=self._grid.mode == "distributed")
+                    folder.prepare()
                     process = ChildProcess(name, self._command(folder), folder.path / "run.log", (lock,))
                     process.start()
                     self.running.append(Running(folder, process, began, Progress(began, 0.0)))
@@ -148,8 +145,8 @@ class Runner:
         return None
 
     def _command(self, folder: CellFolder) -> list[str]:
-        flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}"]
+        # With --resume also at the first start: one that is started again goes on from its newest checkpoint.
+        flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}", "--resume"]
         if self._grid.mode == "distributed":
             return command("coop-local", *flags, f"--actors={self._grid.actors}")
-        every = max(LEAST_STEPS, folder.cell.config.total_steps // EPOCHS)
-        return command("coop-lockstep", *flags, "--resume", f"--checkpoint-every={every}")
+        return command("coop-lockstep", *flags)
