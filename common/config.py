@@ -67,6 +67,8 @@ class LearnerSettings:
     weight_decay: tuple[NonNegative, ...] = ()
     """lambda(i) of each layer, input first; one value holds for all layers; none means 0."""
     device: str = "cpu"
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """bfloat16: targets, and every pass of the gradient methods, with half the bits; parameters stay in float32."""
     threads: Positive = 1
     """CPU threads of torch in the learner."""
     prefetch: Annotated[int, Field(gt=0, le=256)] = 4

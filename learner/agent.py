@@ -60,14 +60,17 @@ class Agent:
         self.spec = spec
         self.device = _device(settings.device)
         self.networks = [make_network(config, spec, number, self.device) for number in (0, 1)]
+        self._halves = self._half_networks()
         self.acting = 0
         self.updates = 0
         self.versions = [0, 0]
         trained = self.networks if config.two_networks else self.networks[:1]
         self.optimizers = [make_optimizer(settings, network.flat, network.gradient) for network in trained]
+        # What is trained on: error-driven feedback needs the accuracy of float32.
+        self._sources = self._halves or self.networks if config.feedback == "none" else self.networks
         polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
         self._rules = [
-            FeedbackRule(network.module, config.feedback, config.seed, polar_dtype) for network in self.networks
+            FeedbackRule(source.module, config.feedback, config.seed, polar_dtype) for source in self._sources
         ]
         self._noise = np.random.default_rng([config.seed, 2])
         self._decay = _decay_vector(settings.weight_decay, self.networks[0])
@@ -79,21 +82,25 @@ class Agent:
         network's with `double`.
         """
         settings, acting = self.config.learner, self.acting
-        network, rule = self.networks[acting], self._rules[acting]
+        network, source, rule = self.networks[acting], self._sources[acting], self._rules[acting]
+        target = (self._halves or self.networks)[1 - acting]
         s = self._draw_s()
         with torch.inference_mode():
             states = self._states(batch)
             obs, next_obs = states[: len(batch)], states[len(batch) :]
             # One pass of the acting network over both where its choice of next actions is asked for.
-            tape = rule.forward(states if settings.double else obs)
-            td_errors, output_error = self._errors(batch, tape.output, self.networks[1 - acting](next_obs))
+            tape = rule.forward((states if settings.double else obs).to(source.flat.dtype))
+            td_errors, output_error = self._errors(batch, tape.output, target(next_obs.to(target.flat.dtype)))
             if settings.double:
                 tape = tape.head(len(batch))
-            rule.backward(tape, output_error, s, network.gradients)
+            rule.backward(tape, output_error.to(source.flat.dtype), s, source.gradients)
+            if source is not network:
+                network.gradient.copy_(source.gradient)
             if self._decay is not None:
                 network.gradient.addcmul_(self._decay, network.flat)
             progress = self.updates / max(1, self.config.planned_updates)
             self.optimizers[acting].step(schedules.learning_rate(settings, progress))
+            self._halve(acting)
         return UpdateResult(td_errors, s, self._count())
 
     def swap(self) -> None:
@@ -102,6 +109,7 @@ class Agent:
             self.acting = 1 - self.acting
         else:
             self.networks[1].load(self.networks[0].flat.detach())
+            self._halve(1)
             self.versions[1] = self.updates
 
     def exploration_rate(self) -> float:
@@ -135,8 +143,9 @@ class Agent:
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue where `state` was taken."""
-        for network, flat in zip(self.networks, state["networks"], strict=True):
-            network.load(flat)
+        for number, flat in enumerate(state["networks"]):
+            self.networks[number].load(flat)
+            self._halve(number)
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
             optimizer.load_state(saved)
         self.acting, self.updates, self.versions = state["acting"], state["updates"], list(state["versions"])
@@ -145,6 +154,16 @@ class Agent:
             **noise,
             "state": {name: int(value) for name, value in noise["state"].items()},
         }
+
+    def _half_networks(self) -> list[FlatNetwork]:
+        """Copies of both networks in bfloat16, kept up by `_halve`; none where all is computed in float32."""
+        if self.config.learner.dtype == "float32":
+            return []
+        return [make_network(self.config, self.spec, number, self.device, torch.bfloat16) for number in (0, 1)]
+
+    def _halve(self, number: int) -> None:
+        if self._halves:
+            self._halves[number].load(self.networks[number].flat.detach())
 
     def _draw_s(self) -> float:
         s = self.exploration_rate()
@@ -164,7 +183,7 @@ class Agent:
         In numpy on the host, whose operations on so few numbers cost a fraction of PyTorch's.
         """
         settings, rows = self.config.learner, np.arange(len(batch))
-        values, next_values = output.cpu().numpy(), next_output.cpu().numpy()
+        values, next_values = output.float().cpu().numpy(), next_output.float().cpu().numpy()
         best = values[len(batch) :].argmax(1) if settings.double else next_values.argmax(1)
         discounts = np.float32(settings.gamma) * ~batch.terminated
         td_errors = values[rows, batch.actions] - (batch.rewards + discounts * next_values[rows, best])
@@ -183,10 +202,12 @@ class Agent:
         return due
 
 
-def make_network(config: RunConfig, spec: EnvSpec, number: int, device: torch.device) -> FlatNetwork:
+def make_network(
+    config: RunConfig, spec: EnvSpec, number: int, device: torch.device, dtype: torch.dtype = torch.float32
+) -> FlatNetwork:
     """Network 0 or 1 of a run as it starts; the same one for both where the method has one and a copy."""
     seed = int(np.random.SeedSequence([config.seed, number if config.two_networks else 0]).generate_state(1)[0])
-    return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device))
+    return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
 
 
 def _device(name: str) -> torch.device:
