@@ -180,3 +180,22 @@ def test_a_restored_agent_goes_on_to_the_bit() -> None:
 def test_a_device_that_is_not_there() -> None:
     with pytest.raises(UsageError, match=r"learner\.device"):
         Agent(_config("dqn", device="nonsense"), SPEC)
+
+
+@pytest.mark.parametrize("method", ["dqn", "g-coop", "edql", "coop"])
+def test_bfloat16_trains_nearly_as_float32_does(method: Method) -> None:
+    exact, half = (Agent(_config(method, dtype=dtype), SPEC) for dtype in ("float32", "bfloat16"))
+    start = [network.snapshot() for network in exact.networks]
+    for number, batch in enumerate(_batches(25)):
+        expected, found = exact.update(batch).td_errors, half.update(batch).td_errors
+        assert number == 0 or not np.array_equal(found, expected), "another precision shows"
+        np.testing.assert_allclose(found, expected, atol=0.1)
+        assert found.dtype == np.float32
+    for before, one, other in zip(start, exact.networks, half.networks, strict=True):
+        went, goes = one.snapshot() - before, other.snapshot() - before
+        assert goes.dtype == np.float32
+        assert went @ goes > 0.95 * np.linalg.norm(went) * np.linalg.norm(goes)
+    resumed = Agent(_config(method, dtype="bfloat16"), SPEC)
+    resumed.load_state(half.state())
+    for batch in _batches(3):
+        np.testing.assert_array_equal(resumed.update(batch).td_errors, half.update(batch).td_errors)
