@@ -17,6 +17,7 @@ import statistics
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -43,9 +44,10 @@ FILLED = 4096  # transitions before the measurements
 Figures = tuple[float, float]  # updates per second, updates per second of processor time
 
 
-def run_config(method: str) -> RunConfig:
+def run_config(method: str, dtype: str) -> RunConfig:
     """Breakout as Mnih played it, with a limiter that never says no."""
     tables = load_tables("breakout", None)
+    tables["learner"] |= {"dtype": dtype}
     tables["replay"] |= {"capacity": 10_000, "start": 1000, "tolerance": 1e12}
     return resolve({**tables, "run": RUN, "total_steps": 10**12}, method)
 
@@ -70,7 +72,7 @@ def bare(config: RunConfig, core: int | None, end: Connection) -> None:
         end.send((updates / spent, updates / (time.thread_time() - processor)))
 
 
-def rival(batch_size: int):  # noqa: ANN201
+def rival(batch_size: int) -> Callable[[], None]:
     """One `DQN.train` step of Stable-Baselines3, with the same network and a filled buffer."""
     import gymnasium  # noqa: PLC0415
     from stable_baselines3 import DQN  # noqa: PLC0415
@@ -162,9 +164,8 @@ class Topology:
         return int(Path(f"/proc/{pid}/task/{pid}/schedstat").read_text().split()[0]) / 1e9
 
 
-def measure(method: str, rounds: int, seconds: float, core: int | None) -> dict[str, list[Figures]]:
+def measure(config: RunConfig, rounds: int, seconds: float, core: int | None) -> dict[str, list[Figures]]:
     """Figures of each round: of a constant batch, of Stable-Baselines3, of the learner."""
-    config = run_config(method)
     figures: dict[str, list[Figures]] = {"constant": [], "sb3": [], "learner": []}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         spawn = multiprocessing.get_context("spawn")
@@ -187,12 +188,15 @@ def main() -> None:
     parser.add_argument("methods", nargs="*", default=["dqn", "coop"])
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement; a stop of 10 s cuts links")
+    parser.add_argument("--dtype", default="float32", help="learner.dtype; Stable-Baselines3 has float32 only")
     parser.add_argument("--core", type=int, help="core of the learner and of those that it is compared with")
     options = parser.parse_args()
     keep_off(options.core)
     for method in options.methods:
-        figures = measure(method, options.rounds, options.seconds, options.core)
-        print(f"{method}, {options.rounds} rounds of {options.seconds:g} s: median (lowest to highest)")
+        figures = measure(run_config(method, options.dtype), options.rounds, options.seconds, options.core)
+        print(
+            f"{method}, {options.dtype}, {options.rounds} rounds of {options.seconds:g} s: median (lowest to highest)"
+        )
         for unit, place in (("updates/s", 0), ("updates/processor s", 1)):
             columns = {name: [pair[place] for pair in pairs] for name, pairs in figures.items()}
             for over, under in (("learner", "constant"), ("constant", "sb3")):
