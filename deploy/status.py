@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
+from common.lifecycle import Stop
 from common.schema import Int, Real, Rule, Text
 from common.schema import Table as TableOf
 from common.transport import Node, open_session
@@ -45,6 +46,7 @@ class RunStatus:
     def __init__(self, run: str, endpoint: str, incarnation: int, zenoh_config: Path | None = None) -> None:
         self._node = Node(open_session((), (endpoint,), zenoh_config), run, "watch", incarnation)
         self._learner = self._node.latest(self._node.key("metrics", "learner", "*"))
+        self._told_at = time.monotonic()
         self.learner: dict[str, Any] = {}
 
     def refresh(self) -> None:
@@ -52,6 +54,15 @@ class RunStatus:
         message = self._learner.take()
         if message is not None and message.kind == "status" and _can_be_shown(message.fields):
             self.learner = dict(message.fields)
+            self._told_at = time.monotonic()
+
+    def silent_for(self) -> float:
+        """Seconds since the learner's last status; since the beginning if there was none."""
+        return time.monotonic() - self._told_at
+
+    def follow_stop(self, stop: Stop) -> None:
+        """Set `stop` when the learner ends the run."""
+        self._node.follow_stop(stop)
 
     def line(self) -> str:
         """The status in one line."""

@@ -18,7 +18,7 @@ from experiments.sweep.cli import main
 from experiments.sweep.grid import load_grid, shipped_grids
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
-TINY = 'methods = ["dqn", "coop"]\n[fixed]\ntotal_steps = 1200\nreplay.capacity = 300\nlearner.swap_every = 10\n'
+TINY = 'methods = ["dqn", "coop"]\n[fixed]\ntotal_steps = 900\nreplay.capacity = 300\nlearner.swap_every = 10\n'
 
 
 def sweep(*flags: str, path: str = os.environ["PATH"]) -> subprocess.CompletedProcess[str]:
@@ -75,6 +75,8 @@ def test_cells_of_the_small_buffers() -> None:
         ("fixed.replay = 5", "replay = 5: must be a table"),
         ('fixed.env.id = "CartPoles-v0"', "CartPoles-v0"),
         ('preset = "catch"', "actor.envs = 4: lockstep cells play one emulator"),
+        ("fixed.total_episodes = 9", "total_episodes = 9: lockstep cells run for total_steps"),
+        ('mode = "distributed"\nfixed.learner.swap_by = "plays"', "learner.swap_by = 'plays': in lockstep runs only"),
         ("a = = 1", "line 1"),
     ],
 )
@@ -145,15 +147,15 @@ def test_interrupted_killed_and_started_again(tmp_path: Path) -> None:
     assert summaries(folder)["dqn-seed=0"] == before
     for path in (first, second):
         log = (path / "run.log").read_text()
-        assert log.count("\ncomplete: 1,200 steps") + log.startswith("complete: 1,200 steps") == 1
+        assert log.count("\ncomplete: 900 steps") + log.startswith("complete: 900 steps") == 1
         episodes = list(csv.DictReader((path / "episodes.csv").read_text().splitlines()))
         assert [int(row["episode"]) for row in episodes] == list(range(len(episodes)))
         assert resolve(tomllib.loads((path / "config.toml").read_text())).replay.capacity == 300
-        assert (path / "checkpoints" / "1072" / "DONE").exists()
+        assert (path / "checkpoints" / "772" / "DONE").exists()
 
 
 def test_a_failing_cell_does_not_stop_the_rest(tmp_path: Path) -> None:
-    (tmp_path / "g.toml").write_text(TINY.replace("1200", "300"))
+    (tmp_path / "g.toml").write_text(TINY.replace("900", "300"))
     broken = tmp_path / "d" / "dqn-seed=0"
     (broken / "metrics.jsonl").mkdir(parents=True)
     done = sweep(str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"))
@@ -165,7 +167,7 @@ def test_a_failing_cell_does_not_stop_the_rest(tmp_path: Path) -> None:
 
 def test_a_job_array_of_distributed_cells(tmp_path: Path) -> None:
     """The submission is to a stand-in for sbatch; the submitted script runs in earnest, as one task would run it."""
-    (tmp_path / "g.toml").write_text(f'mode = "distributed"\n{TINY.replace("1200", "600")}')
+    (tmp_path / "g.toml").write_text(f'mode = "distributed"\n{TINY.replace("900", "600")}')
     flags = (str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--slurm", "--jobs", "7")
     missing = sweep(*flags, path="/nowhere")
     assert missing.returncode == 1

@@ -138,7 +138,7 @@ def aggregates(study: Study) -> list[Figure]:
     """Interquartile means, probabilities of improvement and performance profiles over all shared settings."""
     scores = matrices(study)
     shapes = {name: (*matrix.shape, matrix.size) for name, matrix in scores.items()}
-    seeds = "; ".join(f"{name}: {n} runs, {s} seeds x {t} settings" for name, (s, t, n) in shapes.items())
+    seeds = "; ".join(f"{name}: {n} runs (seeds x settings: {s} x {t})" for name, (s, t, n) in shapes.items())
     means = [
         Line(name, np.array([float(place)]), iqm_overall(matrix)) for place, (name, matrix) in enumerate(scores.items())
     ]

@@ -20,6 +20,7 @@ from common.config import (
     Method,
     Positive,
     RunConfig,
+    check_distributed,
     first_problem,
     load_tables,
     resolve,
@@ -153,7 +154,9 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
         parts = [f"{name}={_word(value)}" for name, value in zip(names, values, strict=True)]
         config = validated({**tables, "method": method, "seed": seed})
         cells.append(Cell("-".join([method, *parts, f"seed={seed}"]), config))
-    _check_environments(file, cells)
+    for cell in cells:
+        check_distributed(cell.config) if file.mode == "distributed" else _check_lockstep(cell.config)
+    _check_environments(cells)
     _check_collisions(cells)
     return tuple(cells)
 
@@ -184,15 +187,20 @@ def _word(value: Any) -> str:  # noqa: ANN401 (a value of any field)
     return re.sub(r"[^A-Za-z0-9.]+", "_", text)
 
 
-def _check_environments(file: GridFile, cells: list[Cell]) -> None:
+def _check_environments(cells: list[Cell]) -> None:
     known: list[EnvSettings] = []
     for cell in cells:
         if cell.config.env not in known:
             env_spec(cell.config.env)  # refuses what can't be played
             known.append(cell.config.env)
-        envs = cell.config.actor.envs
-        if file.mode == "lockstep" and envs != 1:
-            raise UsageError(f"actor.envs = {envs}: lockstep cells play one emulator; put envs = 1 under [fixed.actor]")
+
+
+def _check_lockstep(config: RunConfig) -> None:
+    if config.actor.envs != 1:
+        raise UsageError(f"actor.envs = {config.actor.envs}: lockstep cells play one emulator; fix it to 1")
+    for name in ("total_updates", "total_episodes", "target_return"):
+        if value := getattr(config, name):
+            raise UsageError(f"{name} = {value}: lockstep cells run for total_steps")
 
 
 def _check_collisions(cells: list[Cell]) -> None:

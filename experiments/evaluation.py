@@ -1,0 +1,60 @@
+"""Greedy evaluation: how a saved network plays without exploring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from actors.policy import Policy
+from actors.segments import EpisodeTracker
+from common.config import load_tables, resolve
+from common.environments import make_vector_env
+from common.errors import UsageError
+from learner.agent import make_network
+from learner.epochs import complete_epochs, load_learner
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Returns of full episodes, unclipped, by `network` (1 or 2) of the checkpoint numbered `epoch`."""
+
+    epoch: int
+    network: int
+    returns: list[float]
+
+
+def evaluate(run_dir: Path, episodes: int, seed: int) -> Evaluation:
+    """Play the acting network of a run's newest checkpoint, always with its best action.
+
+    seed: of the emulator; whatever it is, no emulator of the run had the same.
+
+    Raises:
+        UsageError: there is no run in the folder, or no checkpoint of it.
+    """
+    if not (run_dir / "config.toml").is_file():
+        raise UsageError(f"{run_dir}: holds no run")
+    config = resolve(load_tables(None, run_dir / "config.toml"))
+    epochs = complete_epochs(run_dir)
+    if not epochs:
+        raise UsageError(f"{run_dir}: has no complete checkpoint")
+    state = load_learner(run_dir / "checkpoints" / str(epochs[-1]))["agent"]
+    emulator = np.random.SeedSequence([config.seed, 4, seed]).generate_state(1)
+    env = make_vector_env(config.env, 1, int(emulator[0]))
+    networks = [make_network(config, env.spec, number, CPU) for number in (0, 1)]
+    for network, flat in zip(networks, state["networks"], strict=True):
+        network.load(flat)
+    policy = Policy((networks[0], networks[1]), env.spec, np.random.default_rng(seed))
+    policy.acting = state["acting"]
+    obs, tracker = env.reset(), EpisodeTracker(1)
+    returns: list[float] = []
+    while len(returns) < episodes:
+        steps = env.step(policy.act(obs, 0.0))
+        obs = steps.obs
+        returns += [episode.episode_return for episode in tracker.add(steps)]
+    env.close()
+    return Evaluation(epochs[-1], policy.acting + 1, returns)
