@@ -32,6 +32,11 @@ class Broadcaster:
                 self._weights[number] = messages.encode_weights(node.run, number + 1, version, flat)
                 self._published[number] = version
                 node.publish(self._weights_key(number), self._weights[number])
+        self.publish_role()
+
+    def publish_role(self) -> None:
+        """Broadcast who acts, and with which versions of the networks as they were published last."""
+        agent, node = self._agent, self._node
         role = Role(agent.acting + 1, (self._published[0], self._published[1]), agent.updates)
         self._role = messages.encode_role(node.run, role)
         node.publish(node.key("role"), self._role)

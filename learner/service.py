@@ -131,7 +131,7 @@ class LearnerService:
             speed = (self._agent.updates - updates) / (now - then)
             self._speed = (now, self._agent.updates, speed)
         self._status_due = now + STATUS_EVERY
-        self._broadcaster.publish()
+        self._broadcaster.publish_role()
         self._node.publish_status(
             {
                 "env_steps": self._drawn.inserted,
