@@ -35,9 +35,10 @@ def replay_memory(parent: int) -> int:
     return 0
 
 
-def play(preset: str, steps: int, actors: int, folder: Path) -> tuple[Array, str]:
+def play(preset: str, method: str, steps: int, actors: int, folder: Path) -> tuple[Array, str]:
     """(float [n, 2], the time and the replay process's bytes in memory then; the run's last line)."""
-    flags = ["--preset", preset, "--total-steps", str(steps), "--actors", str(actors), "--run-dir", str(folder)]
+    flags = ["--preset", preset, "--method", method, "--total-steps", str(steps)]
+    flags += ["--actors", str(actors), "--run-dir", str(folder)]
     memory = []
     with subprocess.Popen(command("coop-local", *flags), stdout=subprocess.PIPE, text=True) as run:
         while run.poll() is None:
@@ -74,14 +75,15 @@ def report(preset: str, steps: int, folder: Path, memory: Array) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("presets", nargs="*", default=["breakout", "pong", "space-invaders"])
+    parser.add_argument("--method", default="coop")
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--actors", type=int, default=2)
     options = parser.parse_args()
     for preset in options.presets:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "run"
-            memory, last = play(preset, options.steps, options.actors, path)
-            print(f"{preset}: {last}")
+            memory, last = play(preset, options.method, options.steps, options.actors, path)
+            print(f"{preset}, {options.method}: {last}", flush=True)
             report(preset, options.steps, path, memory)
 
 
