@@ -166,7 +166,7 @@ class Bench:
         incarnation = new_incarnation()
         session = open_session((head,), (bare,), shared_memory=shared_memory)
         node = stack.enter_context(Node(session, RUN, "learner", incarnation))
-        Reception(node, CONFIG, ATARI, "")
+        Reception(node, CONFIG, ATARI, "", run_id=0, newest_epoch=lambda: 0)
         flags = ["--run", RUN, "--connect", head, "--listen", replay, "--run-dir", str(folder)]
         service = ChildProcess(
             "replay", command("coop-replay", *flags, *["--shared-memory"] * shared_memory), folder / "log"
