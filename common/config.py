@@ -111,6 +111,10 @@ class ReplaySettings:
     sampling: Literal["uniform", "prioritized"] = "uniform"
     priority_exponent: Share = 0.6
     importance_exponent: Share = 0.4
+    journal: bool = False
+    """Write every accepted segment and every draw to disk before anybody is answered: a kill loses nothing."""
+    journal_keep: bool = False
+    """Keep journal files that an epoch covers, so that the run can be re-executed from its beginning."""
 
 
 @dataclass(frozen=True)
@@ -232,6 +236,8 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
     replay = config.replay
     if replay.start > replay.capacity:
         raise UsageError(f"replay.start = {replay.start}: must not exceed replay.capacity = {replay.capacity}")
+    if replay.journal_keep and not replay.journal:
+        raise UsageError("replay.journal_keep = True: needs replay.journal = True")
     if replay.start > config.total_steps:
         raise UsageError(f"replay.start = {replay.start}: must not exceed total_steps = {config.total_steps}")
     return config

@@ -129,7 +129,8 @@ def _run() -> None:
         "total-steps": options.total_steps,
         "checkpoint-every": options.checkpoint_every,
     }
-    local = command("coop-local", *(f"--{name}={value}" for name, value in flags.items()))
+    settings = (f"--{name}={value}" for name, value in flags.items())
+    local = command("coop-local", *settings, "--replay.journal", "--replay.journal-keep")
     process = ChildProcess("coop-local", local, log)
     process.start()
     started = time.monotonic()

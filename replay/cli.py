@@ -16,6 +16,8 @@ from common.options import RoleOptions
 from common.transport import Node, locators, new_incarnation, open_session
 from replay.core import ReplayCore
 from replay.epochs import ReplayEpochs
+from replay.journal import Journal, journal_files
+from replay.recovery import recover
 from replay.service import ReplayService
 from replay.stats import estimated_bytes
 
@@ -52,19 +54,41 @@ def _run() -> None:
         joined = join(node, stop, request, options.connect, options.join_timeout)
         if joined is not None:
             _check_memory(joined)
-            epochs = ReplayEpochs(options.run_dir, joined.run_id)
-            core = ReplayCore(joined.config, joined.spec)
-            if options.resume:
-                print(epochs.restore(core, joined.epoch), flush=True)
-            elif epochs.any():
-                raise UsageError(f"--run-dir {options.run_dir}: holds a run already; give another, or --resume")
-            service = ReplayService(node, core, epochs)
+            service = _service(node, joined, options)
             service.start()
             membership = Membership(node, stop, request, joined, options.connect, options.patience)
             service.run(stop)
             membership.close()
     if stop.failed:
         raise PeerLost(stop.reason)
+
+
+def _service(node: Node, joined: Joined, options: ReplayOptions) -> ReplayService:
+    """A service that goes on where --run-dir says, or that begins.
+
+    Raises:
+        UsageError: there is a run in --run-dir and --resume was not given, or it is another run.
+        RunError: the journal can't be read or written.
+    """
+    core = ReplayCore(joined.config, joined.spec)
+    folder = options.run_dir / "journal"
+    epochs = ReplayEpochs(options.run_dir, joined.run_id)
+    first, found = 1, "begins with an empty table"
+    if options.resume:
+        first, found = epochs.restore(core, joined.epoch)
+    elif epochs.any() or journal_files(folder):
+        raise UsageError(f"--run-dir {options.run_dir}: holds a run already; give another, or --resume")
+    if joined.config.replay.journal:
+        number, carried_out = recover(core, folder, first, joined.run_id)
+        found = f"{found}; {carried_out}"
+        try:
+            journal = Journal(folder, joined.run_id, number, keep=joined.config.replay.journal_keep)
+        except OSError as error:
+            raise RunError(f"journal in {folder}: {error.strerror or error}") from error
+        core.recorder = journal
+        epochs = ReplayEpochs(options.run_dir, joined.run_id, journal)
+    print(found, flush=True)
+    return ReplayService(node, core, epochs)
 
 
 def _check_memory(joined: Joined) -> None:

@@ -231,8 +231,7 @@ class ReplayCore:
         ]
         self._accounts = {actor: _Account(accepted, acked) for actor, accepted, acked in books["accounts"]}
         self._learners = list(books["learners"])
-        origin = books["limiter"]["origin"]
-        self.limiter = RateLimiter(**{**books["limiter"], "origin": None if origin is None else tuple(origin)})
+        self.limiter = RateLimiter.from_table(books["limiter"])
         self._replies = {drawn.sequence: (batch, drawn) for batch, drawn in replies}
 
     def _follow(self, request: DrawRequest) -> None:

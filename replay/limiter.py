@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import ceil, isfinite
+from typing import Any
 
 from common.errors import UsageError
 
@@ -45,6 +47,11 @@ class RateLimiter:
             raise UsageError(f"start: {self.start:,} transitions, must be at most the total of {self.total:,}")
         if self.capacity is not None and self.start > self.capacity:
             raise UsageError(f"start: {self.start:,} transitions, must be at most the capacity of {self.capacity:,}")
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> RateLimiter:
+        """From `dataclasses.asdict` of one, as it comes back from msgpack."""
+        return cls(**{**table, "origin": None if table["origin"] is None else tuple(table["origin"])})
 
     @property
     def draws_total(self) -> int | None:

@@ -105,6 +105,14 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int) -> Mark:
     return Mark(*state["mark"])
 
 
+def read_mark(path: Path) -> Mark | None:
+    """What the snapshot in `path` belongs to; None where it is torn."""
+    try:
+        return Mark(*_read_state(path / STATE)["mark"])
+    except TornSnapshot:
+        return None
+
+
 def _read_state(path: Path) -> dict[str, Any]:
     try:
         content = path.read_bytes()

@@ -44,7 +44,7 @@ def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
     core, twin = _used_core(spec), ReplayCore(CONFIG, spec)
     base = core.drawn - 2
     _save(core, ReplayEpochs(tmp_path, 5), base)
-    assert "restored epoch" in ReplayEpochs(tmp_path, 5).restore(twin, base)
+    assert "restored epoch" in ReplayEpochs(tmp_path, 5).restore(twin, base)[1]
     for one in (core, twin):
         assert one.insert(make_segment(spec, 14)) == 60, "a repeated delivery is still known"
         assert one.insert(make_segment(spec, 15)) == 64
@@ -70,12 +70,12 @@ def test_torn_parts_are_passed_over_and_old_ones_go(spec: EnvSpec, tmp_path: Pat
     with (parts[30] / "rewards.npy").open("r+b") as file:
         file.seek(-1, 2)
         file.write(b"\7")
-    assert "rewards.npy: size and checksum" in (found := epochs.restore(twin := ReplayCore(CONFIG, spec), 30))
+    assert "rewards.npy: size and checksum" in (found := epochs.restore(twin := ReplayCore(CONFIG, spec), 30)[1])
     assert "restored epoch 20" in found
     assert twin.table.inserted == 60
-    assert epochs.restore(ReplayCore(CONFIG, spec), 19) == "nothing to restore", "the learner is back before it"
+    assert epochs.restore(ReplayCore(CONFIG, spec), 19) == (1, "no epoch to restore"), "the learner is back before it"
     (parts[20] / "state.msgpack").write_bytes(b"")
-    assert "nothing to restore" in epochs.restore(ReplayCore(CONFIG, spec), 20)
+    assert "no epoch to restore" in epochs.restore(ReplayCore(CONFIG, spec), 20)[1]
     (parts[30] / "rewards.npy").unlink()
     with pytest.raises(UsageError, match="belongs to the run with id 5, the learner's has 6"):
         ReplayEpochs(tmp_path, 6).restore(ReplayCore(CONFIG, spec), 30)
