@@ -7,7 +7,7 @@ READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: run test check fuzz netns soak
+.PHONY: run test check fuzz netns soak chaos
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -27,6 +27,9 @@ fuzz: $(READY)
 
 netns: $(READY)
 	@$(BIN)/python benchmarks/netns.py
+
+chaos: $(READY)
+	@$(BIN)/python -m deploy.chaos --run-dir runs/chaos-$(STAMP)
 
 soak: $(READY)
 	@$(BIN)/python benchmarks/soak.py

@@ -6,6 +6,7 @@ import json
 import os
 import random
 import signal
+import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,20 +147,26 @@ def _run() -> None:
         status.close()
         process.interrupt()
         process.end(60)
+    ended = time.monotonic()
     if process.exit_status():
         raise RunError(process.why())
-    _report(options.run_dir, gunner, log.read_text(encoding="utf-8").count("starting it again"), started)
-
-
-def _report(run_dir: Path, gunner: Gunner, restarts: int, started: float) -> None:
-    summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
+    proof = subprocess.run(command("coop-reexecute", str(options.run_dir)), capture_output=True, text=True, check=False)
+    if proof.returncode:
+        raise RunError(proof.stderr.strip())
+    summary = json.loads((options.run_dir / "summary.json").read_text(encoding="utf-8"))
     killed = ", ".join(f"{count} {name.removeprefix('coop-')}" for name, count in gunner.kills.items())
-    print(f"kills                 {sum(gunner.kills.values())} ({killed})")
-    print(f"transitions accepted  {summary['transitions_accepted']:,}")
-    print(f"lost                  {summary['transitions_lost']}")
-    print(f"restarts              {restarts}")
-    print(f"longest stall         {gunner.longest_stall:.1f} s")
-    print(f"wall time             {time.monotonic() - started:.0f} s")
+    restarts = log.read_text(encoding="utf-8").count("starting it again")
+    for name, value in {
+        "kills": f"{sum(gunner.kills.values())} ({killed})",
+        "transitions accepted": f"{summary['transitions_accepted']:,}",
+        "lost": summary["transitions_lost"],
+        "duplicated": 0,  # else coop-reexecute would have failed
+        "restarts": restarts,
+        "longest stall": f"{gunner.longest_stall:.1f} s",
+        "wall time": f"{ended - started:.0f} s",
+        "re-executed": proof.stdout.strip(),
+    }.items():
+        print(f"{name:22}{value}")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from common.options import RunOptions, parse_run
 from common.transport import Node, locators, new_incarnation, open_session
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
-from learner.epochs import load_learner, newest_epoch
+from learner.epochs import go_back
 from learner.reception import Reception
 from learner.run_directory import RunDirectory
 from learner.service import LearnerService
@@ -45,8 +45,7 @@ def _run() -> None:
     stop.on_signals()
     path = options.directory()
     agent = Agent(config, spec)
-    epoch = newest_epoch(path) if options.resume else None
-    state = None if epoch is None else load_learner(epoch)
+    state = go_back(path) if options.resume else None
     if state is not None:
         agent.load_state(state["agent"])
     incarnation = new_incarnation()

@@ -55,16 +55,24 @@ def complete_epochs(run_dir: Path) -> list[int]:
 
 
 def newest_epoch(run_dir: Path) -> Path | None:
-    """The epoch to go on from: the newest that is finished and whole; newer ones are torn, and are dropped."""
+    """The newest epoch that was finished and whose learner.pt is as it was written; None if there is none."""
     for number in reversed(complete_epochs(run_dir)):
         path = run_dir / "checkpoints" / str(number)
         try:
             if json.loads((path / DONE).read_text(encoding="utf-8")) == {LEARNER: list(measure(path / LEARNER))}:
                 return path
         except (OSError, ValueError):
-            pass
-        shutil.rmtree(path, ignore_errors=True)
+            continue
     return None
+
+
+def go_back(run_dir: Path) -> dict[str, Any] | None:
+    """The learner's state of the newest epoch, if there is one; what is newer is torn, and dropped."""
+    path = newest_epoch(run_dir)
+    for number in complete_epochs(run_dir):
+        if path is None or number > int(path.name):
+            shutil.rmtree(run_dir / "checkpoints" / str(number), ignore_errors=True)
+    return None if path is None else load_learner(path)
 
 
 def load_learner(path: Path) -> dict[str, Any]:

@@ -21,6 +21,7 @@ EPISODE_FIELDS = (
     "episode", "env_step", "update", "actor", "stream", "return", "length",
     "epsilon", "s", "q1_mean", "q2_mean", "param_version",
 )  # fmt: skip
+RUN_ID = "run-id"
 
 
 class RunDirectory:
@@ -46,13 +47,13 @@ class RunDirectory:
 
     def run_id(self) -> int:
         """The random id of this run, drawn when it began, which tells it from others of its name; raises RunError."""
-        path = self.path / "run-id"
+        path = self.path / RUN_ID
         try:
             if not path.exists():
                 write_whole(path, f"{secrets.randbits(63)}\n".encode())
-            return int(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except OSError as error:
             raise RunError(f"{path}: {error}") from error
+        return read_run_id(self.path)
 
     def episode(self, number: int, record: EpisodeRecord, update: int, s: float) -> None:
         """Add a line to episodes.csv."""
@@ -96,3 +97,12 @@ class RunDirectory:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def read_run_id(run_dir: Path) -> int:
+    """The id of the run in a directory; raises RunError."""
+    path = run_dir / RUN_ID
+    try:
+        return int(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: {error}") from error

@@ -115,6 +115,11 @@ class ReplayCore:
         return sum(max(0, account.acked - account.accepted) for account in self._accounts.values())
 
     @property
+    def holes(self) -> int:
+        """Segments that have not come although later ones of their stream have."""
+        return self._seen.missing()
+
+    @property
     def episodes_booked(self) -> int:
         """Episodes that ended so far."""
         return self._first_episode + len(self._episodes)
@@ -212,6 +217,10 @@ class ReplayCore:
         }
         replies = [reply for sequence, reply in self._replies.items() if sequence >= base]
         return CoreSnapshot(books, self.table.snapshot(), replies)
+
+    def repeatable(self) -> list[tuple[Batch, Drawn]]:
+        """The draws that the learner may ask for again."""
+        return list(self._replies.values())
 
     def restore(
         self,

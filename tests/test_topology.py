@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from experiments.reexecute import reexecute
 from learner.epochs import load_learner
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
@@ -107,9 +108,11 @@ def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, 
 def test_coop_local_end_to_end(tmp_path: Path) -> None:
     path = tmp_path / "run"
     flags = ("--preset", "cartpole", "--actors", "2", "--seed", "3", "--total-steps", "1500", "--run-dir", str(path))
-    done = run("coop-local", *flags)
+    done = run("coop-local", *flags, "--replay.journal", "--checkpoint-every", "500")
     assert (done.returncode, done.stderr) == (0, "")
     check_files(path, 1500)
+    again = reexecute(path)
+    assert (again.began, again.updates, again.holes) == (1000, 1372, 0)
     again = run("coop-local", *flags)
     assert again.returncode == 2
     assert again.stderr.count("\n") == 1
@@ -168,7 +171,8 @@ def test_ctrl_c_a_killed_actor_and_resume(tmp_path: Path) -> None:
 
 
 def test_a_role_that_gives_up_ends_the_run_and_is_named(tmp_path: Path) -> None:
-    done = run("coop-local", "--replay.capacity", str(10**12), "--run-dir", str(tmp_path / "run"))
+    huge = str(10**12)
+    done = run("coop-local", "--replay.capacity", huge, "--total-steps", huge, "--run-dir", str(tmp_path / "run"))
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "replay ended (exit status 1)" in done.stderr

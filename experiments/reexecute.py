@@ -1,0 +1,134 @@
+"""Trains a distributed run's learner once more from its journal, in one process, and compares the parameters."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from common.config import RunConfig, load_tables, resolve
+from common.environments import env_spec
+from common.errors import RunError, UsageError
+from common.experience import DrawRequest
+from common.types import Batch
+from learner.agent import Agent
+from learner.epochs import complete_epochs, load_learner, newest_epoch
+from learner.run_directory import read_run_id
+from replay.core import ReplayCore
+from replay.epochs import ReplayEpochs
+from replay.journal import DRAW, TornFile, journal_files, read_draw, read_file
+from replay.recovery import carry_out, following_files
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a re-execution gave.
+
+    began: update that it began at; 0 where the journal reaches back to the beginning of the run.
+    holes: segments that are not in the journal although later ones of their stream are.
+    digest: SHA-256 over both networks' parameters.
+    """
+
+    began: int
+    updates: int
+    transitions: int
+    holes: int
+    digest: str
+
+
+def reexecute(run_dir: Path) -> Outcome:
+    """Carry out the journal of `run_dir` from as far back as it goes, with every update of the learner.
+
+    The batches that count are those of the learner that lived on: where one came back from an epoch and drew a batch
+    again, the last draw of that number.
+
+    Raises:
+        UsageError: there is no run with a journal and a finished epoch in the folder.
+        RunError: the journal is not whole, holds a segment twice or other transitions than the summary says, or
+            parameters, optimizers or random state differ in any bit.
+    """
+    config = resolve(load_tables(None, run_dir / "config.toml"))
+    final, folder, run_id = newest_epoch(run_dir), run_dir / "journal", read_run_id(run_dir)
+    if final is None or not journal_files(folder):
+        raise UsageError(f"{run_dir}: no journal and finished epoch here; was the run started with --replay.journal?")
+    expected = load_learner(final)["agent"]
+    torch.set_num_threads(config.learner.threads)
+    agent, core, first = _beginning(config, run_dir, folder, run_id)
+    began = agent.updates
+    files = following_files(folder, first)
+    counts = _last_draws(folder, files, run_id)
+    waiting = {drawn.sequence: batch for batch, drawn in core.repeatable() if drawn.sequence not in counts}
+    for place, (request, batch) in enumerate(_draws(core, folder, files, run_id)):
+        if counts[request.sequence] == place:
+            waiting[request.sequence] = batch
+        while agent.updates < expected["updates"] and agent.updates in waiting:
+            agent.update(waiting.pop(agent.updates))
+    if agent.updates < expected["updates"]:
+        raise RunError(f"{folder}: lacks batch {agent.updates} of {expected['updates']}")
+    if problem := _difference(agent.state(), expected, "agent"):
+        raise RunError(f"{problem} differs from {final}")
+    summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
+    if summary["transitions_accepted"] != core.table.inserted:
+        accepted = summary["transitions_accepted"]
+        raise RunError(f"{folder}: {core.table.inserted:,} transitions, but the run accepted {accepted:,}")
+    digest = hashlib.sha256(b"".join(network.snapshot().tobytes() for network in agent.networks)).hexdigest()
+    return Outcome(began, agent.updates, core.table.inserted, core.holes, digest)
+
+
+def _beginning(config: RunConfig, run_dir: Path, folder: Path, run_id: int) -> tuple[Agent, ReplayCore, int]:
+    """Agent and core as they were at the first file of the journal, or at the oldest epoch that it continues."""
+    spec = env_spec(config.env)
+    agent, core = Agent(config, spec), ReplayCore(config, spec)
+    files = journal_files(folder)
+    if files[0] == 1:
+        return agent, core, 1
+    for number in complete_epochs(run_dir):
+        first, _ = ReplayEpochs(run_dir, run_id).restore(core, number)
+        if first in files:
+            agent.load_state(load_learner(run_dir / "checkpoints" / str(number))["agent"])
+            return agent, core, first
+        core = ReplayCore(config, spec)
+    raise RunError(f"{folder}: begins at file {files[0]}, and no epoch goes before it")
+
+
+def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:
+    """For each number of a batch, which draw of the journal was the last one of that number."""
+    last: dict[int, int] = {}
+    place = 0
+    for number in files:
+        try:
+            for kind, payload in read_file(folder, number, run_id):
+                if kind == DRAW:
+                    last[read_draw(payload)[0].sequence] = place
+                    place += 1
+        except TornFile:
+            if number != files[-1]:  # a kill leaves half a record at the end of the journal, and nowhere else
+                raise
+    return last
+
+
+def _draws(core: ReplayCore, folder: Path, files: list[int], run_id: int) -> Iterator[tuple[DrawRequest, Batch]]:
+    for number in files:
+        try:
+            yield from carry_out(core, folder, number, run_id)
+        except TornFile:
+            if number != files[-1]:
+                raise
+
+
+def _difference(mine: Any, theirs: Any, name: str) -> str | None:  # noqa: ANN401 (nested state)
+    """The first place in which nested states differ in any bit."""
+    if isinstance(mine, torch.Tensor):
+        return None if torch.equal(mine, theirs) else name
+    if isinstance(mine, dict):
+        pairs = [(mine[key], theirs[key], f"{name}.{key}") for key in mine]
+    elif isinstance(mine, list | tuple):
+        pairs = [(a, b, f"{name}[{i}]") for i, (a, b) in enumerate(zip(mine, theirs, strict=True))]
+    else:
+        return None if mine == theirs else name
+    return next((found for a, b, at in pairs if (found := _difference(a, b, at))), None)

@@ -1,0 +1,35 @@
+"""`coop-reexecute RUN_DIR`: does the journal of a run lead to its parameters, bit for bit?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from common import cli
+from common.lifecycle import run_main
+from experiments.reexecute import reexecute
+
+
+@dataclass(frozen=True)
+class ReexecuteOptions:
+    """Flags of `coop-reexecute`."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Folder of a finished run with a journal (--replay.journal; with --replay.journal-keep from its beginning)."""
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop-reexecute", _run)
+
+
+def _run() -> None:
+    options = cli.parse(ReexecuteOptions, "coop-reexecute", "Train a run's learner again from the run's journal.")
+    outcome = reexecute(options.run_dir)
+    print(
+        f"updates {outcome.began:,} to {outcome.updates:,} on {outcome.transitions:,} transitions, none twice, "
+        f"{outcome.holes} segments missing: parameters, optimizers and random state equal the run's, bit for bit "
+        f"(sha256 {outcome.digest})"
+    )

@@ -1,0 +1,24 @@
+"""A short run under fire (`make chaos` is the long one), and what its journal proves."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_four_kills(tmp_path: Path) -> None:
+    flags = ["--kills=4", "--total-steps=2000", "--checkpoint-every=400", "--longest-pause=1", "--give-up=100"]
+    done = subprocess.run(
+        [sys.executable, "-m", "deploy.chaos", f"--run-dir={tmp_path / 'run'}", *flags],
+        capture_output=True,
+        text=True,
+        timeout=115,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    told = dict(re.split(r" {2,}", line, maxsplit=1) for line in done.stdout.splitlines())
+    assert told["kills"].startswith("4 (")
+    assert told["lost"] == "0"
+    assert told["duplicated"] == "0"
+    assert told["restarts"] == "4"
+    assert "bit for bit" in told["re-executed"]

@@ -1,0 +1,132 @@
+"""The journal: what was acknowledged is there after a kill, torn ends are cut, a full disk loses nothing."""
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from samples import make_segment
+from test_epochs import CONFIG, save
+
+from common import experience
+from common.errors import RunError, UsageError
+from common.experience import DrawRequest
+from common.types import EnvSpec
+from replay.core import ReplayCore, Wait
+from replay.epochs import ReplayEpochs
+from replay.journal import Journal, journal_files
+from replay.recovery import recover
+
+
+def _insert(core: ReplayCore, spec: EnvSpec, sequence: int) -> int | Wait:
+    segment = make_segment(spec, sequence, acked=4 * sequence)
+    return core.insert(segment, bytes(experience.encode_segment("test", segment)))
+
+
+def _draw(core: ReplayCore) -> bool:
+    return not isinstance(core.draw(DrawRequest(1, core.drawn, max(0, core.drawn - 2), 4, 0)), Wait)
+
+
+def _use(core: ReplayCore, spec: EnvSpec, sequences: range) -> None:
+    for sequence in sequences:
+        assert not isinstance(_insert(core, spec, sequence), Wait)
+        while _draw(core):
+            pass
+
+
+def _assert_alike(core: ReplayCore, twin: ReplayCore) -> None:
+    first, second = core.snapshot(0), twin.snapshot(0)
+    assert first.books == second.books
+    assert first.table.meta == second.table.meta
+    for name, array in first.table.arrays.items():
+        np.testing.assert_array_equal(array, second.table.arrays[name])
+    assert {reply[1] for reply in first.replies} <= {reply[1] for reply in second.replies}
+
+
+def test_a_kill_loses_nothing(spec: EnvSpec, tmp_path: Path) -> None:
+    core = ReplayCore(CONFIG, spec, Journal(tmp_path, 5, 1, keep=False))
+    _use(core, spec, range(5))
+    core.limit(core.limiter.changed(core.table.inserted, core.drawn, ratio=0.5))
+    _use(core, spec, range(5, 9))
+    with (tmp_path / "00000001.log").open("ab") as file:
+        file.write(b"half a record, longer than its header")
+    twin = ReplayCore(CONFIG, spec)
+    number, found = recover(twin, tmp_path, 1, 5)
+    assert (number, found) == (2, f"36 transitions and {core.drawn} batches from the journal")
+    _assert_alike(core, twin)
+    twin.recorder = Journal(tmp_path, 5, number, keep=False)
+    _use(twin, spec, range(9, 12))
+    third = ReplayCore(CONFIG, spec)
+    assert recover(third, tmp_path, 1, 5)[0] == 3, "the torn end was cut, and what follows is found"
+    _assert_alike(twin, third)
+    with pytest.raises(UsageError, match="belongs to the run with id 5, the learner's has 6"):
+        recover(ReplayCore(CONFIG, spec), tmp_path, 1, 6)
+    content = bytearray((tmp_path / "00000001.log").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "00000001.log").write_bytes(content)
+    with pytest.raises(RunError, match=r"00000001.log: no whole record at byte \d+"):
+        recover(ReplayCore(CONFIG, spec), tmp_path, 1, 5)
+    (tmp_path / "00000001.log").unlink()
+    with pytest.raises(RunError, match=r"has files \[2\], should have every one from 1 on"):
+        recover(ReplayCore(CONFIG, spec), tmp_path, 1, 5)
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_files_that_epochs_cover(keep: bool, spec: EnvSpec, tmp_path: Path) -> None:
+    folder = tmp_path / "journal"
+    journal = Journal(folder, 5, 1, keep=keep)
+    core, epochs = ReplayCore(CONFIG, spec, journal), ReplayEpochs(tmp_path, 5, journal)
+    for turn in range(4):
+        _use(core, spec, range(3 * turn, 3 * turn + 3))
+        save(core, epochs, turn, turn - 1)
+    _use(core, spec, range(12, 14))
+    assert journal_files(folder) == ([1, 2, 3, 4, 5] if keep else [4, 5]), "those since the older epoch that is kept"
+    (tmp_path / "checkpoints" / "3" / "replay" / "state.msgpack").write_bytes(b"torn")
+    twin = ReplayCore(CONFIG, spec)
+    first, _ = ReplayEpochs(tmp_path, 5).restore(twin, 3)
+    assert first == 4
+    assert recover(twin, folder, first, 5)[0] == 6
+    _assert_alike(core, twin)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 256 KiB."""
+    if os.geteuid():
+        pytest.skip("mounting a small file system needs root")
+    path = tmp_path / "disk"
+    path.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(path)], check=True)
+    try:
+        yield path
+    finally:
+        subprocess.run(["umount", "--lazy", str(path)], check=True)
+
+
+def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
+    journal = Journal(small_disk / "journal", 5, 1, keep=True)
+    core, epochs = ReplayCore(CONFIG, spec, journal), ReplayEpochs(small_disk, 5, journal)
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(220_000))
+    sequence = 0
+    while not isinstance(outcome := _insert(core, spec, sequence), Wait):
+        sequence += 1
+        while core.drawn < core.table.inserted - CONFIG.replay.start:
+            assert _draw(core)
+    assert outcome.reason == "the journal can't be written: No space left on device"
+    assert core.inserts_wait_for == outcome.reason
+    before = core.drawn
+    while _draw(core):
+        pass
+    assert core.drawn > before, "training goes on as far as the limiter lets it"
+    with pytest.raises(RunError, match="No space left on device"):
+        save(core, epochs, 1)
+    assert isinstance(_insert(core, spec, sequence), Wait)
+    filler.unlink()
+    assert _insert(core, spec, sequence) == 4 * sequence + 4
+    twin = ReplayCore(CONFIG, spec)
+    recover(twin, small_disk / "journal", 1, 5)
+    _assert_alike(core, twin)
+    save(core, epochs, 2)
