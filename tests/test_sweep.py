@@ -1,6 +1,7 @@
 """Sweeps: bad grids are refused, kills and Ctrl-C lose nothing, failures are listed, job arrays run the same cells."""
 
 import csv
+import fcntl
 import json
 import os
 import signal
@@ -154,14 +155,28 @@ def test_interrupted_killed_and_started_again(tmp_path: Path) -> None:
         assert (path / "checkpoints" / "772" / "DONE").exists()
 
 
-def test_a_failing_cell_does_not_stop_the_rest(tmp_path: Path) -> None:
+def test_a_failing_cell_does_not_stop_the_rest_and_one_that_another_process_runs_is_left_to_it(tmp_path: Path) -> None:
     (tmp_path / "g.toml").write_text(TINY.replace("900", "300"))
-    broken = tmp_path / "d" / "dqn-seed=0"
+    broken, taken = tmp_path / "d" / "dqn-seed=0", tmp_path / "d" / "coop-seed=0"
     (broken / "metrics.jsonl").mkdir(parents=True)
-    done = sweep(str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"))
-    assert done.returncode == 1
-    assert done.stderr == "coop-sweep: error: 1 of 2 cells failed; the same command tries them again\n"
-    assert "failed: dqn-seed=0: dqn-seed=0 ended (exit status 1): coop-lockstep: error: run directory" in done.stdout
+    taken.mkdir()
+    command = [str(SCRIPTS / "coop-sweep"), str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--jobs", "2"]
+    with (
+        (taken / "lock").open("w") as lock,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+    ):
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert process.stdout is not None
+        lines = [process.stdout.readline(), process.stdout.readline()]
+        assert lines[1].startswith(
+            "dqn-seed=0: FAILED, dqn-seed=0 ended (exit status 1): coop-lockstep: error: run dir"
+        )
+        assert [path.name for path in taken.iterdir()] == ["lock"]
+        lock.close()
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert err == "coop-sweep: error: 1 of 2 cells failed; the same command tries them again\n"
+    assert "failed: dqn-seed=0: dqn-seed=0 ended (exit status 1): coop-lockstep: error: run directory" in out
     assert list(summaries(tmp_path / "d")) == ["coop-seed=0"]
 
 
