@@ -75,7 +75,7 @@ class Topology:
         session = open_session((head,), (replay,))
         self._node = stack.enter_context(Node(session, RUN, "learner", new_incarnation()))
         agent = Agent(config, spec)
-        Reception(self._node, config, spec, agent.networks[0].layout_digest())
+        Reception(self._node, config, spec, agent.networks[0].layout_digest(), 0, lambda: 0)
         Broadcaster(self._node, agent)
         joining = ["--run", RUN, "--connect", head]
         service = command("coop-replay", *joining, "--listen", replay, "--run-dir", str(folder))
@@ -93,7 +93,7 @@ class Topology:
         """What the actor inserts, from one change of the count to another."""
         self._actor.send_signal(signal.SIGCONT)
         changes = [(time.perf_counter(), self._inserted())]
-        while changes[-1][0] - changes[0][0] < seconds:
+        while len(changes) < 4 or changes[-1][0] - changes[0][0] < seconds:
             time.sleep(0.005)
             if (count := self._inserted()) != changes[-1][1]:
                 changes.append((time.perf_counter(), count))
