@@ -51,9 +51,17 @@ def join(
         if time.monotonic() > deadline:
             where = ", ".join(connect) or "no endpoint (give --connect)"
             missing = "replay service" if answered else "learner"
-            raise JoinError(f"no {missing} of run {node.run!r} found at {where} within {timeout:g} s")
+            text = f"no {missing} of run {node.run!r} found at {where} within {timeout:g} s"
+            others = [] if answered else other_runs(node)
+            raise JoinError(f"{text}; there is run {', '.join(map(repr, others))}" if others else text)
         stop.wait(RETRY_PAUSE)
     return None
+
+
+def other_runs(node: Node) -> list[str]:
+    """Names of the runs whose learners this process is connected to."""
+    tokens = node.session.liveliness().get("coop/*/alive/learner/*", timeout=1.0)
+    return sorted({str(reply.ok.key_expr).split("/")[1] for reply in tokens if reply.ok is not None})
 
 
 class Membership:

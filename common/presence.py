@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 
 import zenoh
 
@@ -27,9 +28,14 @@ class Presence:
         self._there: set[str] = set()
         self._gone: dict[str, float] = {}  # since when
         self._lock = threading.Lock()
+        self._on_change: Callable[[], None] = lambda: None
         self._began = time.monotonic()
         for role in ROLES:  # one subscriber each: access control may let a process see some roles only
             session.liveliness().declare_subscriber(f"{prefix}/{role}/*", self._tell, history=True)
+
+    def on_change(self, call: Callable[[], None]) -> None:
+        """Have `call` called whenever somebody comes or goes, in a thread of Zenoh's."""
+        self._on_change = call
 
     def counts(self) -> dict[str, int]:
         """How many processes of each role are connected."""
@@ -62,8 +68,9 @@ class Presence:
             if sample.kind == zenoh.SampleKind.DELETE:
                 self._there.discard(name)
                 self._gone[name] = time.monotonic()
-                return
-            self._there.add(name)
-            role = f"{name.split('/')[0]}/"
-            replaced = name if name in self._gone else next((old for old in self._gone if old.startswith(role)), "")
-            self._gone.pop(replaced, None)
+            else:
+                self._there.add(name)
+                role = f"{name.split('/')[0]}/"
+                replaced = name if name in self._gone else next((old for old in self._gone if old.startswith(role)), "")
+                self._gone.pop(replaced, None)
+        self._on_change()

@@ -266,19 +266,20 @@ class Latest:
 
 
 def _answer(reply: zenoh.Reply) -> Message:
-    if reply.ok is not None:
-        try:
-            return wire.decode(reply.ok.payload.to_bytes())
-        except BadMessage as error:
-            raise NoAnswer(f"an answer that can't be read: {error}") from error
-    failure = reply.err
-    assert failure is not None
-    raw = failure.payload.to_bytes()
+    part = reply.ok or reply.err
+    assert part is not None
+    raw = part.payload.to_bytes()
     try:
-        problem = messages.decode_error(wire.decode(raw))
-    except BadMessage:
-        raise NoAnswer(raw.decode(errors="replace") or "no answer") from None
-    raise Refused(problem)
+        message = wire.decode(raw)
+        problem = None if reply.ok is not None else messages.decode_error(message)
+    except BadMessage as error:
+        if error.field == "protocol":  # asking again would not help
+            raise Refused(str(error)) from error
+        text = f"an answer that can't be read: {error}" if reply.ok is not None else raw.decode(errors="replace")
+        raise NoAnswer(text) from error
+    if problem is not None:
+        raise Refused(problem)
+    return message
 
 
 def _first_line(error: Exception) -> str:

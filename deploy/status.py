@@ -13,7 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 
 from common.lifecycle import Stop
-from common.schema import Int, Real, Rule, Text
+from common.schema import Int, ListOf, Real, Rule, Text
 from common.schema import Table as TableOf
 from common.transport import Node, open_session
 
@@ -30,6 +30,7 @@ _SHOWN: dict[str, Rule] = {
     "s": Real(),
     "waiting": Text(),
     "connected": TableOf(),
+    "missing": ListOf(Text(128)),
 }
 
 PLAIN_EVERY = 5.0  # seconds between lines where the output is no terminal
@@ -76,6 +77,11 @@ class RunStatus:
         )
         return f"{text}  [{told['waiting']}]" if told.get("waiting") else text
 
+    def missing(self) -> list[str]:
+        """Processes that have gone and that nobody has replaced."""
+        lost = [name for name in self._node.presence.missing() if name.startswith("learner")]
+        return lost or list(self.learner.get("missing", []))
+
     def connected(self) -> str:
         """Who is connected, in words."""
         counts = self.learner.get("connected", {})
@@ -98,6 +104,7 @@ class Display:
         self._console = Console()
         self._live = Live(console=self._console, refresh_per_second=4, transient=True)
         self._due = time.monotonic() + PLAIN_EVERY
+        self._missing: list[str] = []
 
     def __enter__(self) -> Display:
         if self._console.is_terminal:
@@ -110,6 +117,10 @@ class Display:
     def update(self) -> None:
         """Show what the status says now."""
         self._status.refresh()
+        missing = self._status.missing()
+        for name in set(missing) - set(self._missing):
+            self.say(f"{name} does not answer")
+        self._missing = missing
         if self._console.is_terminal:
             self._live.update(self._panel())
         elif time.monotonic() >= self._due:

@@ -54,6 +54,9 @@ class LearnerService:
         self._drawn = NOTHING_DRAWN
         self._started = time.monotonic()
         self._status_due = 0.0
+        self._status: dict[str, Any] = {}
+        self._missing: list[str] = []
+        node.presence.on_change(self._look_round)
         self._speed = (self._started, agent.updates, 0.0)
         if state is not None:
             self._telemetry.load_state(state["telemetry"])
@@ -132,22 +135,31 @@ class LearnerService:
             self._speed = (now, self._agent.updates, speed)
         self._status_due = now + STATUS_EVERY
         self._broadcaster.publish_role()
-        self._node.publish_status(
-            {
-                "env_steps": self._drawn.inserted,
-                "total_steps": self._config.total_steps,
-                "updates": self._agent.updates,
-                "updates_per_s": speed,
-                "acting": self._agent.acting + 1,
-                "episodes": self._telemetry.episodes,
-                "return_mean_100": self._telemetry.return_mean,
-                "epsilon": self._epsilon(),
-                "s": self._agent.exploration_rate(),
-                "waiting": self._samples.waiting,
-                "bad_messages": self._node.bad_messages,
-                "connected": self._node.presence.counts(),
-            }
-        )
+        self._status = {
+            "env_steps": self._drawn.inserted,
+            "total_steps": self._config.total_steps,
+            "updates": self._agent.updates,
+            "updates_per_s": speed,
+            "acting": self._agent.acting + 1,
+            "episodes": self._telemetry.episodes,
+            "return_mean_100": self._telemetry.return_mean,
+            "epsilon": self._epsilon(),
+            "s": self._agent.exploration_rate(),
+            "waiting": self._samples.waiting,
+            "bad_messages": self._node.bad_messages,
+            "connected": self._node.presence.counts(),
+            "missing": self._node.presence.missing(),
+        }
+        self._node.publish_status(self._status)
+
+    def _look_round(self) -> None:
+        """Name those who have gone at once: the loop may be waiting for one of them."""
+        missing = self._node.presence.missing()
+        for name in set(missing) - set(self._missing):
+            print(f"{name} does not answer", flush=True)
+        if self._status and missing != self._missing:
+            self._node.publish_status({**self._status, "connected": self._node.presence.counts(), "missing": missing})
+        self._missing = missing
 
     def _save(self) -> None:
         """Save the closing epoch; there is none before the first update, or where the replay service is gone."""
@@ -156,6 +168,7 @@ class LearnerService:
 
     def _finish(self, outcome: str) -> dict[str, Any]:
         """Collect the last counters, write the summary, and send everybody home."""
+        self._node.presence.on_change(lambda: None)
         try:
             summary = self._summary(outcome, self._replay_stats())
             self._directory.summary(summary)
