@@ -54,6 +54,7 @@ class ActorService:
         """Play until the stop; what has not filled a segment by then is dropped."""
         while not self._weights.ready:
             self._weights.refresh()
+            self._tell()
             if self._stop.wait(0.05):
                 return
         obs = self._env.reset()
@@ -93,6 +94,7 @@ class ActorService:
         if now < self._status_due:
             return
         self._status_due = now + STATUS_EVERY
-        self._node.publish_status(
-            {"steps": self._steps, "acked": self._inserts.acked, "waiting": self._inserts.waiting}
-        )
+        self._node.publish_status({"steps": self._steps, "acked": self._inserts.acked, "waiting": self._waiting()})
+
+    def _waiting(self) -> str:
+        return self._inserts.waiting if self._weights.ready else "waiting for the learner's weights"

@@ -21,6 +21,7 @@ from learner.telemetry import Telemetry
 
 METRICS_EVERY = 200  # updates
 STATUS_EVERY = 0.5  # seconds
+REPLAY_BACK = 30.0  # seconds that a replay service may be away when the run is complete
 FAREWELL = 5.0  # seconds that the others get to leave
 NOTHING_DRAWN = Drawn(0, 0, 0, 0, 0, 0, ())
 
@@ -163,7 +164,12 @@ class LearnerService:
 
     def _save(self) -> None:
         """Save the closing epoch; there is none before the first update, or where the replay service is gone."""
-        if self._agent.updates and self._replay_stats() is not None:
+        deadline = time.monotonic() + (0 if self._stop.is_set() else REPLAY_BACK)
+        while self._replay_stats() is None:
+            if time.monotonic() >= deadline:
+                return
+            time.sleep(STATUS_EVERY)
+        if self._agent.updates:
             self._checkpoints.save(self._state())
 
     def _finish(self, outcome: str) -> dict[str, Any]:

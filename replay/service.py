@@ -11,11 +11,12 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from common import experience, messages
+from common import experience, limits, messages
 from common.clients import replay_key
-from common.errors import BadMessage
+from common.errors import BadMessage, RunError
 from common.experience import SegmentReader
 from common.lifecycle import Stop
+from common.limits import Limits
 from common.messages import ReplayStats
 from common.transport import Node
 from common.wire import Message
@@ -62,6 +63,7 @@ class ReplayService:
         node.serve(replay_key(node, "insert"), self._insert, depth=INSERT_QUEUE)
         node.serve(replay_key(node, "sample"), self._sample)
         node.serve(replay_key(node, "stats"), self._stats)
+        node.serve(replay_key(node, "limits"), self._limits)
         node.serve(replay_key(node, "snapshot"), self._snapshot)
 
     def run(self, stop: Stop) -> None:
@@ -134,6 +136,30 @@ class ReplayService:
     def _stats(self, message: Message) -> bytearray:
         messages.decode_question("stats", message)
         return messages.encode_stats(self._node.run, self.stats())
+
+    def _limits(self, message: Message) -> bytearray:
+        with self._changed:
+            core = self._core
+            if message.kind == "limit":
+                ratio, tolerance = limits.decode_limit(message)
+                try:
+                    inserted, drawn = core.table.inserted, core.drawn
+                    core.limit(core.limiter.changed(inserted, drawn, ratio=ratio, tolerance=tolerance))
+                except OSError as error:
+                    raise RunError(f"the journal can't be written: {error.strerror or error}") from error
+                self._changed.notify_all()
+            else:
+                messages.decode_question("limits", message)
+            now = Limits(
+                ratio=core.limiter.ratio,
+                tolerance=core.limiter.tolerance,
+                inserted=core.table.inserted,
+                drawn=core.drawn,
+                planned=core.limiter.draws_total or 0,
+                inserts_wait_for=core.inserts_wait_for,
+                samples_wait_for=core.samples_wait_for,
+            )
+        return limits.encode_limits(self._node.run, now)
 
     def _snapshot(self, message: Message) -> bytearray:
         if message.kind == "snapshot":

@@ -13,10 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import make_segment
 
-from common import experience, messages, wire
+from common import experience, limits, messages, wire
 from common.config import RunConfig, to_tables
 from common.errors import BadMessage, RunError
 from common.experience import BatchReader, Drawn, DrawRequest, EpisodeRecord, SegmentReader
+from common.limits import Limits
 from common.messages import Join, Joined, ReplayStats, Role
 from common.types import Batch, EnvSpec, EpisodeEnd
 from common.wire import Message
@@ -27,6 +28,7 @@ END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]
 RECORD = [4, 7, 0, END]
 STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
 JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300)
+LIMITS = Limits(0.5, 8.0, 10, 5, 50, "a", "")
 TABLES = to_tables(RunConfig())
 FLAT = np.arange(3, dtype=np.float32)
 
@@ -52,6 +54,8 @@ READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "stats": (messages.encode_stats("r", STATS), messages.decode_stats),
     "snapshot": (messages.encode_snapshot("r", 12, [4, 8]), messages.decode_snapshot),
     "written": (messages.encode_written("r", 12), messages.decode_written),
+    "limit": (limits.encode_limit("r", 0.5, 8), limits.decode_limit),
+    "limits": (limits.encode_limits("r", LIMITS), limits.decode_limits),
     "stop": (messages.encode_stop("r", "complete"), messages.decode_stop),
     "current": (messages.encode_question("r", "current"), partial(messages.decode_question, "current")),
 }
@@ -74,6 +78,8 @@ def _valid(kind: str) -> Message:
         ("stats", STATS),
         ("snapshot", (12, [4, 8])),
         ("written", 12),
+        ("limit", (0.5, 8.0)),
+        ("limits", LIMITS),
         ("stop", "complete"),
         ("current", None),
     ],
@@ -158,6 +164,10 @@ FIELDS = [
     ("sample", "sequence", 1),
     ("sample", "sequence", 2 + experience.MAX_AHEAD),
     ("batch", "planned", -1),
+    ("limit", "ratio", 0.0),
+    ("limit", "ratio", math.nan),
+    ("limit", "tolerance", -1),
+    ("limits", "drawn", "many"),
 ]
 
 

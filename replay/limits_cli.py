@@ -1,0 +1,60 @@
+"""`coop-limits`: shows the limiter of a running replay service, and changes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from common import cli, limits, messages
+from common.clients import replay_key
+from common.errors import RunError
+from common.joining import join
+from common.lifecycle import Stop, run_main
+from common.limits import Limits
+from common.messages import Join
+from common.options import RoleOptions
+from common.transport import NoAnswer, Node, Refused, new_incarnation, open_session
+
+
+@dataclass(frozen=True)
+class LimitsOptions(RoleOptions):
+    """Flags of `coop-limits`."""
+
+    ratio: float | None = None
+    """New updates per environment step, from now on; as it is if not given."""
+    tolerance: float | None = None
+    """New environment steps that acting and learning may drift apart; as it is if not given."""
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop-limits", _run)
+
+
+def _run() -> None:
+    options = cli.parse(LimitsOptions, "coop-limits", "Show, and change, how a run keeps acting and learning in step.")
+    stop = Stop()
+    stop.on_signals()
+    request = Join("actor", new_incarnation(), [], index=0)  # asks where the replay service is; takes no actor's place
+    with Node(open_session((), options.connect, options.zenoh_config), options.run, "watch", 0) as node:
+        joined = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
+    if joined is None:
+        return
+    endpoints = (*options.connect, *joined.replay_endpoints)
+    with Node(open_session((), endpoints, options.zenoh_config), options.run, "watch", 0) as node:
+        now = _ask(node, messages.encode_question(node.run, "limits"))
+        if options.ratio is not None or options.tolerance is not None:
+            ratio = now.ratio if options.ratio is None else options.ratio
+            tolerance = now.tolerance if options.tolerance is None else options.tolerance
+            now = _ask(node, limits.encode_limit(node.run, ratio, tolerance))
+    print(f"ratio {now.ratio:g}, tolerance {now.tolerance:g} steps")
+    print(f"{now.inserted:,} transitions, {now.drawn:,} batches of {now.planned:,}")
+    print(f"inserts: {now.inserts_wait_for or 'admitted'}; samples: {now.samples_wait_for or 'admitted'}")
+
+
+def _ask(node: Node, question: bytearray) -> Limits:
+    try:
+        return limits.decode_limits(node.ask(replay_key(node, "limits"), question))
+    except NoAnswer as error:
+        raise RunError(f"the replay service of run {node.run!r} does not answer") from error
+    except Refused as error:
+        raise RunError(f"the replay service refused: {error}") from error
