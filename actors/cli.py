@@ -76,7 +76,9 @@ def _networks(joined: Joined) -> tuple[FlatNetwork, FlatNetwork]:
         JoinError: this process builds another layout than the learner.
     """
     settings = joined.config.network
-    first, second = (FlatNetwork(build_network(settings.kind, joined.spec, settings.hidden, seed=0)) for _ in range(2))
+    modules = [build_network(settings.kind, joined.spec, settings.hidden, seed=0) for _ in range(2)]
+    dtype = torch.bfloat16 if settings.dtype == "bfloat16" else torch.float32
+    first, second = (FlatNetwork(module.to(dtype)) for module in modules)
     if first.layout_digest() != joined.layout:
         raise JoinError(f"network layout here {first.layout_digest()}, the learner's {joined.layout}")
     return first, second

@@ -14,7 +14,7 @@ from common.types import Array, EnvSpec
 class Policy:
     """Two networks, of which one acts.
 
-    networks: Q1 and Q2. acting: 0 or 1.
+    networks: Q1 and Q2, of any floating dtype. acting: 0 or 1.
     """
 
     def __init__(self, networks: tuple[FlatNetwork, FlatNetwork], spec: EnvSpec, rng: np.random.Generator) -> None:
@@ -41,4 +41,5 @@ class Policy:
 
     @torch.inference_mode()
     def _values(self, number: int, obs: Array) -> Tensor:
-        return self.networks[number](preprocess(torch.from_numpy(obs), self._spec))
+        network = self.networks[number]
+        return network(preprocess(torch.from_numpy(obs), self._spec).to(network.flat.dtype))

@@ -37,11 +37,12 @@ EPSILON = 0.1
 RUN = "bench"
 
 
-def run_config(envs: int) -> RunConfig:
+def run_config(envs: int, dtype: str) -> RunConfig:
     """Breakout as Mnih played it late in a run, with a limiter that never says no."""
     tables = load_tables("breakout", None)
     tables["replay"] |= {"capacity": 20_000, "start": 1000, "tolerance": 1e12}
     tables["actor"] |= {"envs": envs, "epsilon_start": EPSILON, "epsilon_final": EPSILON}
+    tables["network"] |= {"dtype": dtype}
     return resolve({**tables, "run": RUN, "total_steps": 10**12})
 
 
@@ -50,8 +51,9 @@ def bare(config: RunConfig, end: Connection) -> None:
     torch.set_num_threads(1)
     spec, envs = env_spec(config.env), config.actor.envs
     env = make_vector_env(config.env, envs, seed=0)
-    networks = [FlatNetwork(build_network(config.network.kind, spec, (), seed)) for seed in (0, 1)]
-    policy = Policy((networks[0], networks[1]), spec, np.random.default_rng(0))
+    dtype = torch.bfloat16 if config.network.dtype == "bfloat16" else torch.float32
+    first, second = (FlatNetwork(build_network(config.network.kind, spec, (), seed).to(dtype)) for seed in (0, 1))
+    policy = Policy((first, second), spec, np.random.default_rng(0))
     obs = env.reset()
     actions = policy.act(obs, EPSILON)
     while (work := end.recv()) is not None:
@@ -114,8 +116,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement; a stop of 10 s cuts links")
     parser.add_argument("--envs", type=int, default=8)
+    parser.add_argument("--dtype", default="float32", help="network.dtype")
     options = parser.parse_args()
-    config = run_config(options.envs)
+    config = run_config(options.envs, options.dtype)
     figures: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         spawn = multiprocessing.get_context("spawn")

@@ -47,7 +47,7 @@ Figures = tuple[float, float]  # updates per second, updates per second of proce
 def run_config(method: str, dtype: str) -> RunConfig:
     """Breakout as Mnih played it, with a limiter that never says no."""
     tables = load_tables("breakout", None)
-    tables["learner"] |= {"dtype": dtype}
+    tables["network"] |= {"dtype": dtype}
     tables["replay"] |= {"capacity": 10_000, "start": 1000, "tolerance": 1e12}
     return resolve({**tables, "run": RUN, "total_steps": 10**12}, method)
 
@@ -188,7 +188,7 @@ def main() -> None:
     parser.add_argument("methods", nargs="*", default=["dqn", "coop"])
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement; a stop of 10 s cuts links")
-    parser.add_argument("--dtype", default="float32", help="learner.dtype; Stable-Baselines3 has float32 only")
+    parser.add_argument("--dtype", default="float32", help="network.dtype; Stable-Baselines3 has float32 only")
     parser.add_argument("--core", type=int, help="core of the learner and of those that it is compared with")
     options = parser.parse_args()
     keep_off(options.core)

@@ -36,6 +36,9 @@ class NetworkSettings:
     """mlp: Linear layers with ReLU; nature: 3 conv + 2 linear; nips2013: 2 conv + 2 linear."""
     hidden: tuple[Positive, ...] = (128, 128, 128)
     """Widths of the hidden layers of the mlp."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """bfloat16: actor processes, targets, and all passes of the gradient methods, with half the bits; parameters and
+    optimizers stay in float32."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +70,6 @@ class LearnerSettings:
     weight_decay: tuple[NonNegative, ...] = ()
     """lambda(i) of each layer, input first; one value holds for all layers; none means 0."""
     device: str = "cpu"
-    dtype: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16: targets, and every pass of the gradient methods, with half the bits; parameters stay in float32."""
     threads: Positive = 1
     """CPU threads of torch in the learner."""
     prefetch: Annotated[int, Field(gt=0, le=256)] = 4

@@ -157,7 +157,7 @@ class Agent:
 
     def _half_networks(self) -> list[FlatNetwork]:
         """Copies of both networks in bfloat16, kept up by `_halve`; none where all is computed in float32."""
-        if self.config.learner.dtype == "float32":
+        if self.config.network.dtype == "float32":
             return []
         return [make_network(self.config, self.spec, number, self.device, torch.bfloat16) for number in (0, 1)]
 

@@ -184,7 +184,9 @@ def test_a_device_that_is_not_there() -> None:
 
 @pytest.mark.parametrize("method", ["dqn", "g-coop", "edql", "coop"])
 def test_bfloat16_trains_nearly_as_float32_does(method: Method) -> None:
-    exact, half = (Agent(_config(method, dtype=dtype), SPEC) for dtype in ("float32", "bfloat16"))
+    config = _config(method)
+    low = replace(config, network=replace(config.network, dtype="bfloat16"))
+    exact, half = Agent(config, SPEC), Agent(low, SPEC)
     start = [network.snapshot() for network in exact.networks]
     for number, batch in enumerate(_batches(25)):
         expected, found = exact.update(batch).td_errors, half.update(batch).td_errors
@@ -195,7 +197,7 @@ def test_bfloat16_trains_nearly_as_float32_does(method: Method) -> None:
         went, goes = one.snapshot() - before, other.snapshot() - before
         assert goes.dtype == np.float32
         assert went @ goes > 0.95 * np.linalg.norm(went) * np.linalg.norm(goes)
-    resumed = Agent(_config(method, dtype="bfloat16"), SPEC)
+    resumed = Agent(low, SPEC)
     resumed.load_state(half.state())
     for batch in _batches(3):
         np.testing.assert_array_equal(resumed.update(batch).td_errors, half.update(batch).td_errors)
