@@ -101,10 +101,10 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
             assert run.poll() is None
             time.sleep(0.1)
         second.send_signal(signal.SIGINT)
-        assert "the run has ended" not in second.communicate(timeout=30)[0]
+        assert "the run has ended" not in second.communicate(timeout=110)[0]
         # A learner tells its status twice a second.
-        assert hasty.communicate(timeout=60)[1].endswith("the learner of run 'coop' has been silent for 0.1 s\n")
-        out, _ = first.communicate(timeout=90)
-        assert (first.returncode, second.returncode, hasty.returncode, run.wait(30)) == (0, 0, 1, 0)
+        assert hasty.communicate(timeout=110)[1].endswith("the learner of run 'coop' has been silent for 0.1 s\n")
+        out, _ = first.communicate(timeout=110)
+        assert (first.returncode, second.returncode, hasty.returncode, run.wait(110)) == (0, 0, 1, 0)
     assert re.search(r"step \d+/900  return [\d.]+ \(last 100 of \d+ episodes\)", out)
     assert out.endswith("the run has ended: complete\n")
