@@ -1,0 +1,121 @@
+"""What the journal costs: `python benchmarks/journal.py`. Atari segments, with journal and without.
+
+Real `coop-replay` processes on TCP, one inserting client with a window of 16 segments. Both services take turns
+for a second each, so that the ratio holds on a busy machine; beside transitions/s stands the processor time that the
+service spent on them, which does not depend on who else is busy. After each turn an epoch drops the journal's files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from table import ATARI, segments
+
+from common import messages
+from common.clients import InsertClient, replay_key
+from common.config import validated
+from common.lifecycle import Stop
+from common.memory import keep_freed_memory
+from common.processes import ChildProcess, command, free_endpoint
+from common.transport import NoAnswer, Node, new_incarnation, open_session
+from learner.reception import Reception
+
+STEPS, WINDOW, CAPACITY = 64, 16, 5000
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+class Service:
+    """A replay service and a client of it."""
+
+    def __init__(self, stack: ExitStack, journal: bool, folder: Path) -> None:
+        run = f"journal-{journal}".lower()
+        config = validated(
+            {
+                "run": run,
+                "total_steps": 10**12,
+                "env": {"id": "breakout"},
+                "replay": {"capacity": CAPACITY, "start": 1000, "tolerance": 1e12, "journal": journal},
+            }
+        )
+        head, at = free_endpoint(), free_endpoint()
+        learner = stack.enter_context(Node(open_session((head,)), run, "learner", new_incarnation()))
+        Reception(learner, config, ATARI, "", run_id=0, newest_epoch=lambda: 0)
+        flags = ("--run", run, "--connect", head, "--listen", at, "--run-dir", str(folder))
+        self._process = ChildProcess("replay", command("coop-replay", *flags), folder.with_suffix(".log"))
+        self._process.start()
+        stack.callback(self._process.end, 20)
+        stack.callback(self._process.interrupt)
+        incarnation = new_incarnation()
+        self._node = stack.enter_context(Node(open_session((), (at,)), run, "actor", incarnation))
+        self._client = InsertClient(self._node, Stop(), WINDOW)
+        self._stream = (replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
+        self._epoch = 0
+        self.insert(1.0)
+
+    def insert(self, seconds: float) -> tuple[float, float]:
+        """Insert as fast as it goes: (transitions/s, the service's processor time in us per transition)."""
+        before, begun, acked = self._processor_time(), time.monotonic(), self._client.acked
+        while time.monotonic() < begun + seconds:
+            self._client.submit(next(self._stream))
+        self._client.drain()
+        done, took = self._client.acked - acked, time.monotonic() - begun
+        figures = done / took, 1e6 * (self._processor_time() - before) / done
+        self._save()
+        return figures
+
+    def _processor_time(self) -> float:
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / TICKS
+
+    def _save(self) -> None:
+        self._epoch += 1
+        self._ask(messages.encode_snapshot(self._node.run, self._epoch, []))
+        while self._ask(messages.encode_written(self._node.run, self._epoch)) == "retry":
+            pass
+
+    def _ask(self, question: bytearray) -> str:
+        while True:
+            try:
+                return self._node.ask(replay_key(self._node, "snapshot"), question, 30.0).kind
+            except NoAnswer:
+                time.sleep(0.1)
+
+
+def shown(values: list[float], form: Callable[[float], str]) -> str:
+    """Median (lowest to highest)."""
+    return f"{form(statistics.median(values))} ({form(min(values))} to {form(max(values))})"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--seconds", type=float, default=1.0, help="of each turn")
+    options = parser.parse_args()
+    keep_freed_memory()
+    rounds = []
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        services = [Service(stack, journal, Path(folder) / str(journal)) for journal in (False, True)]
+        for number in range(options.rounds):
+            order = services if number % 2 else services[::-1]
+            taken = {id(service): service.insert(options.seconds) for service in order}
+            rounds.append([taken[id(service)] for service in services])
+    print(f"{options.rounds} rounds of {options.seconds:g} s, segments of {STEPS} steps: median (lowest to highest)")
+    for place, name in enumerate(("without", "with journal")):
+        rates, costs = zip(*(turn[place] for turn in rounds), strict=True)
+        print(f"{name:14}{shown(list(rates), '{:,.0f}'.format)} transitions/s", end=", ")
+        print(f"{shown(list(costs), '{:.1f}'.format)} us of processor time each")
+    for what, index in (("transitions/s", 0), ("processor time", 1)):
+        ratios = [turn[1][index] / turn[0][index] for turn in rounds]
+        print(f"with / without, {what}: {shown(ratios, '{:.2f}'.format)}")
+
+
+if __name__ == "__main__":
+    main()
