@@ -27,7 +27,7 @@ from common.experience import DrawRequest
 from replay.limiter import RateLimiter
 
 FORMAT = 1
-BEGIN, SEGMENT, DRAW, LIMITER = range(4)
+BEGIN, SEGMENT, DRAW, LIMITER, END = range(5)
 ROLL_AT = 1 << 28  # bytes after which a new file is begun
 
 _HEADER = struct.Struct("<IIQQ")
@@ -85,9 +85,14 @@ class Journal:
     def roll(self) -> int:
         """Begin the next file, whose number is returned; raises OSError, and this file goes on then."""
         self._append_late()
-        before, end = self._file, self._end
-        self._open(self._number + 1)
-        os.ftruncate(before, end)
+        self._write(END, b"")  # behind it may be what is left of an older file
+        before = self._file
+        try:
+            self._open(self._number + 1)
+        except OSError:
+            self._end -= _HEADER.size
+            self._records -= 1
+            raise
         os.close(before)
         return self._number
 
@@ -96,11 +101,6 @@ class Journal:
         for number in () if self._keep else journal_files(self._folder):
             if number < before:
                 _path(self._folder, number).replace(self._folder / _SPARE)
-
-    def close(self) -> None:
-        """Close the file."""
-        os.ftruncate(self._file, self._end)
-        os.close(self._file)
 
     def _open(self, number: int) -> None:
         path = _path(self._folder, number)
@@ -181,6 +181,8 @@ def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record]:
                 if (place, len(payload)) != (expected, length) or _checksum(kind, number, place, payload) != checksum:
                     raise TornFile(path, end)
                 end = file.tell()
+                if kind == END:
+                    return
                 if kind == BEGIN:
                     _check_begin(path, payload, run_id)
                 else:
