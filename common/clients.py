@@ -9,6 +9,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from common import experience, messages
 from common.errors import BadMessage
 from common.experience import MAX_AHEAD, BatchReader, Drawn, DrawRequest
@@ -176,6 +179,8 @@ class SampleClient:
         self._next = first
         self._done = first
         self._pinned: int | None = None
+        self._trained: list[tuple[int, float]] = []  # priorities that no request has taken along yet
+        self._carried: dict[int, tuple[tuple[int, float], ...]] = {}  # by number of the request that takes them
         self._backoff = Backoff()
 
     def pin(self) -> int:
@@ -187,6 +192,10 @@ class SampleClient:
         """End `pin`."""
         self._pinned = None
 
+    def prioritise(self, batch: Batch, priorities: NDArray[np.float32]) -> None:
+        """Let the next request set the priorities, float32 [batch], of the transitions of a batch."""
+        self._trained.extend(zip(batch.ids.tolist(), priorities.tolist(), strict=True))
+
     def next(self) -> tuple[Batch, Drawn] | None:
         """The next batch and the episodes that are new since the last one; None if there is none for now.
 
@@ -194,6 +203,7 @@ class SampleClient:
             Refused: the replay service found a request bad, or serves another learner now.
         """
         while len(self._outstanding) < self._prefetch and self._next < self._base + MAX_AHEAD:
+            self._carried[self._next], self._trained = tuple(self._trained), []
             self._outstanding.append((self._next, self._request(self._next)))
             self._next += 1
         if not self._outstanding:
@@ -221,7 +231,8 @@ class SampleClient:
         return self._done if self._pinned is None else self._pinned
 
     def _request(self, sequence: int) -> Pending:
-        request = DrawRequest(self._incarnation, sequence, self._base, self._batch_size, self.episodes)
+        priorities = self._carried[sequence]
+        request = DrawRequest(self._incarnation, sequence, self._base, self._batch_size, self.episodes, priorities)
         return self._node.begin(self._key, experience.encode_sample(self._node.run, request))
 
     def _accept(self, message: Message, sequence: int) -> tuple[Batch, Drawn]:
@@ -231,6 +242,7 @@ class SampleClient:
         self._backoff.reset()
         self.waiting = ""
         self._done = sequence + 1
+        del self._carried[sequence]
         first = max(self.episodes, drawn.first_episode)
         fresh = drawn.episodes[first - drawn.first_episode :]
         self.episodes = first + len(fresh)

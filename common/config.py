@@ -117,6 +117,11 @@ class ReplaySettings:
     journal_keep: bool = False
     """Keep journal files that an epoch covers, so that the run can be re-executed from its beginning."""
 
+    @property
+    def prioritized(self) -> bool:
+        """Whether the table wants to be told of TD errors."""
+        return "prioritized" in (self.eviction, self.sampling)
+
 
 @dataclass(frozen=True)
 class ActorSettings:

@@ -23,6 +23,7 @@ from common.wire import Message
 MAX_SEGMENT_STEPS = 4096
 MAX_EPISODES = 1000  # told with one batch; later ones come with the next
 MAX_AHEAD = 1024  # draws that a learner may be ahead of its base
+MAX_BATCH = 65_536
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,7 @@ class DrawRequest:
     base: updates that the learner has done for good: it never asks again for a batch below. A replay service that
         has drawn less than that, or that served another incarnation, takes it for its own count of draws.
     episodes_from: number of the first episode that the learner has not been told of.
+    priorities: new priorities (id of a transition, |TD error|), to be set before the draw.
     """
 
     incarnation: int
@@ -69,6 +71,7 @@ class DrawRequest:
     base: int
     batch_size: int
     episodes_from: int
+    priorities: tuple[tuple[int, float], ...] = ()
 
 
 _EPISODE_END = Row((Int(0, MAX_SEGMENT_STEPS - 1), Real(), Int(1), Real(), Real(), Real(), Int(-1)))
@@ -79,8 +82,9 @@ _SAMPLE = Schema(
         "incarnation": INCARNATION,
         "sequence": Int(),
         "base": Int(),
-        "batch_size": Int(1, 65_536),
+        "batch_size": Int(1, MAX_BATCH),
         "episodes_from": Int(),
+        "priorities": ListOf(Row((Int(), Real())), 2 * MAX_BATCH),
     },
     {},
 )
@@ -189,7 +193,10 @@ def encode_sample(run: str, request: DrawRequest) -> bytearray:
 def decode_sample(message: Message) -> DrawRequest:
     """Read a draw request; raises BadMessage."""
     _SAMPLE.check(message)
-    request = DrawRequest(**message.fields)
+    fields = {**message.fields, "priorities": tuple(map(tuple, message.fields["priorities"]))}
+    request = DrawRequest(**fields)
+    if any(priority < 0 for _, priority in request.priorities):
+        raise BadMessage("fields.priorities", "a priority below 0")
     if not request.base <= request.sequence < request.base + MAX_AHEAD:
         allowed = f"{request.base} to {request.base + MAX_AHEAD - 1}"
         raise BadMessage("fields.sequence", f"{request.sequence}; with base {request.base}: {allowed}")

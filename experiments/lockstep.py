@@ -92,7 +92,7 @@ class Lockstep:
         agent, table = self.agent, self._table
         batch = table.sample(self.config.learner.batch_size)
         result = agent.update(batch)
-        if self.config.replay.sampling == "prioritized" or self.config.replay.eviction == "prioritized":
+        if self.config.replay.prioritized:
             table.update_priorities(batch.ids, np.abs(result.td_errors))
         self.telemetry.add(agent, batch, result)
         if agent.updates % METRICS_EVERY == 0:

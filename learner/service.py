@@ -6,6 +6,8 @@ import time
 from dataclasses import asdict, replace
 from typing import Any
 
+import numpy as np
+
 from common import messages, schedules
 from common.clients import SampleClient, replay_key
 from common.experience import Drawn
@@ -91,6 +93,8 @@ class LearnerService:
             batch, self._drawn = got
             result = agent.update(batch)
             self._telemetry.add(agent, batch, result)
+            if self._config.replay.prioritized:
+                self._samples.prioritise(batch, np.abs(result.td_errors))
             if result.swapped or agent.updates % settings.publish_every == 0:
                 self._broadcaster.publish()
             self._book_episodes()

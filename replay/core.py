@@ -181,6 +181,9 @@ class ReplayCore:
         """Carry out a draw that was admitted, now or, according to a journal, before; raises as `draw`."""
         self._follow(request)
         table = self.table
+        if request.priorities:
+            numbers, priorities = zip(*request.priorities, strict=True)
+            table.update_priorities(np.array(numbers, np.int64), np.array(priorities))
         batch = table.sample(request.batch_size)
         self.drawn = max(self.drawn, request.sequence + 1)
         first = max(request.episodes_from, self._first_episode)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,3 +131,18 @@ def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
     recover(twin, small_disk / "journal", 1, 5)
     _assert_alike(core, twin)
     save(core, epochs, 2)
+
+
+def test_priorities_are_carried_out_again(spec: EnvSpec, tmp_path: Path) -> None:
+    replay = replace(CONFIG.replay, sampling="prioritized", eviction="prioritized")
+    config = replace(CONFIG, replay=replay)
+    core = ReplayCore(config, spec, Journal(tmp_path, 5, 1, keep=False))
+    priorities: tuple[tuple[int, float], ...] = ()
+    for sequence in range(20):
+        assert not isinstance(_insert(core, spec, sequence), Wait)
+        while not isinstance(got := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, 0, priorities)), Wait):
+            priorities = tuple((number, 0.1 + number % 7) for number in got[0].ids.tolist())
+    assert len(set(core.table.snapshot().arrays["priorities"].tolist())) > 3
+    twin = ReplayCore(config, spec)
+    recover(twin, tmp_path, 1, 5)
+    _assert_alike(core, twin)

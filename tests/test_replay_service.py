@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -186,3 +187,24 @@ def test_a_port_in_use_is_named() -> None:
         pytest.raises(RunError, match="can't listen on"),
     ):
         open_session(tuple(locators(node.session)))
+
+
+def test_a_learner_sets_priorities_with_its_next_draw(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
+    server, client = nodes
+    replay = replace(CONFIG.replay, sampling="prioritized", priority_exponent=1.0, tolerance=200.0)
+    core = ReplayCore(replace(CONFIG, replay=replay), spec)
+    _serve(server, core, tmp_path)
+    for sequence in range(15):
+        client.ask(replay_key(client, "insert"), experience.encode_segment("test", make_segment(spec, sequence)))
+    samples = SampleClient(client, Stop(), 1, spec, 4, 2)
+    chosen = -1
+    for number in range(12):
+        got = None
+        while got is None:
+            got = samples.next()
+        batch = got[0]
+        if number == 0:
+            chosen = int(batch.ids[0])
+        samples.prioritise(batch, np.where(batch.ids == chosen, 1e6, 1e-3).astype(np.float32))
+        if number > 3:  # two requests were under way before the first priorities were known
+            assert (batch.ids == chosen).all()
