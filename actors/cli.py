@@ -14,6 +14,7 @@ from common.environments import make_vector_env
 from common.errors import JoinError, PeerLost
 from common.joining import Membership, join
 from common.lifecycle import Stop, run_main
+from common.memory import keep_freed_memory
 from common.messages import Join, Joined
 from common.networks import FlatNetwork, build_network
 from common.options import RoleOptions
@@ -36,6 +37,7 @@ def main() -> None:
 def _run() -> None:
     options = cli.parse(ActorOptions, "coop-actor", "Play emulators for a run; the rest comes from its learner.")
     torch.set_num_threads(1)
+    keep_freed_memory()
     stop = Stop()
     stop.on_signals()
     incarnation = new_incarnation()

@@ -2,13 +2,15 @@
 
 The actor is a real `coop-actor` that publishes to a real `coop-replay`; it is stopped by signal while the bare loop, in
 a process of its own, takes its turn: emulation alone, inference alone, then both. Ratios are taken in each round, so
-that they hold on a busy machine; printed are medians with their range.
+that they hold on a busy machine, and also from steps per second of processor time, of all threads of the process;
+printed are medians with their range.
 """
 
 from __future__ import annotations
 
 import argparse
 import multiprocessing
+import os
 import signal
 import statistics
 import subprocess
@@ -33,6 +35,7 @@ from learner.agent import Agent
 from learner.broadcast import Broadcaster
 from learner.reception import Reception
 
+Figures = tuple[float, float]  # steps per second, steps per second of processor time
 EPSILON = 0.1
 RUN = "bench"
 
@@ -47,7 +50,7 @@ def run_config(envs: int, dtype: str) -> RunConfig:
 
 
 def bare(config: RunConfig, end: Connection) -> None:
-    """Answers each (what, seconds) with steps/s of "emulation", of "inference" or of "both" in a loop."""
+    """Answers each (what, seconds) with its figures: of "emulation", of "inference" or of "both" in a loop."""
     torch.set_num_threads(1)
     spec, envs = env_spec(config.env), config.actor.envs
     env = make_vector_env(config.env, envs, seed=0)
@@ -58,14 +61,14 @@ def bare(config: RunConfig, end: Connection) -> None:
     actions = policy.act(obs, EPSILON)
     while (work := end.recv()) is not None:
         what, seconds = work
-        steps, begun = 0, time.perf_counter()
+        steps, begun, processor = 0, time.perf_counter(), time.process_time()
         while (spent := time.perf_counter() - begun) < seconds:
             if what != "emulation":
                 actions = policy.act(obs, EPSILON)
             if what != "inference":
                 obs = env.step(actions).obs
             steps += envs
-        end.send(steps / spent)
+        end.send((steps / spent, steps / (time.process_time() - processor)))
 
 
 class Topology:
@@ -91,17 +94,22 @@ class Topology:
             time.sleep(0.1)
         self._actor.send_signal(signal.SIGSTOP)
 
-    def steps_per_second(self, seconds: float) -> float:
-        """What the actor inserts, from one change of the count to another."""
+    def figures(self, seconds: float) -> Figures:
+        """Of what the actor inserts, from one change of the count to another."""
         self._actor.send_signal(signal.SIGCONT)
-        changes = [(time.perf_counter(), self._inserted())]
+        changes = [(time.perf_counter(), self._processor_seconds(), self._inserted())]
         while len(changes) < 4 or changes[-1][0] - changes[0][0] < seconds:
             time.sleep(0.005)
-            if (count := self._inserted()) != changes[-1][1]:
-                changes.append((time.perf_counter(), count))
+            if (count := self._inserted()) != changes[-1][2]:
+                changes.append((time.perf_counter(), self._processor_seconds(), count))
         self._actor.send_signal(signal.SIGSTOP)
-        (begun, first), (ended, last) = changes[1], changes[-1]  # the first turn after the stop is not whole
-        return (last - first) / (ended - begun)
+        # The first turn after the stop is not whole.
+        seconds, processor, steps = (last - first for first, last in zip(changes[1], changes[-1], strict=True))
+        return steps / seconds, steps / processor
+
+    def _processor_seconds(self) -> float:
+        fields = Path(f"/proc/{self._actor.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def _inserted(self) -> int:
         question = messages.encode_question(RUN, "stats")
@@ -133,12 +141,14 @@ def main() -> None:
             for what in ("emulation", "inference", "both"):
                 ours.send((what, options.seconds))
                 speed[what] = ours.recv()
-            speed["actor"] = topology.steps_per_second(options.seconds)
-            for name, value in speed.items():
-                figures.setdefault(f"{name}: steps/s", []).append(value)
-            parts = 1 / speed["emulation"] + 1 / speed["inference"]
-            figures.setdefault("time of both / time of emulation + inference", []).append(1 / speed["both"] / parts)
-            figures.setdefault("actor / both", []).append(speed["actor"] / speed["both"])
+            speed["actor"] = topology.figures(options.seconds)
+            for name, pair in speed.items():
+                figures.setdefault(f"{name}: steps/s", []).append(pair[0])
+            for place, unit in enumerate(("time", "processor time")):
+                emulation, inference, both, actor = (pair[place] for pair in speed.values())
+                parts = 1 / emulation + 1 / inference
+                figures.setdefault(f"{unit} of both / of emulation + inference", []).append(1 / both / parts)
+                figures.setdefault(f"{unit} of both / of actor", []).append(actor / both)
     print(f"{options.envs} emulators, {options.rounds} rounds of {options.seconds:g} s: median (lowest to highest)")
     for name, values in figures.items():
         digits = 0 if "steps/s" in name else 3
