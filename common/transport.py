@@ -20,6 +20,7 @@ import zenoh
 from common import messages, wire
 from common.errors import BadMessage, CoopError, RunError, UsageError
 from common.lifecycle import Stop
+from common.links import never_linger
 from common.presence import LEASE_MS, Presence
 from common.wire import Message
 
@@ -77,9 +78,11 @@ def open_session(
     except zenoh.ZError as error:
         raise UsageError(f"zenoh configuration: {_first_line(error)}") from error
     try:
-        return zenoh.open(config)
+        session = zenoh.open(config)
     except zenoh.ZError as error:
         raise RunError(f"can't listen on {', '.join(listen) or 'any endpoint'}: {_first_line(error)}") from error
+    never_linger(session)
+    return session
 
 
 def locators(session: zenoh.Session) -> list[str]:

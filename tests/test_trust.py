@@ -82,7 +82,7 @@ def run(keys: Path) -> Iterator[tuple[str, str]]:
             stack.callback(role.end, 0.0)
             roles.append(role)
         with joined((learner_at, replay_at), keys / "replay.json5", "watch") as node:
-            deadline = time.monotonic() + 60
+            deadline = time.monotonic() + 100
             while not training(node):
                 assert time.monotonic() < deadline, [role.last_line() for role in roles]
                 time.sleep(0.1)

@@ -1,0 +1,43 @@
+"""Keeps a dead link from holding up the others: Zenoh must not wait when it closes a TCP connection.
+
+Zenoh sets SO_LINGER to 10 s on its sockets. Where a peer freezes or its cable is cut with something still to send, the
+closing thread of Zenoh then stands still for that long, and there is one for all links: nothing goes to or comes from
+any other peer meanwhile. Zenoh has no setting for it, so each new link's socket is told otherwise here.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import struct
+from pathlib import Path
+
+import zenoh
+
+_LINGER_OFF = struct.pack("ii", 0, 0)
+
+
+def never_linger(session: zenoh.Session) -> None:
+    """Have every link of this session, now and later, closed at once; the kernel still delivers what it can."""
+
+    def changed(event: zenoh.LinkEvent) -> None:
+        if event.kind == zenoh.SampleKind.PUT:
+            _linger_off()
+
+    session.info.declare_link_events_listener(changed, history=True)
+
+
+def _linger_off() -> None:
+    """Switch SO_LINGER off on every TCP socket of this process."""
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            own = os.dup(int(entry.name))
+        except OSError:
+            continue  # closed since it was listed
+        if not stat.S_ISSOCK(os.fstat(own).st_mode):
+            os.close(own)
+            continue
+        with socket.socket(fileno=own) as opened:
+            if opened.type == socket.SOCK_STREAM and opened.family in (socket.AF_INET, socket.AF_INET6):
+                opened.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_OFF)

@@ -1,0 +1,57 @@
+"""Peers that freeze with a full link: the others are served all the same."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from common import messages
+from common.transport import Node, locators, new_incarnation, open_session
+
+FROZEN = 3  # more than the threads that Zenoh receives with, left to itself
+LISTENER = """
+import sys, time
+from common.transport import open_session
+session = open_session((), (sys.argv[1],))
+subscriber = session.declare_subscriber("coop/test/weights/1", lambda sample: None)
+print("ready", flush=True)
+time.sleep(120)
+"""
+
+
+@pytest.fixture
+def server() -> Iterator[Node]:
+    with Node(open_session(("tcp/127.0.0.1:0",)), "test", "learner", new_incarnation()) as node:
+        node.serve(node.key("role"), lambda message: messages.encode_ack("test", 1))
+        yield node
+
+
+def test_frozen_peers_do_not_make_a_process_deaf(server: Node) -> None:
+    at = locators(server.session)
+    with ExitStack() as stack:
+        frozen = []
+        for _ in range(FROZEN):
+            process = stack.enter_context(
+                subprocess.Popen([sys.executable, "-c", LISTENER, at[0]], stdout=subprocess.PIPE)
+            )
+            stack.callback(process.kill)
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+            frozen.append(process)
+        client = stack.enter_context(Node(open_session((), at), "test", "actor", new_incarnation()))
+        while len(server.session.info.peers_zid()) < FROZEN + 1:
+            time.sleep(0.05)
+        for process in frozen:
+            process.send_signal(signal.SIGSTOP)
+        weights = bytearray(1 << 20)
+        while len(server.session.info.peers_zid()) > 1:
+            server.publish(server.key("weights", "1"), weights)
+            time.sleep(0.02)
+        question = messages.encode_question("test", "current")
+        for _ in range(20):
+            client.ask(client.key("role"), question, timeout=4.0)
+            time.sleep(0.1)
