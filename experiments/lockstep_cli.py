@@ -13,6 +13,7 @@ from common.options import RunOptions, parse_run
 from experiments.lockstep import Lockstep, finish
 from learner.epochs import newest_epoch
 from learner.run_directory import RunDirectory
+from learner.targets import target_reached
 
 PROGRESS_EVERY = 5.0  # seconds
 
@@ -34,8 +35,7 @@ def _run() -> None:
     epoch = newest_epoch(path) if options.resume else None
     sizes = None if epoch is None else run.restore(epoch)
     with RunDirectory(path, config, sizes) as directory:
-        _play(run, directory, stop)
-        outcome = stop.reason or "complete"
+        outcome = _play(run, directory, stop)
         values = finish(run, directory, started, outcome)
     run.env.close()
     print(
@@ -44,11 +44,14 @@ def _run() -> None:
     )
 
 
-def _play(run: Lockstep, directory: RunDirectory, stop: Stop) -> None:
+def _play(run: Lockstep, directory: RunDirectory, stop: Stop) -> str:
+    """Play until the run is complete or stopped; why it ended."""
     config, due = run.config, time.monotonic() + PROGRESS_EVERY
     every = config.checkpoint_every or math.inf
     save_at = run.agent.updates + every
     while run.step < config.total_steps and not stop.is_set():
+        if reached := target_reached(config, run.agent.updates, run.telemetry):
+            return reached
         run.play(directory)
         if run.agent.updates >= save_at and run.step < config.total_steps:
             save_at += every
@@ -57,3 +60,4 @@ def _play(run: Lockstep, directory: RunDirectory, stop: Stop) -> None:
             due = time.monotonic() + PROGRESS_EVERY
             text = f"step {run.step:,}/{config.total_steps:,}  return {run.telemetry.return_mean:.1f}"
             print(text, end="\r" if sys.stdout.isatty() else "\n", flush=True)
+    return stop.reason or "complete"

@@ -19,6 +19,7 @@ from learner.broadcast import Broadcaster
 from learner.checkpoints import Checkpoints
 from learner.curve import draw_learning_curve
 from learner.run_directory import RunDirectory
+from learner.targets import target_reached
 from learner.telemetry import Telemetry
 
 METRICS_EVERY = 200  # updates
@@ -109,19 +110,12 @@ class LearnerService:
 
     def _outcome(self) -> str:
         """Why the run is over; empty while it goes on."""
-        config, agent, telemetry = self._config, self._agent, self._telemetry
+        config, agent = self._config, self._agent
         if self._stop.is_set():
             return self._stop.reason
         if agent.updates >= self._drawn.planned and self._drawn.inserted >= config.total_steps:
             return "complete"
-        if 0 < config.total_updates <= agent.updates:
-            return "complete: total_updates reached"
-        if 0 < config.total_episodes <= telemetry.episodes:
-            return "complete: total_episodes reached"
-        target, full = config.target_return, len(telemetry.returns) == telemetry.returns.maxlen
-        if target is not None and full and telemetry.return_mean >= target:
-            return "complete: target_return reached"
-        return ""
+        return target_reached(config, agent.updates, self._telemetry)
 
     def _book_episodes(self) -> None:
         for record in self._drawn.episodes:

@@ -1,5 +1,6 @@
 """Lockstep runs: the same bytes for a seed, also through a kill -9, for every method."""
 
+import json
 import subprocess
 import sysconfig
 import time
@@ -90,3 +91,21 @@ def test_roles_in_processes_have_no_plays(name: str, flags: list[str], tmp_path:
     assert result.returncode == 2
     assert "in lockstep runs only" in result.stderr
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "column", "value"),
+    [
+        (["--total-episodes", "7"], "episodes", 7),
+        (["--total-updates", "60"], "updates", 60),
+        (["--target-return", "5", "--actor.epsilon-final", "0.9"], "episodes", 100),
+    ],
+)
+def test_a_target_ends_the_run(flags: list[str], column: str, value: int, tmp_path: Path) -> None:
+    command = [COMMAND, "--method", "dqn", "--total-steps", "4000", *flags, "--run-dir", tmp_path / "run"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    name = flags[0].removeprefix("--").replace("-", "_")
+    assert result.stdout.rstrip().splitlines()[-1].startswith(f"complete: {name} reached")
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary[column] == value
+    assert summary["exit"] == f"complete: {name} reached"

@@ -77,7 +77,6 @@ def test_cells_of_the_small_buffers() -> None:
         ("fixed.replay = 5", "replay = 5: must be a table"),
         ('fixed.env.id = "CartPoles-v0"', "CartPoles-v0"),
         ('preset = "catch"', "actor.envs = 4: lockstep cells play one emulator"),
-        ("fixed.total_episodes = 9", "total_episodes = 9: lockstep cells run for total_steps"),
         ('mode = "distributed"\nfixed.learner.swap_by = "plays"', "learner.swap_by = 'plays': in lockstep runs only"),
         ("a = = 1", "line 1"),
     ],

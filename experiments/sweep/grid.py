@@ -198,9 +198,6 @@ def _check_environments(cells: list[Cell]) -> None:
 def _check_lockstep(config: RunConfig) -> None:
     if config.actor.envs != 1:
         raise UsageError(f"actor.envs = {config.actor.envs}: lockstep cells play one emulator; fix it to 1")
-    for name in ("total_updates", "total_episodes", "target_return"):
-        if value := getattr(config, name):
-            raise UsageError(f"{name} = {value}: lockstep cells run for total_steps")
 
 
 def _check_collisions(cells: list[Cell]) -> None:
