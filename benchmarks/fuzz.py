@@ -26,7 +26,7 @@ import numpy as np
 from mutations import mutate
 from roles import Roles, replay_stats, running, wait_until
 
-from common import experience, messages, wire
+from common import experience, limits, messages, wire
 from common.clients import replay_key
 from common.errors import BadMessage, CoopError, RunError
 from common.experience import DrawRequest, SegmentReader
@@ -137,6 +137,12 @@ def targets(node: Node, joined: Joined) -> list[Target]:
     def snapshot(message: Message) -> None:
         (messages.decode_snapshot if message.kind == "snapshot" else messages.decode_written)(message)
 
+    def limiting(message: Message) -> None:
+        if message.kind == "limit":
+            limits.decode_limit(message)
+        else:
+            messages.decode_question("limits", message)
+
     def joining(role: str, message: Message) -> None:
         if messages.decode_join(message).role != role:
             raise BadMessage("fields.role", "not this key's")
@@ -146,19 +152,11 @@ def targets(node: Node, joined: Joined) -> list[Target]:
     current = partial(messages.decode_question, "current")
     made: list[tuple[str, bytearray, str, Callable[[Message], Any]]] = [
         (replay_key(node, "insert"), experience.encode_segment(RUN, segment), "replay", SegmentReader(spec)),
-        (
-            replay_key(node, "sample"),
-            experience.encode_sample(RUN, draw),
-            "replay",
-            sample,
-        ),
+        (replay_key(node, "sample"), experience.encode_sample(RUN, draw), "replay", sample),
+        (replay_key(node, "limits"), limits.encode_limit(RUN, 1.0, 64.0), "replay", limiting),
+        (replay_key(node, "limits"), question("limits"), "replay", limiting),
         (replay_key(node, "stats"), question("stats"), "replay", partial(messages.decode_question, "stats")),
-        (
-            replay_key(node, "snapshot"),
-            messages.encode_snapshot(RUN, 7, [3]),
-            "replay",
-            snapshot,
-        ),
+        (replay_key(node, "snapshot"), messages.encode_snapshot(RUN, 7, [3]), "replay", snapshot),
         (replay_key(node, "snapshot"), messages.encode_written(RUN, 7), "replay", snapshot),
         *(
             (join_key(node, role), messages.encode_join(RUN, Join(role, 5, [])), "learner", partial(joining, role))

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from common import experience, messages
+from common import experience, limits, messages
 from common.clients import replay_key
 from common.experience import DrawRequest
 from common.joining import join_key
@@ -128,6 +128,7 @@ def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, s
         for key, payload in (
             (replay_key(actor, "sample"), experience.encode_sample(RUN, DrawRequest(1, 0, 0, 32, 0))),
             (replay_key(actor, "stats"), messages.encode_question(RUN, "stats")),
+            (replay_key(actor, "limits"), limits.encode_limit(RUN, 1.0, 64.0)),
             (replay_key(actor, "snapshot"), messages.encode_snapshot(RUN, 1, [])),
             (join_key(actor, "replay"), messages.encode_join(RUN, Join("replay", 1, ["tls/127.0.0.1:9"]))),
         ):
