@@ -157,7 +157,9 @@ def test_ctrl_c_a_killed_actor_and_resume(tmp_path: Path) -> None:
         os.kill(roles["coop-actor"], signal.SIGKILL)
         wait_for("the new actor", lambda: children(local.pid).get("coop-actor", 0) != roles["coop-actor"])
         os.kill(roles["coop-replay"], signal.SIGSTOP)
-        wait_for("the frozen one's name", lambda: "replay" in (path / "logs" / "learner.log").read_text())
+        log = path / "logs" / "learner.log"
+        wait_for("the frozen one's name", lambda: re.search("replay [0-9a-f]+ does not answer", log.read_text()))
+        time.sleep(3)  # coop-local finds out by itself, and prints where this test can't look yet
         os.kill(roles["coop-replay"], signal.SIGCONT)
         before = lines(path / "metrics.jsonl")
         wait_for("metrics with the new actor", lambda: lines(path / "metrics.jsonl") > before + 1)
