@@ -47,6 +47,33 @@ class SyncedFile:
         self._file.close()
 
 
+class LineFile:
+    """A file that grows by whole lines. What there is no space for is kept, and written as soon as there is.
+
+    problem: why lines are being kept; empty while none are.
+    """
+
+    def __init__(self, path: Path, *, go_on: bool) -> None:
+        self.problem = ""
+        self._late = b""
+        self._file = path.open("ab" if go_on else "wb", buffering=0)
+
+    def write(self, text: str) -> None:
+        """Append text that ends in a line's end."""
+        self._late += text.encode()
+        try:
+            while self._late:
+                self._late = self._late[self._file.write(self._late) :]
+            self.problem = ""
+        except OSError as error:
+            self.problem = error.strerror or str(error)
+
+    def close(self) -> None:
+        """Try once more, and close the file."""
+        self.write("")
+        self._file.close()
+
+
 def write_whole(path: Path, data: bytes) -> int:
     """Replace a file's content; the checksum of the new one. Raises OSError, the old file being untouched then."""
     part = path.with_name(path.name + ".part")

@@ -105,6 +105,8 @@ class Display:
         self._live = Live(console=self._console, refresh_per_second=4, transient=True)
         self._due = time.monotonic() + PLAIN_EVERY
         self._missing: list[str] = []
+        self._over = Stop()  # after it they leave
+        status.follow_stop(self._over)
 
     def __enter__(self) -> Display:
         if self._console.is_terminal:
@@ -117,7 +119,7 @@ class Display:
     def update(self) -> None:
         """Show what the status says now."""
         self._status.refresh()
-        missing = self._status.missing()
+        missing = [] if self._over.is_set() else self._status.missing()
         for name in set(missing) - set(self._missing):
             self.say(f"{name} does not answer")
         self._missing = missing

@@ -10,12 +10,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from torch.utils.tensorboard import SummaryWriter
-
 from common.config import RunConfig, to_toml
 from common.errors import RunError
 from common.experience import EpisodeRecord
-from common.files import write_whole
+from common.files import LineFile, write_whole
+from learner.board import Board
 
 EPISODE_FIELDS = (
     "episode", "env_step", "update", "actor", "stream", "return", "length",
@@ -25,7 +24,7 @@ RUN_ID = "run-id"
 
 
 class RunDirectory:
-    """Writes a run's files as the run goes on; every line is complete on disk when its call returns."""
+    """Writes a run's files as the run goes on; a line is complete when its call returns, if there is space for it."""
 
     def __init__(self, path: Path, config: RunConfig, sizes: dict[str, int] | None = None) -> None:
         """Begin a run's files, or go on with those cut back to `sizes` in bytes; RunError where that can't be."""
@@ -35,15 +34,15 @@ class RunDirectory:
             write_whole(path / "config.toml", to_toml(config).encode())
             for name, size in (sizes or {}).items():
                 os.truncate(path / name, size)
-            mode = "w" if sizes is None else "a"
-            self._episodes = (path / "episodes.csv").open(mode, newline="", encoding="utf-8", buffering=1)
-            self._metrics = (path / "metrics.jsonl").open(mode, encoding="utf-8", buffering=1)
+            self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
+            self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
+            self._board = Board(path / "tb")
         except OSError as error:
             raise RunError(f"run directory {path}: {error.strerror or error}") from error
         self._csv = csv.writer(self._episodes, lineterminator="\n")
         if sizes is None:
             self._csv.writerow(EPISODE_FIELDS)
-        self._board = SummaryWriter(str(path / "tb"))
+        self._problem = ""
 
     def run_id(self) -> int:
         """The random id of this run, drawn when it began, which tells it from others of its name; raises RunError."""
@@ -61,14 +60,16 @@ class RunDirectory:
         place = (number, record.env_step, update, f"{record.actor:x}", record.stream)
         values = (f"{value:.6g}" for value in (end.epsilon, s, end.q1_mean, end.q2_mean))
         self._csv.writerow((*place, f"{end.episode_return:g}", end.length, *values, end.param_version))
-        self._board.add_scalar("episode/return", end.episode_return, record.env_step)
+        self._board.add("episode/return", end.episode_return, record.env_step)
+        self._look()
 
     def metrics(self, row: dict[str, Any]) -> None:
         """Add a line to metrics.jsonl, and the same to TensorBoard."""
         self._metrics.write(json.dumps(row) + "\n")
         for name, value in row.items():
             if name not in ("time", "env_step"):
-                self._board.add_scalar(f"train/{name}", value, row["env_step"])
+                self._board.add(f"train/{name}", value, row["env_step"])
+        self._look()
 
     def summary(self, values: dict[str, Any]) -> None:
         """Write summary.json, whole or not at all."""
@@ -76,19 +77,20 @@ class RunDirectory:
 
     def sizes(self) -> dict[str, int]:
         """How long the files that grow are now, in bytes."""
-        self.flush()
         return {name: (self.path / name).stat().st_size for name in ("episodes.csv", "metrics.jsonl")}
 
-    def flush(self) -> None:
-        """Hand everything written so far to the operating system."""
-        self._episodes.flush()
-        self._metrics.flush()
-
     def close(self) -> None:
-        """Flush and close all files."""
+        """Close all files."""
         self._episodes.close()
         self._metrics.close()
         self._board.close()
+
+    def _look(self) -> None:
+        """Say once that there is no space, and once that there is again; no line is lost between the two."""
+        problem = self._episodes.problem or self._metrics.problem
+        if problem != self._problem:
+            print(f"{self.path}: {problem or 'can be written again'}", flush=True)
+        self._problem = problem
 
     def __enter__(self) -> Self:
         return self

@@ -80,6 +80,7 @@ class ReplayCore:
     """A table with its limiter and its books. One owner makes all calls.
 
     drawn: batches drawn, as the learner counts them: one that comes back from an epoch takes the count back with it.
+    problem: why no segment can be taken although the limiter admits it, in words; empty where there is none.
     """
 
     def __init__(self, config: RunConfig, spec: EnvSpec, recorder: Recorder | None = None) -> None:
@@ -100,6 +101,7 @@ class ReplayCore:
         self.batch_size = config.learner.batch_size
         self.drawn = 0
         self.duplicates = 0
+        self.problem = ""
         self.inserts_wait_for = ""
         self.samples_wait_for = ""
         self._seen = SeenWindow()
@@ -136,8 +138,9 @@ class ReplayCore:
         if not reason:
             try:
                 self.recorder.insert(payload)
+                self.problem = ""
             except OSError as error:
-                reason = f"the journal can't be written: {error.strerror or error}"
+                reason = self.problem = f"the journal can't be written: {error.strerror or error}"
         self.inserts_wait_for = reason or ""
         if reason:
             return Wait(reason)
@@ -170,6 +173,8 @@ class ReplayCore:
         reason = None
         if request.sequence >= self.drawn:
             reason = self.limiter.why_not_sample(self.table.inserted, self.drawn, len(self.table))
+        if reason and self.problem:
+            reason = f"{reason}; {self.problem}"
         self.samples_wait_for = reason or ""
         if reason:
             return Wait(reason)

@@ -68,7 +68,11 @@ class ReplayService:
 
     def run(self, stop: Stop) -> None:
         """Tell displays what goes on, until the stop."""
+        problem = ""
         while not stop.wait(STATUS_EVERY):
+            if problem != self._core.problem:
+                problem = self._core.problem
+                print(problem or "the journal can be written again", flush=True)
             stats = self.stats()
             self._node.publish_status(
                 {

@@ -14,6 +14,7 @@ from test_epochs import CONFIG, save
 from common import experience
 from common.errors import RunError, UsageError
 from common.experience import DrawRequest
+from common.files import LineFile
 from common.types import EnvSpec
 from replay.core import ReplayCore, Wait
 from replay.epochs import ReplayEpochs
@@ -121,6 +122,7 @@ def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
     before = core.drawn
     while _draw(core):
         pass
+    assert core.samples_wait_for.endswith("; the journal can't be written: No space left on device")
     assert core.drawn > before, "training goes on as far as the limiter lets it"
     with pytest.raises(RunError, match="No space left on device"):
         save(core, epochs, 1)
@@ -146,3 +148,18 @@ def test_priorities_are_carried_out_again(spec: EnvSpec, tmp_path: Path) -> None
     twin = ReplayCore(config, spec)
     recover(twin, tmp_path, 1, 5)
     _assert_alike(core, twin)
+
+
+def test_lines_wait_for_space(small_disk: Path) -> None:
+    lines = LineFile(small_disk / "lines", go_on=False)
+    (small_disk / "filler").write_bytes(bytes(250_000))
+    written = ""
+    while not lines.problem:
+        lines.write(line := f"line {len(written)}\n")
+        written += line
+    assert lines.problem == "No space left on device"
+    (small_disk / "filler").unlink()
+    lines.write("the end\n")
+    assert not lines.problem
+    lines.close()
+    assert (small_disk / "lines").read_text() == f"{written}the end\n"
