@@ -5,14 +5,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 
+
+@pytest.mark.timeout(240)  # a busy machine starts eight processes slowly
 def test_four_kills(tmp_path: Path) -> None:
-    flags = ["--kills=4", "--total-steps=2000", "--checkpoint-every=400", "--longest-pause=1", "--give-up=100"]
+    flags = ["--kills=4", "--total-steps=1200", "--checkpoint-every=200", "--longest-pause=1", "--give-up=200"]
     done = subprocess.run(
         [sys.executable, "-m", "deploy.chaos", f"--run-dir={tmp_path / 'run'}", *flags],
         capture_output=True,
         text=True,
-        timeout=115,
+        timeout=230,
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
