@@ -36,5 +36,5 @@ def _run() -> None:
     # Imported once the flags are known to be right: the statistics' libraries take seconds.
     from experiments.report.writer import write_report  # noqa: PLC0415
 
-    index = write_report(options.runs, options.out or options.runs / "report")
-    print(index)
+    index, tables = write_report(options.runs, options.out or options.runs / "report")
+    print(tables[0].markdown(), index, sep="\n")

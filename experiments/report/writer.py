@@ -10,10 +10,11 @@ from experiments.report.page import page
 from experiments.report.plots import draw
 from experiments.report.results import tables
 from experiments.report.study import load_study
+from experiments.report.table import ResultTable
 
 
-def write_report(runs: Path, out: Path) -> Path:
-    """Write the report of a folder of runs; the page's path.
+def write_report(runs: Path, out: Path) -> tuple[Path, list[ResultTable]]:
+    """Write the report of a folder of runs; the page's path and the tables.
 
     Raises:
         UsageError: the folder holds no run, or the report's can't be written.
@@ -36,4 +37,4 @@ def write_report(runs: Path, out: Path) -> Path:
         index.write_text(page(study, runs, results, drawn, lacking), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror}") from error
-    return index
+    return index, results
