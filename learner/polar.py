@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,42 +35,32 @@ def whitened(gram: Tensor, e: Tensor) -> tuple[Tensor, Tensor | None]:
     eps |C^(-1)| <= eps sum_i (C^(-1))_ii: rows of very different length do no harm, rows that are nearly parallel do.
     Those sums are the variance inflation factors of statistics.
     """
+    limits = _LIMITS[gram.dtype]
     if gram.shape[-1] == 2:
-        return _whitened_pairs(gram, e)
-    white, doubtful = _whitened_by_eigh(gram.double(), e.double(), _LIMITS[gram.dtype])
+        white, doubtful = _whitened_pairs(gram, e, limits)
+    else:
+        white, doubtful = _whitened_by_eigh(gram.double(), e.double(), limits)
     if doubtful is not None:
         white.masked_fill_(doubtful.unsqueeze(-1), 0)
     return white.to(gram.dtype), doubtful
 
 
-def _whitened_pairs(gram: Tensor, e: Tensor) -> tuple[Tensor, Tensor | None]:
+def _whitened_pairs(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Tensor | None]:
     """The closed form for 2 x 2: G^(-1/2) = ((t + d) I - G) / (d sqrt(t + 2 d)) with d^2 = det G and t = tr G.
 
-    By numpy on the host, whose operations on so few numbers cost a fraction of PyTorch's.
+    In g's own dtype: the determinant loses no more to rounding than the limit on inflation allows.
     """
-    limits = _LIMITS[gram.dtype]
-    g, x = gram.cpu().numpy().astype(np.float64), e.cpu().numpy().astype(np.float64)
-    a, b, c = g[..., 0, 0], g[..., 1, 1], g[..., 0, 1]
-    first, second = x[..., 0], x[..., 1]
-    with np.errstate(over="ignore", invalid="ignore"):
-        product, trace = a * b, a + b
-        determinant = product - c * c
-        # Both variance inflation factors are product / determinant; determinant / trace is below the shorter row's
-        # square.
-        sure = determinant > product * (2 / limits.inflation) + trace * limits.square
-    doubtful = None if sure.all() else ~sure
-    if doubtful is not None:
-        g[doubtful], determinant[doubtful], trace[doubtful] = 0, 1, 0
-    d = np.sqrt(determinant)
-    scale = np.sqrt(trace + 2 * d) * d
-    white = np.stack((((b + d) * first - c * second) / scale, ((a + d) * second - c * first) / scale), axis=-1)
-    if doubtful is not None:
-        white *= sure[..., None]
-    dtype, device = gram.dtype, gram.device
-    return (
-        torch.from_numpy(white).to(device, dtype),
-        None if doubtful is None else torch.from_numpy(doubtful).to(device),
-    )
+    a, c, _, b = g.flatten(-2).unbind(-1)
+    first, second = e.unbind(-1)
+    product, trace = a * b, a + b
+    determinant = torch.addcmul(product, c, c, value=-1)
+    # Both variance inflation factors are product / determinant; determinant / trace is below the shorter row's square.
+    margin = torch.sub(determinant, product, alpha=2 / limits.inflation).sub_(trace, alpha=limits.square)
+    doubtful = None if float(margin.min()) > 0 else (margin > 0).logical_not_()
+    d = determinant.sqrt_()
+    scale = torch.add(trace, d, alpha=2).sqrt_().mul_(d)
+    white = ((b + d) * first).addcmul_(c, second, value=-1), ((a + d) * second).addcmul_(c, first, value=-1)
+    return torch.stack(white, -1).div_(scale.unsqueeze(-1)), doubtful
 
 
 def _whitened_by_eigh(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Tensor | None]:
