@@ -2,9 +2,11 @@
 
     python benchmarks/edl.py [--rounds 15]
 
-One thread, float32, batch 32. An update is: targets, forward, feedback, RMSprop step on the flat buffer. The
-methods of a network take turns in one process, each on its own copy of it; a round times each once. Printed are the
-median milliseconds and the ratio to the hand-written gradient's, with its lowest and highest value over five blocks.
+One thread, float32, batch 32. An update is the learner's: it takes a drawn batch of transitions and makes targets,
+forward pass, feedback and RMSProp step. The methods of a network take turns in one process, each with its own networks;
+a round gives each one turn. Printed are the median milliseconds and the ratio to the hand-written gradient's ("none"),
+with its lowest and highest value over five blocks. Yardsticks: "autograd" is the same update as PyTorch users write it,
+"weight-gradient svd" calls an SVD on each weight gradient.
 """
 
 from __future__ import annotations
@@ -12,67 +14,108 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from common.networks import FlatNetwork, build_network
-from common.types import EnvSpec
+from common.config import RunConfig, validated
+from common.networks import build_network
+from common.types import Batch, EnvSpec
+from learner.agent import Agent
+from learner.backprop import Tape
 from learner.edl import FeedbackRule
 
 BATCH, GAMMA, RATE = 32, 0.99, 0.1
 BLOCKS = 5
 
+Update = Callable[[], object]
 
-class Update:
-    """One network, its target and its optimizer on a fixed batch; calling it makes one update."""
 
-    def __init__(self, kind: str, spec: EnvSpec, method: str, double: bool) -> None:
-        self.online = FlatNetwork(build_network(kind, spec, (128, 128, 128), seed=0))
-        self.target = FlatNetwork(build_network(kind, spec, (128, 128, 128), seed=1))
-        self.optimizer = torch.optim.RMSprop([self.online.flat], lr=1e-5)
-        generator = torch.Generator().manual_seed(2)
-        self.obs, self.next_obs = torch.rand(2, BATCH, *spec.obs_shape, generator=generator)
-        self.actions = torch.randint(spec.num_actions, (BATCH, 1), generator=generator)
-        self.rewards = torch.rand(BATCH, 1, generator=generator)
-        self.double, self.method = double, method
-        feedback, polar_dtype = ("transform", torch.bfloat16) if method == "transform bf16" else (method, None)
-        if method in ("autograd", "weight-gradient svd"):
-            feedback = "none"
-        self.rule = FeedbackRule(self.online.module, feedback, polar_dtype=polar_dtype)
-        self.target_rule = FeedbackRule(self.target.module)
+def random_batch(spec: EnvSpec) -> Batch:
+    """A batch of transitions that share no frame but within a transition."""
+    rng = np.random.default_rng(0)
+    span = spec.stack + 1
+    shape = (BATCH * span, *spec.frame_shape)
+    frames = rng.standard_normal(shape, np.float32) if spec.frame_dtype == "float32" else rng.integers(256, size=shape)
+    index = np.arange(BATCH * span, dtype=np.int32).reshape(BATCH, span)
+    return Batch(
+        frames=frames.astype(spec.frame_dtype),
+        obs_index=index[:, :-1],
+        next_index=index[:, 1:],
+        actions=rng.integers(spec.num_actions, size=BATCH).astype(np.int32),
+        rewards=rng.random(BATCH).astype(np.float32),
+        terminated=np.zeros(BATCH, np.bool_),
+        weights=np.ones(BATCH, np.float32),
+        ids=np.arange(BATCH),
+        param_version=np.zeros(BATCH, np.int64),
+        age=np.arange(BATCH),
+        reuse=np.ones(BATCH, np.int32),
+    )
 
-    def __call__(self) -> None:
-        if self.method == "autograd":
-            self.autograd()
-        else:
-            tape = self.rule.forward(self.obs)
-            targets = self.targets(lambda x: self.rule.forward(x).output, lambda x: self.target_rule.forward(x).output)
-            error = torch.zeros_like(tape.output)
-            error.scatter_(1, self.actions, (tape.output.gather(1, self.actions) - targets).div_(BATCH))
-            self.rule.backward(tape, error, RATE, self.online.gradients)
-            if self.method == "weight-gradient svd":
-                for g in (g for g in self.online.gradients.values() if g.dim() > 1):
-                    u, s, vh = torch.linalg.svd(g.flatten(1), full_matrices=False)
-                    g.copy_(((u * (s + RATE)) @ vh).view(g.shape))
-        self.optimizer.step()
 
-    def targets(self, online: Callable[[Tensor], Tensor], target: Callable[[Tensor], Tensor]) -> Tensor:
-        """Bellman targets [batch, 1]."""
+def settings(kind: str, method: str, double: bool) -> RunConfig:
+    """A run whose learner uses the feedback that `method` names."""
+    feedback, _, dtype = method.partition(" ")
+    gradient = method == "none" or feedback == "autograd" or dtype == "svd"
+    edl = {"rate": RATE, "polar_dtype": "bfloat16" if dtype == "bf16" else "float32"}
+    return validated(
+        {
+            "method": "g-coop" if gradient else "coop",
+            "network": {"kind": kind},
+            "learner": {"gamma": GAMMA, "double": double, "learning_rate": 1e-5, "swap_every": 10**9},
+            "edl": edl if gradient else {**edl, "feedback": feedback},
+        }
+    )
+
+
+class SvdRule(FeedbackRule):
+    """The weight-gradient feedback by an SVD of each weight gradient."""
+
+    def backward(self, tape: Tape, error: Tensor, s: float, out: Mapping[str, Tensor]) -> None:
+        """See `FeedbackRule`."""
+        super().backward(tape, error, 0.0, out)
+        for gradient in out.values():
+            if gradient.dim() > 1:
+                u, values, vh = torch.linalg.svd(gradient.flatten(1), full_matrices=False)
+                gradient.copy_(((u * (values + RATE)) @ vh).view(gradient.shape))
+
+
+def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:
+    """A call of it is one update on the same batch."""
+    batch, config = random_batch(spec), settings(kind, method, double)
+    if method == "autograd":
+        return autograd(config, spec, batch)
+    agent = Agent(config, spec)
+    if method.endswith("svd"):
+        agent._rules = [SvdRule(network.module) for network in agent.networks]
+    return lambda: agent.update(batch)
+
+
+def autograd(config: RunConfig, spec: EnvSpec, batch: Batch) -> Update:
+    """The gradient method with PyTorch's modules, autograd and RMSprop."""
+    online, target = (build_network(config.network.kind, spec, config.network.hidden, seed) for seed in (0, 1))
+    optimizer = torch.optim.RMSprop(online.parameters(), lr=config.learner.learning_rate)
+
+    def update() -> None:
+        frames = torch.as_tensor(batch.frames)
+        frames = frames.float() / 255 if frames.dtype == torch.uint8 else frames
+        obs, next_obs = (
+            frames[torch.as_tensor(i)].view(-1, *spec.obs_shape) for i in (batch.obs_index, batch.next_index)
+        )
+        actions = torch.as_tensor(batch.actions).long().unsqueeze(1)
         with torch.no_grad():
-            values = target(self.next_obs)
-            best = values.amax(1, keepdim=True)
-            if self.double:
-                best = values.gather(1, online(self.next_obs).argmax(1, keepdim=True))
-            return self.rewards + GAMMA * best
+            values = target(next_obs)
+            best = online(next_obs).argmax(1, keepdim=True) if config.learner.double else values.argmax(1, keepdim=True)
+            discounts = GAMMA * ~torch.as_tensor(batch.terminated)
+            targets = torch.as_tensor(batch.rewards) + discounts * values.gather(1, best).squeeze(1)
+        errors = online(obs).gather(1, actions).squeeze(1) - targets
+        optimizer.zero_grad()
+        (0.5 * errors.square() * torch.as_tensor(batch.weights)).mean().backward()
+        optimizer.step()
 
-    def autograd(self) -> None:
-        """The plain gradient as PyTorch users write it."""
-        targets = self.targets(self.online.module, self.target.module)
-        values = self.online(self.obs).gather(1, self.actions)
-        self.optimizer.zero_grad(set_to_none=False)
-        (0.5 * (values - targets).square().mean()).backward()
+    return update
 
 
 def compare(title: str, updates: dict[str, Update], rounds: int, repeat: int) -> None:
@@ -113,7 +156,7 @@ def main() -> None:
         title = f"{kind}, {spec.num_actions} actions, {'double' if double else 'single'} targets"
         if options.only in title:
             names = [*methods, "weight-gradient", "weight-gradient svd"] if spec.num_actions in (2, 6) else methods
-            compare(title, {name: Update(kind, spec, name, double) for name in names}, options.rounds, repeat)
+            compare(title, {name: make_update(kind, spec, name, double) for name in names}, options.rounds, repeat)
 
 
 if __name__ == "__main__":
