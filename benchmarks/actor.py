@@ -26,10 +26,11 @@ import torch
 from actors.policy import Policy
 from common import messages
 from common.clients import replay_key
-from common.config import RunConfig, load_tables, resolve
+from common.config import RunConfig
 from common.environments import env_spec, make_vector_env
 from common.networks import FlatNetwork, build_network
 from common.processes import ChildProcess, command, free_endpoint
+from common.tables import load_tables, resolve
 from common.transport import NoAnswer, Node, new_incarnation, open_session
 from learner.agent import Agent
 from learner.broadcast import Broadcaster

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from common.config import load_tables, resolve, shortened
 from common.processes import command
+from common.tables import load_tables, resolve, shortened
 from common.types import Array
 
 FRAME_BYTES = 84 * 84

@@ -20,8 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from common.config import RunConfig, validated
+from common.config import RunConfig
 from common.networks import build_network
+from common.tables import validated
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
 from learner.backprop import Tape

@@ -28,10 +28,10 @@ from table import ATARI, segments
 
 from common import experience
 from common.clients import InsertClient, SampleClient
-from common.config import validated
 from common.lifecycle import Stop
 from common.memory import keep_freed_memory
 from common.processes import ChildProcess, command, free_endpoint
+from common.tables import validated
 from common.transport import Node, new_incarnation, open_session
 from learner.reception import Reception
 

@@ -28,12 +28,13 @@ from table import ATARI, segments
 
 from common import messages
 from common.clients import InsertClient, replay_key
-from common.config import RunConfig, load_tables, resolve, to_toml
+from common.config import RunConfig
 from common.joining import join
 from common.lifecycle import Stop
 from common.memory import keep_freed_memory
 from common.messages import Join
 from common.processes import ChildProcess, command, free_endpoint
+from common.tables import load_tables, resolve, to_toml
 from common.transport import NoAnswer, Node, new_incarnation, open_session
 from learner.agent import Agent
 from replay.table import Table

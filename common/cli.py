@@ -13,8 +13,9 @@ from typing import TypeVar
 
 import tyro
 
-from common.config import RunConfig, load_tables, resolve, shortened
+from common.config import RunConfig
 from common.errors import UsageError
+from common.tables import load_tables, resolve, shortened
 
 T = TypeVar("T")
 _FRAME = re.compile(r"[╭╮╰╯│─]+")

@@ -9,10 +9,10 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from common import messages
-from common.config import first_difference, identity
 from common.errors import BadMessage, JoinError
 from common.lifecycle import Stop
 from common.messages import Join, Joined
+from common.tables import first_difference, identity
 from common.transport import NoAnswer, Node, Refused
 
 RETRY_PAUSE = 0.1  # seconds

@@ -18,10 +18,11 @@ from dataclasses import fields as dataclass_fields
 from typing import Any
 
 from common import wire
-from common.config import RunConfig, to_tables, validated
+from common.config import RunConfig
 from common.errors import BadMessage, CoopError, UsageError
 from common.presence import ROLES
 from common.schema import Int, ListOf, Row, Rule, Schema, Table, Text
+from common.tables import to_tables, validated
 from common.types import Array, EnvSpec
 from common.wire import Message
 

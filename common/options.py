@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from common import cli
-from common.config import RunConfig, first_difference, identity, load_tables, resolve, validated
+from common.config import RunConfig
 from common.errors import UsageError
+from common.tables import first_difference, identity, load_tables, resolve, validated
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,14 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.config import RunConfig, check_distributed, to_toml
+from common.config import RunConfig, check_distributed
 from common.environments import env_spec
 from common.errors import RunError, UsageError
 from common.files import write_whole
 from common.lifecycle import Stop, run_main
 from common.options import RunOptions, parse_run
 from common.processes import ChildProcess, command, free_endpoint
+from common.tables import to_toml
 from common.transport import new_incarnation
 from deploy.status import Display, RunStatus
 from deploy.supervisor import RESTARTS, RestartPolicy

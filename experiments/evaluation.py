@@ -10,9 +10,9 @@ import torch
 
 from actors.policy import Policy
 from actors.segments import EpisodeTracker
-from common.config import load_tables, resolve
 from common.environments import make_vector_env
 from common.errors import UsageError
+from common.tables import load_tables, resolve
 from learner.agent import make_network
 from learner.epochs import complete_epochs, load_learner
 

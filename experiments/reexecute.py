@@ -11,10 +11,11 @@ from typing import Any
 
 import torch
 
-from common.config import RunConfig, load_tables, resolve
+from common.config import RunConfig
 from common.environments import env_spec
 from common.errors import RunError, UsageError
 from common.experience import DrawRequest
+from common.tables import load_tables, resolve
 from common.types import Batch
 from learner.agent import Agent
 from learner.epochs import complete_epochs, load_learner, newest_epoch

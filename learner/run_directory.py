@@ -10,10 +10,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from common.config import RunConfig, to_toml
+from common.config import RunConfig
 from common.errors import RunError
 from common.experience import EpisodeRecord
 from common.files import LineFile, write_whole
+from common.tables import to_toml
 from learner.board import Board
 
 EPISODE_FIELDS = (

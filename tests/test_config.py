@@ -6,19 +6,20 @@ from typing import Any
 
 import pytest
 
-from common import config, schedules
+from common import schedules
 from common.cli import base_config
 from common.config import ActorSettings, EdlSettings, LearnerSettings
 from common.errors import UsageError
 from common.options import RunOptions, parse_run
+from common.tables import load_tables, preset_names, resolve, to_toml
 
 
-@pytest.mark.parametrize("preset", config.preset_names())
+@pytest.mark.parametrize("preset", preset_names())
 @pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
 def test_presets_resolve_and_come_back_from_toml(preset: str, method: str) -> None:
-    resolved = config.resolve(config.load_tables(preset, None), method)
+    resolved = resolve(load_tables(preset, None), method)
     assert resolved.method == method
-    assert config.resolve(tomllib.loads(config.to_toml(resolved))) == resolved
+    assert resolve(tomllib.loads(to_toml(resolved))) == resolved
 
 
 def test_a_method_table_overrides_the_rest() -> None:
@@ -82,7 +83,7 @@ def test_refused_in_one_line(flags: list[str], words: list[str], monkeypatch: py
 )
 def test_files_are_refused_by_field(tables: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError) as caught:
-        config.resolve(tables)
+        resolve(tables)
     assert words in str(caught.value)
 
 
@@ -90,7 +91,7 @@ def test_a_file_that_is_not_toml(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text("a = = 1")
     with pytest.raises(UsageError, match=r"c\.toml"):
-        config.load_tables(None, path)
+        load_tables(None, path)
 
 
 @pytest.mark.parametrize(

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from samples import make_segment
 
 from common import experience, limits, messages, wire
-from common.config import RunConfig, to_tables
+from common.config import RunConfig
 from common.errors import BadMessage, RunError
 from common.experience import BatchReader, Drawn, DrawRequest, EpisodeRecord, SegmentReader
 from common.limits import Limits
 from common.messages import Join, Joined, ReplayStats, Role
+from common.tables import to_tables
 from common.types import Batch, EnvSpec, EpisodeEnd
 from common.wire import Message
 from replay.table import Table

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from common.config import resolve
 from common.errors import UsageError
+from common.tables import resolve
 from experiments.sweep.cli import main
 from experiments.sweep.grid import load_grid, shipped_grids
 
