@@ -34,15 +34,16 @@ def test_another_protocol_is_refused_with_both_versions(
     nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learner, actor = nodes
-    _receive(learner, spec)
-    assert join(actor, Stop(), REQUEST, (), 5) is not None
     with monkeypatch.context() as patch:
         patch.setattr(wire, "PROTOCOL", 7)
         payload = messages.encode_join("test", REQUEST)
         newer = messages.encode_stop("test", "an answer of another protocol")
+    # Before the reception, so that who has joined knows of it too.
+    learner.serve(learner.key("newer"), lambda message: newer)
+    _receive(learner, spec)
+    assert join(actor, Stop(), REQUEST, (), 5) is not None
     with pytest.raises(Refused, match="version 7; this process speaks 1"):
         actor.ask(join_key(actor, "actor"), payload)
-    learner.serve(learner.key("newer"), lambda message: newer)
     with pytest.raises(Refused, match="version 7; this process speaks 1"):
         actor.ask(actor.key("newer"), messages.encode_question("test", "current"))
 
