@@ -12,7 +12,7 @@ from typing import Any
 import pydantic
 import tomli_w
 
-from common.config import ReplaySettings, RunConfig
+from common.config import LearnerSettings, ReplaySettings, RunConfig
 from common.errors import UsageError
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
@@ -40,10 +40,21 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
 
 
 def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
-    """A preset for a run of another length: its `replay.start` is at most a tenth of the run, so that it learns."""
-    replay = tables.get("replay", {})
+    """A preset for a run of another length.
+
+    Its `replay.start` is at most a tenth of the run, so that it learns. In a shorter run the learning rate falls as it
+    does in the preset's own: to the share that it would have reached by then.
+    """
+    replay, learner = tables.get("replay", {}), tables.get("learner", {})
     start = min(replay.get("start", ReplaySettings.start), max(1, total_steps // 10))
-    return {**tables, "total_steps": total_steps, "replay": {**replay, "start": start}}
+    part = min(1.0, total_steps / tables.get("total_steps", RunConfig.total_steps))
+    final = learner.get("learning_rate_final", LearnerSettings.learning_rate_final) ** part
+    return {
+        **tables,
+        "total_steps": total_steps,
+        "replay": {**replay, "start": start},
+        "learner": {**learner, "learning_rate_final": final},
+    }
 
 
 def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:

@@ -108,3 +108,13 @@ def test_a_file_that_is_not_toml(tmp_path: Path) -> None:
 )
 def test_schedules(value: float, expected: float) -> None:
     assert value == pytest.approx(expected)
+
+
+def test_a_shorter_run_of_a_preset_is_how_the_longer_one_begins() -> None:
+    whole = base_config(["--preset", "cartpole"])
+    half = base_config(["--preset", "cartpole", "--total-steps", str(whole.total_steps // 2)])
+    double = base_config(["--preset", "cartpole", "--total-steps", str(whole.total_steps * 2)])
+    for share in (0.1, 0.5, 1.0):
+        expected = schedules.learning_rate(whole.learner, share / 2)
+        assert schedules.learning_rate(half.learner, share) == pytest.approx(expected)
+        assert schedules.learning_rate(double.learner, share) == schedules.learning_rate(whole.learner, share)

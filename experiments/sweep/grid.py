@@ -18,7 +18,7 @@ from pydantic import ConfigDict, Field
 from common.config import Count, Method, Positive, RunConfig, check_distributed
 from common.environments import EnvSettings, env_spec
 from common.errors import UsageError
-from common.tables import first_problem, load_tables, resolve, to_tables, validated
+from common.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 
@@ -135,10 +135,12 @@ def _nested(path: FieldPath, value: Any) -> dict[str, Any]:  # noqa: ANN401 (a v
 def _cells(file: GridFile) -> tuple[Cell, ...]:
     axes = _axes(file)
     names = _short_names(tuple(axes))
-    bases = {method: to_tables(resolve(load_tables(file.preset, None), method)) for method in file.methods}
+    preset = load_tables(file.preset, None)
     cells = []
     for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
-        tables = _merged(bases[method], file.fixed)
+        total_steps = dict(zip(axes, values, strict=True)).get(("total_steps",), file.fixed.get("total_steps"))
+        fitting = shortened(preset, total_steps) if type(total_steps) is int and total_steps > 0 else preset
+        tables = _merged(to_tables(resolve(fitting, method)), file.fixed)
         for path, value in zip(axes, values, strict=True):
             tables = _merged(tables, _nested(path, value))
         parts = [f"{name}={_word(value)}" for name, value in zip(names, values, strict=True)]
