@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
+from rich.console import Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
+from common.display import LiveDisplay
 from common.lifecycle import Stop
 from common.schema import Int, ListOf, Real, Rule, Text
 from common.schema import Table as TableOf
@@ -96,25 +96,15 @@ def _can_be_shown(fields: Mapping[str, Any]) -> bool:
     return all(rule.problem(fields.get(name)) is None for name, rule in _SHOWN.items())
 
 
-class Display:
-    """Shows a status: a live panel on a terminal, a line now and then elsewhere."""
+class Display(LiveDisplay):
+    """Shows a status."""
 
     def __init__(self, status: RunStatus) -> None:
+        super().__init__(PLAIN_EVERY, refreshes=4)
         self._status = status
-        self._console = Console()
-        self._live = Live(console=self._console, refresh_per_second=4, transient=True)
-        self._due = time.monotonic() + PLAIN_EVERY
         self._missing: list[str] = []
         self._over = Stop()  # after it they leave
         status.follow_stop(self._over)
-
-    def __enter__(self) -> Display:
-        if self._console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
 
     def update(self) -> None:
         """Show what the status says now."""
@@ -123,17 +113,14 @@ class Display:
         for name in set(missing) - set(self._missing):
             self.say(f"{name} does not answer")
         self._missing = missing
-        if self._console.is_terminal:
-            self._live.update(self._panel())
-        elif time.monotonic() >= self._due:
-            self._due = time.monotonic() + PLAIN_EVERY
-            self.say(self._status.line())
+        super().update()
 
-    def say(self, text: str) -> None:
-        """Print a line that stays."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+    def line(self) -> str:
+        """The status in one line."""
+        return self._status.line()
 
-    def _panel(self) -> RenderableType:
+    def picture(self) -> RenderableType:
+        """The status as a panel."""
         told = self._status.learner
         table = Table(show_header=False, box=None)
         table.add_column(style="dim")

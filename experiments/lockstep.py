@@ -17,13 +17,14 @@ from common.config import RunConfig
 from common.environments import Steps, make_vector_env
 from common.errors import UsageError
 from common.experience import Drawn, EpisodeRecord
+from common.randomness import generator_state, set_generator_state
 from common.types import EpisodeEnd
 from learner.agent import Agent
 from learner.curve import draw_learning_curve
 from learner.epochs import load_learner, save_epoch
 from learner.run_directory import RunDirectory
 from learner.telemetry import Telemetry
-from replay.table import Table
+from replay.core import make_table
 
 METRICS_EVERY = 200  # updates
 
@@ -46,16 +47,7 @@ class Lockstep:
         self._policy_rng = np.random.default_rng(policy_seed)
         first, second = self.agent.networks
         self._policy = Policy((first, second), self.env.spec, self._policy_rng)
-        replay = config.replay
-        self._table = Table(
-            self.env.spec,
-            replay.capacity,
-            eviction=replay.eviction,
-            sampling=replay.sampling,
-            rng=np.random.default_rng([config.seed, 1]),
-            priority_exponent=replay.priority_exponent,
-            importance_exponent=replay.importance_exponent,
-        )
+        self._table = make_table(config, self.env.spec)
         self._episodes = EpisodeTracker(1)
         self._segments = SegmentAssembler(self.env.spec, 1, 0, 1)
         self._actions: list[int] = []
@@ -109,12 +101,11 @@ class Lockstep:
 
     def save(self, directory: RunDirectory) -> None:
         """Save an epoch from which `restore` goes on to the bit."""
-        generator = self._policy_rng.bit_generator.state
         state = {
             "agent": self.agent.state(),
             "telemetry": self.telemetry.state(),
             "step": self.step,
-            "policy": {**generator, "state": {name: str(value) for name, value in generator["state"].items()}},
+            "policy": generator_state(self._policy_rng),
             "sizes": directory.sizes(),
         }
 
@@ -147,11 +138,7 @@ class Lockstep:
         meta = msgpack.unpackb((epoch / "replay" / "state.msgpack").read_bytes(), strict_map_key=False)["table"]
         self._table.load_state(meta, arrays)
         self.agent.load_state(state["agent"])
-        generator = state["policy"]
-        self._policy_rng.bit_generator.state = {
-            **generator,
-            "state": {name: int(value) for name, value in generator["state"].items()},
-        }
+        set_generator_state(self._policy_rng, state["policy"])
         self.telemetry.load_state(state["telemetry"])
         self.step = state["step"]
         sizes: dict[str, int] = state["sizes"]

@@ -23,6 +23,7 @@ from common import schedules
 from common.config import RunConfig
 from common.errors import UsageError
 from common.networks import FlatNetwork, build_network, preprocess
+from common.randomness import generator_state, set_generator_state
 from common.types import Array, Batch, EnvSpec
 from learner.edl import FeedbackRule
 from learner.optimizers import make_optimizer
@@ -131,14 +132,13 @@ class Agent:
 
     def state(self) -> dict[str, Any]:
         """Everything that `load_state` needs; loads with weights_only."""
-        generator = self._noise.bit_generator.state
         return {
             "networks": [network.flat.detach().cpu().clone() for network in self.networks],
             "optimizers": [optimizer.state() for optimizer in self.optimizers],
             "acting": self.acting,
             "updates": self.updates,
             "versions": list(self.versions),
-            "noise": {**generator, "state": {name: str(value) for name, value in generator["state"].items()}},
+            "noise": generator_state(self._noise),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -149,11 +149,7 @@ class Agent:
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
             optimizer.load_state(saved)
         self.acting, self.updates, self.versions = state["acting"], state["updates"], list(state["versions"])
-        noise = state["noise"]
-        self._noise.bit_generator.state = {
-            **noise,
-            "state": {name: int(value) for name, value in noise["state"].items()},
-        }
+        set_generator_state(self._noise, state["noise"])
 
     def _half_networks(self) -> list[FlatNetwork]:
         """Copies of both networks in bfloat16, kept up by `_halve`; none where all is computed in float32."""

@@ -29,9 +29,9 @@ _LIMITS = {torch.float32: _Limits(1e-31, 3e2, 1e-11), torch.float64: _Limits(1e-
 def whitened(gram: Tensor, e: Tensor) -> tuple[Tensor, Tensor | None]:
     """G^(-1/2) e, and where that is doubtful and 0 was put: ([..., m], bool [...] or None for nowhere).
 
-    gram: float32 or float64 [..., m, m], Gram matrices of matrices in that dtype. e: [..., m], broadcast. The
-    algebra is done in float64, so what limits the accuracy is the rounding of gram's entries, eps |t_i| |t_j|. With C
-    the matrix G scaled to a unit diagonal, the polar factor's relative error is about
+    gram: float32 or float64 [..., m, m], Gram matrices of matrices in that dtype. e: [..., m], broadcast. Larger than
+    pairs, the algebra is done in float64; what limits the accuracy is the rounding of gram's entries,
+    eps |t_i| |t_j|. With C the matrix G scaled to a unit diagonal, the polar factor's relative error is about
     eps |C^(-1)| <= eps sum_i (C^(-1))_ii: rows of very different length do no harm, rows that are nearly parallel do.
     Those sums are the variance inflation factors of statistics.
     """

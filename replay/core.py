@@ -85,15 +85,7 @@ class ReplayCore:
 
     def __init__(self, config: RunConfig, spec: EnvSpec, recorder: Recorder | None = None) -> None:
         settings = config.replay
-        self.table = Table(
-            spec,
-            settings.capacity,
-            eviction=settings.eviction,
-            sampling=settings.sampling,
-            rng=np.random.default_rng([config.seed, 1]),
-            priority_exponent=settings.priority_exponent,
-            importance_exponent=settings.importance_exponent,
-        )
+        self.table = make_table(config, spec)
         self.limiter = RateLimiter(
             settings.ratio, settings.start, settings.tolerance, config.total_steps, settings.capacity
         )
@@ -265,3 +257,17 @@ class ReplayCore:
         # Keeping more than can be asked for again costs memory and the processor's caches.
         for sequence in [number for number in self._replies if number < request.base]:
             del self._replies[sequence]
+
+
+def make_table(config: RunConfig, spec: EnvSpec) -> Table:
+    """The table of a run as it starts."""
+    settings = config.replay
+    return Table(
+        spec,
+        settings.capacity,
+        eviction=settings.eviction,
+        sampling=settings.sampling,
+        rng=np.random.default_rng([config.seed, 1]),
+        priority_exponent=settings.priority_exponent,
+        importance_exponent=settings.importance_exponent,
+    )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import UsageError
+from common.randomness import generator_state, set_generator_state
 from common.types import Array, Batch, EnvSpec, Segment
 from replay.frames import FrameStore, Slots, as_slice
 from replay.selection import make_eviction, make_sampling
@@ -194,7 +195,6 @@ class Table:
         distinct, index = self._frames.unique(np.concatenate((slots.reshape(-1), tail_slots[stored])))
         tail_index = np.full(len(tail_slots), -1, np.int32)
         tail_index[stored] = index[slots.size :]
-        generator = self._rng.bit_generator.state
         meta = {
             "settings": self._settings,
             "inserted": self.inserted,
@@ -203,8 +203,7 @@ class Table:
             "max_priority": self._max_priority,
             "reuse_evicted": self._reuse_evicted.tolist(),
             "streams": [[*key, sequence, len(tail)] for key, (sequence, tail) in self._tails.items()],
-            # 128 bits: text, since msgpack's integers end at 64.
-            "rng": {**generator, "state": {name: str(number) for name, number in generator["state"].items()}},
+            "rng": generator_state(self._rng),
         }
         arrays = {name: self._column(name)[:size].copy() for name in COLUMNS}
         arrays["slots"] = index[: slots.size].reshape(slots.shape)
@@ -248,11 +247,7 @@ class Table:
         self._sampled = meta["sampled"]
         self._max_priority = meta["max_priority"]
         self._reuse_evicted[:] = meta["reuse_evicted"]
-        generator = meta["rng"]
-        self._rng.bit_generator.state = {
-            **generator,
-            "state": {name: int(digits) for name, digits in generator["state"].items()},
-        }
+        set_generator_state(self._rng, meta["rng"])
         rows = np.arange(size)
         if self._row_of is not None:
             self._row_of.update(zip(self._ids[rows].tolist(), rows.tolist(), strict=True))

@@ -4,45 +4,23 @@ from __future__ import annotations
 
 import time
 
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
+from rich.console import Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
+from common.display import LiveDisplay
 from experiments.sweep.runner import Runner
 
 PLAIN_EVERY = 30.0  # seconds between lines where the output is no terminal
 
 
-class SweepDisplay:
+class SweepDisplay(LiveDisplay):
     """Live view of a runner."""
 
     def __init__(self, runner: Runner) -> None:
+        super().__init__(PLAIN_EVERY, refreshes=2)
         self._runner = runner
-        self._console = Console()
-        self._live = Live(console=self._console, refresh_per_second=2, transient=True)
         self._began = time.monotonic()
-        self._due = self._began + PLAIN_EVERY
-
-    def __enter__(self) -> SweepDisplay:
-        if self._console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
-
-    def update(self) -> None:
-        """Show how far the cells are."""
-        if self._console.is_terminal:
-            self._live.update(self._table())
-        elif time.monotonic() >= self._due:
-            self._due = time.monotonic() + PLAIN_EVERY
-            self.say(self.line())
-
-    def say(self, text: str) -> None:
-        """Print a line that stays."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def line(self) -> str:
         """The sweep in one line."""
@@ -66,7 +44,8 @@ class SweepDisplay:
         seconds = round(left * (time.monotonic() - self._began) / done)
         return f"about {seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02} left"
 
-    def _table(self) -> RenderableType:
+    def picture(self) -> RenderableType:
+        """The running cells, above the line."""
         table = Table(box=None, header_style="dim")
         for column in ("cell", "steps", "", "return"):
             table.add_column(column, justify="right" if column in ("steps", "return") else "left")

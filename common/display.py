@@ -1,0 +1,51 @@
+"""Shows what goes on: a live picture on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from typing import Self
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+
+
+class LiveDisplay(ABC):
+    """A context that is told to `update` again and again.
+
+    plain_every: seconds between lines where the output is no terminal. refreshes: pictures per second on one.
+    """
+
+    def __init__(self, plain_every: float, refreshes: float) -> None:
+        self._console = Console()
+        self._live = Live(console=self._console, refresh_per_second=refreshes, transient=True)
+        self._plain_every = plain_every
+        self._due = time.monotonic() + plain_every
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def update(self) -> None:
+        """Show how things are now."""
+        if self._console.is_terminal:
+            self._live.update(self.picture())
+        elif time.monotonic() >= self._due:
+            self._due = time.monotonic() + self._plain_every
+            self.say(self.line())
+
+    def say(self, text: str) -> None:
+        """Print a line that stays."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    @abstractmethod
+    def picture(self) -> RenderableType:
+        """How things are, for a terminal."""
+
+    @abstractmethod
+    def line(self) -> str:
+        """How things are, in one line."""
