@@ -7,6 +7,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -136,11 +137,16 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
     axes = _axes(file)
     names = _short_names(tuple(axes))
     preset = load_tables(file.preset, None)
+
+    @cache
+    def base(method: Method, total_steps: int | None) -> dict[str, Any]:
+        return to_tables(resolve(preset if total_steps is None else shortened(preset, total_steps), method))
+
     cells = []
     for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
         total_steps = dict(zip(axes, values, strict=True)).get(("total_steps",), file.fixed.get("total_steps"))
-        fitting = shortened(preset, total_steps) if type(total_steps) is int and total_steps > 0 else preset
-        tables = _merged(to_tables(resolve(fitting, method)), file.fixed)
+        fits = type(total_steps) is int and total_steps > 0  # what is not a number of steps is refused below
+        tables = _merged(base(method, total_steps if fits else None), file.fixed)
         for path, value in zip(axes, values, strict=True):
             tables = _merged(tables, _nested(path, value))
         parts = [f"{name}={_word(value)}" for name, value in zip(names, values, strict=True)]
