@@ -18,6 +18,7 @@ from common.memory import keep_freed_memory
 from common.messages import Join, Joined
 from common.networks import FlatNetwork, build_network
 from common.options import RoleOptions
+from common.threads import use_threads
 from common.transport import Node, new_incarnation, open_session
 
 
@@ -36,7 +37,7 @@ def main() -> None:
 
 def _run() -> None:
     options = cli.parse(ActorOptions, "coop-actor", "Play emulators for a run; the rest comes from its learner.")
-    torch.set_num_threads(1)
+    use_threads(1)
     keep_freed_memory()
     stop = Stop()
     stop.on_signals()

@@ -24,7 +24,7 @@ class FrameBlock:
         self._capacity = max_steps + 4 * spec.stack  # room for some restarts; grows where that is not enough
         self._allocate()
         # Row numbers, in `_free` and `_pushed`, count through all streams: stream * capacity + row.
-        self._free = np.arange(num_envs) * self._capacity
+        self._free = self._first.copy()
         self._pushed = np.empty((max_steps, num_envs), np.int64)
         self._windows = np.arange(max_steps + 1)[:, None] + np.arange(spec.stack)
         self._steps = 0
@@ -69,15 +69,15 @@ class FrameBlock:
             carried: how many of each stream's last frames begin its next round.
         """
         obs_index, next_index = self._indices()
-        used = (self._free - np.arange(self._num_envs) * self._capacity).tolist()
-        frames = [frames[:count] for frames, count in zip(self._frames, used, strict=True)]
+        used = self._free - self._first
+        frames = [frames[:count] for frames, count in zip(self._frames, used.tolist(), strict=True)]
         first = obs_index[:, -1, 0]
-        carried = (used - first).tolist()
+        carried: list[int] = (used - first).tolist()
         self._allocate()
         for stream, count in enumerate(carried):
             self._frames[stream, :count] = frames[stream][-count:]
         self._current = (obs_index[:, -1] - first[:, None]).T
-        self._free = np.arange(self._num_envs) * self._capacity + carried
+        self._free = self._first + carried
         self._most = max(carried)
         self._steps = 0
         self._restarts = []
@@ -86,7 +86,7 @@ class FrameBlock:
     def _indices(self) -> tuple[Rows, Rows]:
         """int32 [envs, steps + 1, stack], what each step starts from and the next one would; [envs, steps, stack]."""
         stack = self._spec.stack
-        pushed = self._pushed[: self._steps] - np.arange(self._num_envs) * self._capacity
+        pushed = self._pushed[: self._steps] - self._first
         rows = np.concatenate([self._current, pushed.astype(np.int32)])
         windows = rows.T.take(self._windows[: self._steps + 1], axis=1)
         obs_index, next_index = windows, windows[:, 1:].copy()
@@ -99,19 +99,19 @@ class FrameBlock:
 
     def _reserve(self, count: int) -> None:
         """Make room for `count` more frames in every stream."""
-        streams = np.arange(self._num_envs)
-        self._most = int((self._free - streams * self._capacity).max())
+        self._most = int((self._free - self._first).max())
         if self._most + count <= self._capacity:
             return
-        old, before = self._frames, self._capacity
+        old, before, first = self._frames, self._capacity, self._first
         self._capacity += before // 2 + count
         self._allocate()
         self._frames[:, :before] = old
-        shift = streams * (self._capacity - before)
+        shift = self._first - first
         self._free += shift
         self._pushed[: self._steps] += shift
 
     def _allocate(self) -> None:
+        self._first = np.arange(self._num_envs) * self._capacity  # row of each stream's first frame
         shape = (self._num_envs * self._capacity, *self._spec.frame_shape)
         self._flat: Array = np.empty(shape, self._spec.frame_dtype)
         self._frames = self._flat.reshape(self._num_envs, self._capacity, *self._spec.frame_shape)

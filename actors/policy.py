@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from common.networks import FlatNetwork, preprocess
 from common.types import Array, EnvSpec
@@ -25,11 +26,10 @@ class Policy:
 
     def act(self, obs: Array, epsilon: float) -> NDArray[np.int32]:
         """Actions, int32 [envs], for <frame_dtype>[envs, *obs_shape]."""
-        random = np.flatnonzero(self._rng.random(len(obs)) < epsilon)
+        actions = np.empty(len(obs), np.int32)
+        random = (self._rng.random(len(obs)) < epsilon).nonzero()[0]
         if len(random) < len(obs):
-            actions = self._values(self.acting, obs).argmax(1).numpy().astype(np.int32)
-        else:
-            actions = np.empty(len(obs), np.int32)
+            actions[:] = self._values(self.acting, obs).argmax(1)
         if len(random):
             actions[random] = self._rng.integers(self._spec.num_actions, size=len(random), dtype=np.int32)
         return actions
@@ -39,7 +39,9 @@ class Policy:
         first, second = (float(self._values(number, obs[None]).mean()) for number in (0, 1))
         return first, second
 
-    @torch.inference_mode()
-    def _values(self, number: int, obs: Array) -> Tensor:
+    def _values(self, number: int, obs: Array) -> NDArray[np.floating[Any]]:
         network = self.networks[number]
-        return network(preprocess(torch.from_numpy(obs), self._spec).to(network.flat.dtype))
+        if network.dense is not None:
+            return network.dense(obs)
+        with torch.inference_mode():
+            return network(preprocess(torch.from_numpy(obs), self._spec).to(network.flat.dtype)).float().numpy()

@@ -31,6 +31,7 @@ from common.environments import env_spec, make_vector_env
 from common.networks import FlatNetwork, build_network
 from common.processes import ChildProcess, command, free_endpoint
 from common.tables import load_tables, resolve
+from common.threads import use_threads
 from common.transport import NoAnswer, Node, new_incarnation, open_session
 from learner.agent import Agent
 from learner.broadcast import Broadcaster
@@ -52,7 +53,7 @@ def run_config(envs: int, dtype: str) -> RunConfig:
 
 def bare(config: RunConfig, end: Connection) -> None:
     """Answers each (what, seconds) with its figures: of "emulation", of "inference" or of "both" in a loop."""
-    torch.set_num_threads(1)
+    use_threads(1)
     spec, envs = env_spec(config.env), config.actor.envs
     env = make_vector_env(config.env, envs, seed=0)
     dtype = torch.bfloat16 if config.network.dtype == "bfloat16" else torch.float32

@@ -18,13 +18,14 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from common.config import RunConfig
 from common.networks import build_network
 from common.tables import validated
+from common.threads import use_threads
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
+from learner.arrays import Array, like
 from learner.backprop import Tape
 from learner.edl import FeedbackRule
 
@@ -74,13 +75,13 @@ def settings(kind: str, method: str, double: bool) -> RunConfig:
 class SvdRule(FeedbackRule):
     """The weight-gradient feedback by an SVD of each weight gradient."""
 
-    def backward(self, tape: Tape, error: Tensor, s: float, out: Mapping[str, Tensor]) -> None:
+    def backward(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
         """See `FeedbackRule`."""
         super().backward(tape, error, 0.0, out)
         for gradient in out.values():
-            if gradient.dim() > 1:
-                u, values, vh = torch.linalg.svd(gradient.flatten(1), full_matrices=False)
-                gradient.copy_(((u * (values + RATE)) @ vh).view(gradient.shape))
+            if gradient.ndim > 1:
+                u, values, vh = torch.linalg.svd(torch.as_tensor(gradient).flatten(1), full_matrices=False)
+                gradient[:] = like(((u * (values + RATE)) @ vh).view(gradient.shape), gradient)
 
 
 def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:
@@ -90,7 +91,7 @@ def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:
         return autograd(config, spec, batch)
     agent = Agent(config, spec)
     if method.endswith("svd"):
-        agent._rules = [SvdRule(network.module) for network in agent.networks]
+        agent._rules = [SvdRule(trainable.chain) for trainable in agent._trainables]
     return lambda: agent.update(batch)
 
 
@@ -148,7 +149,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15, help="rounds in each of the five blocks")
     parser.add_argument("--only", default="", help="print tables whose title holds this text")
     options = parser.parse_args()
-    torch.set_num_threads(1)
+    use_threads(1)
     methods = ["autograd", "none", "transform", "transform bf16"]
     cartpole = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
     cases = [("mlp", cartpole, double, 20) for double in (False, True)]

@@ -17,11 +17,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
-import torch
 from stable_baselines3 import DQN
 from stable_baselines3.common.logger import Logger
 
 from common.cli import base_config
+from common.threads import use_threads
 from experiments.lockstep import Lockstep
 from learner.run_directory import RunDirectory
 
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--steps", type=int, default=500, help="of each, in a round")
     options = parser.parse_args()
-    torch.set_num_threads(1)
+    use_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         players = {"sb3 dqn": rival(), **{name: ours(name, Path(folder) / name) for name in METHODS}}
         for play in players.values():

@@ -23,7 +23,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
-import torch
 from table import ATARI, segments
 
 from common import messages
@@ -35,6 +34,7 @@ from common.memory import keep_freed_memory
 from common.messages import Join
 from common.processes import ChildProcess, command, free_endpoint
 from common.tables import load_tables, resolve, to_toml
+from common.threads import use_threads
 from common.transport import NoAnswer, Node, new_incarnation, open_session
 from learner.agent import Agent
 from replay.table import Table
@@ -56,7 +56,7 @@ def run_config(method: str, dtype: str) -> RunConfig:
 def bare(config: RunConfig, core: int | None, end: Connection) -> None:
     """Answers each ("constant" | "sb3", seconds) with its figures."""
     keep_off(core, own=True)
-    torch.set_num_threads(1)
+    use_threads(1)
     keep_freed_memory()
     table = Table(ATARI, 1024, rng=np.random.default_rng(0))
     table.insert(next(segments(ATARI, 1024)))

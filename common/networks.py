@@ -13,6 +13,7 @@ import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself use
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from common.dense import Dense
 from common.errors import UsageError
 from common.types import EnvSpec
 
@@ -111,13 +112,11 @@ def _function(layer: nn.Module, fresh: bool) -> Callable[[Tensor], Tensor]:
 
 
 class FlatNetwork:
-    """A network whose parameters, and their gradients, are views of one flat buffer each.
+    """A network whose parameters are views of one flat buffer.
 
-    flat: float32 nn.Parameter [P], what an optimizer holds, what is published and stored; `flat.grad` exists from
-        the start and is never replaced (zero it in place: `zero_grad(set_to_none=False)`).
-    module: the network; its named parameters view `flat`, their `.grad` views `flat.grad`.
-    gradient: `flat.grad`.
-    gradients: name -> view of `flat.grad`, in the shape of the parameter.
+    flat: float32 [P] (or the module's dtype), what is trained, published and stored.
+    module: the network; its named parameters view `flat`.
+    dense: the network in numpy, over the same parameters; None where it does not fit (see `Dense.fits`).
     layout: (name, shape) of each parameter in the order of the buffer.
     """
 
@@ -125,17 +124,14 @@ class FlatNetwork:
         parameters = list(module.named_parameters())
         self.module = module
         self.layout: list[tuple[str, tuple[int, ...]]] = [(name, tuple(p.shape)) for name, p in parameters]
-        self.flat = nn.Parameter(torch.cat([p.detach().reshape(-1) for _, p in parameters]))
-        self.gradient = self.flat.grad = torch.zeros_like(self.flat)
-        self.gradients: dict[str, Tensor] = {}
+        self.flat = torch.cat([p.detach().reshape(-1) for _, p in parameters])
         start = 0
-        for name, p in parameters:
-            span = slice(start, start + p.numel())
-            self.gradients[name] = self.gradient[span].view(p.shape)
-            p.data = self.flat.data[span].view(p.shape)
-            p.grad = self.gradients[name]
-            start = span.stop
+        for _, p in parameters:
+            stop = start + p.numel()
+            p.data = self.flat[start:stop].view(p.shape)
+            start = stop
         self._functions = layer_functions(module)
+        self.dense = Dense(module) if Dense.fits(module) else None
 
     def __call__(self, x: Tensor) -> Tensor:
         """The module's output for a preprocessed batch: float32 [batch, *input] -> [batch, num_actions]."""
@@ -149,11 +145,11 @@ class FlatNetwork:
         source = flat if isinstance(flat, Tensor) else torch.tensor(flat)
         if source.shape != self.flat.shape:
             raise ValueError(f"flat parameters: got shape {tuple(source.shape)}, the network has {self.flat.numel()}")
-        self.flat.data.copy_(source)
+        self.flat.copy_(source)
 
     def snapshot(self) -> NDArray[np.float32]:
         """A copy of all parameters on the host: float32 [P]."""
-        array: NDArray[np.float32] = self.flat.detach().to("cpu", copy=True).numpy()
+        array: NDArray[np.float32] = self.flat.to("cpu", copy=True).numpy()
         return array
 
     def layout_digest(self) -> str:

@@ -6,10 +6,9 @@ import math
 import sys
 import time
 
-import torch
-
 from common.lifecycle import Stop, run_main
 from common.options import RunOptions, parse_run
+from common.threads import use_threads
 from experiments.lockstep import Lockstep, finish
 from learner.epochs import newest_epoch
 from learner.run_directory import RunDirectory
@@ -26,7 +25,7 @@ def main() -> None:
 def _run() -> None:
     options = parse_run(RunOptions, "coop-lockstep", "Run Algorithm 1 exactly, in one process without a network.")
     config = options.run_config()
-    torch.set_num_threads(config.learner.threads)
+    use_threads(config.learner.threads)
     path = options.directory()
     stop = Stop()
     stop.on_signals()

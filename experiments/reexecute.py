@@ -16,6 +16,7 @@ from common.environments import env_spec
 from common.errors import RunError, UsageError
 from common.experience import DrawRequest
 from common.tables import load_tables, resolve
+from common.threads import use_threads
 from common.types import Batch
 from learner.agent import Agent
 from learner.epochs import complete_epochs, load_learner, newest_epoch
@@ -58,7 +59,7 @@ def reexecute(run_dir: Path) -> Outcome:
     if final is None or not journal_files(folder):
         raise UsageError(f"{run_dir}: no journal and finished epoch here; was the run started with --replay.journal?")
     expected = load_learner(final)["agent"]
-    torch.set_num_threads(config.learner.threads)
+    use_threads(config.learner.threads)
     agent, core, first = _beginning(config, run_dir, folder, run_id)
     began = agent.updates
     files = following_files(folder, first)

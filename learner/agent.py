@@ -11,6 +11,8 @@ The four methods differ by config only:
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,9 +26,11 @@ from common.config import RunConfig
 from common.errors import UsageError
 from common.networks import FlatNetwork, build_network, preprocess
 from common.randomness import generator_state, set_generator_state
-from common.types import Array, Batch, EnvSpec
+from common.types import Batch, EnvSpec
+from learner.arrays import Array
 from learner.edl import FeedbackRule
 from learner.optimizers import make_optimizer
+from learner.trainable import Trainable
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,16 +69,20 @@ class Agent:
         self.acting = 0
         self.updates = 0
         self.versions = [0, 0]
-        trained = self.networks if config.two_networks else self.networks[:1]
-        self.optimizers = [make_optimizer(settings, network.flat, network.gradient) for network in trained]
-        # What is trained on: error-driven feedback needs the accuracy of float32.
-        self._sources = self._halves or self.networks if config.feedback == "none" else self.networks
         polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
+        self._trainables = [Trainable(network, polar_dtype) for network in self.networks]
+        halves = [Trainable(network, polar_dtype) for network in self._halves]
+        self._targets = halves or self._trainables
+        # What the gradient is made of: error-driven feedback needs the accuracy of float32.
+        self._sources = self._targets if config.feedback == "none" else self._trainables
+        trained = self._trainables if config.two_networks else self._trainables[:1]
+        self.optimizers = [make_optimizer(settings, one.theta, one.gradient) for one in trained]
         self._rules = [
-            FeedbackRule(source.module, config.feedback, config.seed, polar_dtype) for source in self._sources
+            FeedbackRule(source.chain, config.feedback, config.seed, polar_dtype) for source in self._sources
         ]
         self._noise = np.random.default_rng([config.seed, 2])
-        self._decay = _decay_vector(settings.weight_decay, self.networks[0])
+        decay = _decay_vector(settings.weight_decay, self.networks[0].layout)
+        self._decay = None if decay is None else self._trainables[0].take(decay)
 
     def update(self, batch: Batch) -> UpdateResult:
         """Train the acting network on one batch, towards targets of the other one; then swap if it is time.
@@ -83,22 +91,21 @@ class Agent:
         network's with `double`.
         """
         settings, acting = self.config.learner, self.acting
-        network, source, rule = self.networks[acting], self._sources[acting], self._rules[acting]
-        target = (self._halves or self.networks)[1 - acting]
+        trained, source, target = self._trainables[acting], self._sources[acting], self._targets[1 - acting]
         s = self._draw_s()
         with torch.inference_mode():
             states = self._states(batch)
             obs, next_obs = states[: len(batch)], states[len(batch) :]
             # One pass of the acting network over both where its choice of next actions is asked for.
-            tape = rule.forward((states if settings.double else obs).to(source.flat.dtype))
-            td_errors, output_error = self._errors(batch, tape.output, target(next_obs.to(target.flat.dtype)))
+            tape = source.chain.forward(source.take(states if settings.double else obs))
+            td_errors, output_error = self._errors(batch, tape.output, target.values(target.take(next_obs)))
             if settings.double:
                 tape = tape.head(len(batch))
-            rule.backward(tape, output_error.to(source.flat.dtype), s, source.gradients)
-            if source is not network:
-                network.gradient.copy_(source.gradient)
+            self._rules[acting].backward(tape, source.take(output_error), s, source.gradients)
+            if source is not trained:
+                trained.gradient[:] = trained.take(source.gradient)
             if self._decay is not None:
-                network.gradient.addcmul_(self._decay, network.flat)
+                trained.gradient += self._decay * trained.theta
             progress = self.updates / max(1, self.config.planned_updates)
             self.optimizers[acting].step(schedules.learning_rate(settings, progress))
             self._halve(acting)
@@ -109,7 +116,7 @@ class Agent:
         if self.config.two_networks:
             self.acting = 1 - self.acting
         else:
-            self.networks[1].load(self.networks[0].flat.detach())
+            self.networks[1].load(self.networks[0].flat)
             self._halve(1)
             self.versions[1] = self.updates
 
@@ -133,7 +140,7 @@ class Agent:
     def state(self) -> dict[str, Any]:
         """Everything that `load_state` needs; loads with weights_only."""
         return {
-            "networks": [network.flat.detach().cpu().clone() for network in self.networks],
+            "networks": [network.flat.cpu().clone() for network in self.networks],
             "optimizers": [optimizer.state() for optimizer in self.optimizers],
             "acting": self.acting,
             "updates": self.updates,
@@ -159,34 +166,36 @@ class Agent:
 
     def _halve(self, number: int) -> None:
         if self._halves:
-            self._halves[number].load(self.networks[number].flat.detach())
+            self._halves[number].load(self.networks[number].flat)
 
     def _draw_s(self) -> float:
         s = self.exploration_rate()
         return s * float(self._noise.standard_normal()) if self.config.edl.noise == "normal" and s else s
 
-    def _states(self, batch: Batch) -> Tensor:
+    def _states(self, batch: Batch) -> Array:
         """Inputs of the networks [2 batch, *input]: obs, then next_obs."""
+        index = np.concatenate((batch.obs_index, batch.next_index)).reshape(-1)
+        if self._trainables[0].in_numpy:
+            return batch.frames.take(index, axis=0)
         # Copies: arrays from the wire are read-only, and PyTorch warns of viewing those.
-        frames = torch.tensor(batch.frames, device=self.device)
-        index = torch.tensor(np.concatenate((batch.obs_index, batch.next_index)).reshape(-1), device=self.device)
-        return preprocess(frames.index_select(0, index).view(-1, *self.spec.obs_shape), self.spec)
+        frames, places = torch.tensor(batch.frames, device=self.device), torch.tensor(index, device=self.device)
+        return preprocess(frames.index_select(0, places).view(-1, *self.spec.obs_shape), self.spec)
 
-    def _errors(self, batch: Batch, output: Tensor, next_output: Tensor) -> tuple[NDArray[np.float32], Tensor]:
+    def _errors(self, batch: Batch, output: Array, next_output: Array) -> tuple[NDArray[np.float32], Array]:
         """TD errors of the taken actions, float32 [batch], and e with weights and batch mean in it, [batch, actions].
 
         output: of the acting network for obs, and for next_obs below it with `double`. next_output: of the other one.
         In numpy on the host, whose operations on so few numbers cost a fraction of PyTorch's.
         """
         settings, rows = self.config.learner, np.arange(len(batch))
-        values, next_values = output.float().cpu().numpy(), next_output.float().cpu().numpy()
+        values, next_values = _on_host(output), _on_host(next_output)
         best = values[len(batch) :].argmax(1) if settings.double else next_values.argmax(1)
         discounts = np.float32(settings.gamma) * ~batch.terminated
         td_errors = values[rows, batch.actions] - (batch.rewards + discounts * next_values[rows, best])
         clipped = td_errors.clip(-1, 1) if settings.loss == "huber" else td_errors
         output_error = np.zeros_like(next_values)
         output_error[rows, batch.actions] = clipped * batch.weights / np.float32(len(batch))
-        return td_errors, torch.from_numpy(output_error).to(self.device)
+        return td_errors, output_error
 
     def _count(self) -> bool:
         self.updates += 1
@@ -206,6 +215,10 @@ def make_network(
     return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
 
 
+def _on_host(values: Array) -> NDArray[np.float32]:
+    return values.float().cpu().numpy() if isinstance(values, Tensor) else values
+
+
 def _device(name: str) -> torch.device:
     try:
         device = torch.device(name)
@@ -215,14 +228,12 @@ def _device(name: str) -> torch.device:
     return device
 
 
-def _decay_vector(decay: tuple[float, ...], network: FlatNetwork) -> Tensor | None:
-    """lambda(i) of every parameter, float32 [P]; biases share their layer's."""
+def _decay_vector(decay: tuple[float, ...], layout: Sequence[tuple[str, tuple[int, ...]]]) -> Tensor | None:
+    """lambda(i) of every parameter of a network's layout, float32 [P]; biases share their layer's."""
     if not any(decay):
         return None
-    layers = list(dict.fromkeys(name.rsplit(".", 1)[0] for name, _ in network.layout))
+    layers = list(dict.fromkeys(name.rsplit(".", 1)[0] for name, _ in layout))
     if len(decay) not in (1, len(layers)):
         raise UsageError(f"learner.weight_decay = {decay}: give one value, or one for each of {len(layers)} layers")
     by_layer = dict(zip(layers, decay * len(layers) if len(decay) == 1 else decay, strict=True))
-    return torch.cat(
-        [torch.full((int(np.prod(shape)),), by_layer[name.rsplit(".", 1)[0]]) for name, shape in network.layout]
-    ).to(network.flat.device)
+    return torch.cat([torch.full((math.prod(shape),), by_layer[name.rsplit(".", 1)[0]]) for name, shape in layout])

@@ -1,4 +1,4 @@
-"""A hand-written forward and backward for sequences of Linear, Conv2d, ReLU and Flatten, without autograd."""
+"""A hand-written forward and backward for Linear, Conv2d, ReLU and Flatten in PyTorch, without autograd."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself use
 from torch import Tensor, nn
 
 from common.networks import layer_functions
+from learner.arrays import Array
 
 Parametrised = nn.Linear | nn.Conv2d
 
@@ -25,14 +26,14 @@ class Tape:
     output: [batch, actions]. inputs: the input of each step of the chain, [batch, *shape], images channels last.
     """
 
-    output: Tensor
-    inputs: list[Tensor]
+    output: Array
+    inputs: list[Array]
 
     def head(self, batch: int) -> Tape:
         """The tape of the first `batch` samples."""
         return Tape(self.output[:batch], [x[:batch] for x in self.inputs])
 
-    def output_of(self, index: int) -> Tensor:
+    def output_of(self, index: int) -> Array:
         """The output of step `index`: [batch, *shape]; after a ReLU that follows, its shape and sign still hold."""
         return self.inputs[index + 1] if index + 1 < len(self.inputs) else self.output
 
@@ -117,6 +118,21 @@ class Chain:
             out[name + "weight"].copy_(weight_grad)
             if bias is not None:
                 out[name + "bias"].copy_(bias_grad)
+
+    @staticmethod
+    def gram(t: Tensor) -> Tensor:
+        """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
+        return torch.bmm(t, t.mT)
+
+    @staticmethod
+    def combine(weights: Tensor, t: Tensor) -> Tensor:
+        """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""
+        if len(t) < len(weights):
+            return weights @ t[0]
+        if weights.shape[1] == 2:
+            (v, w), (first, second) = weights.unsqueeze(-1).unbind(1), t.unbind(1)
+            return torch.addcmul(v * first, w, second)
+        return torch.bmm(weights.unsqueeze(1), t).squeeze(1)
 
 
 def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-
 from common.clients import SampleClient
 from common.config import check_distributed
 from common.environments import env_spec
 from common.lifecycle import Stop, run_main
 from common.options import RunOptions, parse_run
+from common.threads import use_threads
 from common.transport import Node, locators, new_incarnation, open_session
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
@@ -40,7 +39,7 @@ def _run() -> None:
     config = options.run_config()
     check_distributed(config)
     spec = env_spec(config.env)
-    torch.set_num_threads(config.learner.threads)
+    use_threads(config.learner.threads)
     stop = Stop()
     stop.on_signals()
     path = options.directory()

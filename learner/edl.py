@@ -9,8 +9,8 @@ orthogonal polar factor P(i) = U V^T,
 
 Outside code calls `edl_gradients` and `feedback_matrices`. A learner keeps one `FeedbackRule` per network:
 
-    rule = FeedbackRule(network, feedback="transform")
-    tape = rule.forward(x)                      # tape.output: [batch, actions]; no autograd anywhere
+    rule = FeedbackRule(Chain(network), feedback="transform")
+    tape = rule.chain.forward(x)                # tape.output: [batch, actions]; no autograd anywhere
     rule.backward(tape, error, s, out)          # overwrites out[name], e.g. FlatNetwork.gradients
 
 With s = 0, or feedback "none", backward is plain backpropagation and costs one gradient.
@@ -21,11 +21,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from common.memory import keep_freed_memory
+from learner.arrays import Array, like
 from learner.backprop import Chain, Tape
+from learner.dense import DenseChain
 from learner.polar import polar, polar_of_product
 from learner.transforms import Transforms
 
@@ -33,49 +36,52 @@ FEEDBACKS = ("none", "transform", "weight-gradient", "random")
 
 
 class FeedbackRule:
-    """Forward and backward of one network under one feedback.
+    """The backward pass of one network under one feedback.
 
+    chain: the network, in PyTorch or in numpy; arrays of the same library go in and come out.
     feedback: "none" (backpropagation), "transform" (the equations above), "weight-gradient" (backpropagation, then
         U (S + s I) V^T of each weight gradient; biases plain) or "random" (fixed B(i), direct feedback alignment).
     seed: draws the fixed matrices of "random", and nothing else.
     polar_dtype: dtype of the passes that only the polar part needs; T(i)^T e is exact always. None: the network's.
+        Of a `Chain` only.
     """
 
     def __init__(
-        self, network: nn.Module, feedback: str = "transform", seed: int = 0, polar_dtype: torch.dtype | None = None
+        self,
+        chain: Chain | DenseChain,
+        feedback: str = "transform",
+        seed: int = 0,
+        polar_dtype: torch.dtype | None = None,
     ) -> None:
         if feedback not in FEEDBACKS:
             raise ValueError(f"feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
         keep_freed_memory()
-        self.chain = Chain(network)
+        self.chain = chain
         self.feedback = feedback
         self._seed = seed
         self._polar_dtype = polar_dtype
-        self._fixed: dict[int, Tensor] = {}
+        self._fixed: dict[int, Array] = {}
 
-    def forward(self, x: Tensor) -> Tape:
-        """Run the network on float x [batch, *input]."""
-        return self.chain.forward(x)
-
-    def backward(self, tape: Tape, error: Tensor, s: float, out: Mapping[str, Tensor]) -> None:
+    def backward(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
         """Write one gradient per named parameter into `out`.
 
-        error: [batch, actions], the output error e with the batch mean already in it. s: the exploration rate.
+        tape: of the chain's forward pass. error: [batch, actions], the output error e with the batch mean already in
+        it. s: the exploration rate. The caller keeps autograd off.
         """
-        with torch.no_grad():
+        with np.errstate(all="ignore"):  # a run that diverges goes on, as it does in PyTorch
             if self.feedback == "random":
                 for index in self.chain.parametrised:
                     self.chain.write(tape, index, self._aligned(tape, index, error), out)
             elif self.feedback == "transform" and s != 0:
                 self._transform(tape, error, s, out)
             else:
-                for index, delta in self.chain.walk(tape, error.unsqueeze(1)):
-                    self.chain.write(tape, index, delta.squeeze(1), out)
+                for index, delta in self.chain.walk(tape, error[:, None]):
+                    self.chain.write(tape, index, delta[:, 0], out)
                     if self.feedback == "weight-gradient" and s != 0:
-                        gradient = out[self.chain.names[index] + "weight"].flatten(1)
-                        gradient.add_(_polar_of_gradient(gradient, delta.squeeze(1), tape.inputs[index]), alpha=s)
+                        gradient = out[self.chain.names[index] + "weight"]
+                        gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index])
 
-    def _transform(self, tape: Tape, error: Tensor, s: float, out: Mapping[str, Tensor]) -> None:
+    def _transform(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
         """sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e for every layer, then its gradients."""
         transforms = Transforms(self.chain, tape, self._polar_dtype)
         if self._polar_dtype is None:
@@ -83,27 +89,31 @@ class FeedbackRule:
                 self.chain.write(tape, index, sigma, out)
         else:
             polar_parts = dict(transforms.pull(error, s, polar_only=True))
-            for index, delta in self.chain.walk(tape, error.unsqueeze(1)):
-                self.chain.write(tape, index, delta.squeeze(1) + polar_parts[index], out)
+            for index, delta in self.chain.walk(tape, error[:, None]):
+                self.chain.write(tape, index, delta[:, 0] + polar_parts[index], out)
 
-    def _aligned(self, tape: Tape, index: int, error: Tensor) -> Tensor:
+    def _aligned(self, tape: Tape, index: int, error: Array) -> Array:
         """B(i)^T e with the fixed B(i) of layer `index`; the last layer's is the identity, as T(d) is."""
         shape = tape.output_of(index).shape
         if index == self.chain.parametrised[-1]:
-            return error.view(shape)
+            return error.reshape(shape)
         if index not in self._fixed:
             size = math.prod(shape[1:])
-            generator = torch.Generator().manual_seed(self._seed * 1000 + index)
+            layer = self.chain.parametrised.index(index)
+            generator = torch.Generator().manual_seed(self._seed * 1000 + layer)
             draw = torch.randn(error.shape[1], size, generator=generator, dtype=torch.float64) / math.sqrt(size)
-            self._fixed[index] = draw.to(error)
-        return (error @ self._fixed[index]).view(shape)
+            self._fixed[index] = like(draw, error)
+        return (error @ self._fixed[index]).reshape(shape)
 
 
-def _polar_of_gradient(gradient: Tensor, delta: Tensor, h: Tensor) -> Tensor:
-    """U V^T of a weight gradient [m, n]; that of a Linear layer is delta^T h, which lacks rank in a small batch."""
-    if delta.dim() == 2 and len(delta) < min(gradient.shape):
-        return polar_of_product(delta, h)
-    return polar(gradient)
+def _polar_of_gradient(gradient: Array, delta: Array, h: Array) -> Array:
+    """U V^T of a weight gradient [m, ...]; that of a Linear layer is delta^T h, which lacks rank in a small batch."""
+    matrix = torch.as_tensor(gradient).flatten(1)
+    if delta.ndim == 2 and len(delta) < min(matrix.shape):
+        factor = polar_of_product(torch.as_tensor(delta), torch.as_tensor(h))
+    else:
+        factor = polar(matrix)
+    return like(factor.view(gradient.shape), gradient)
 
 
 def edl_gradients(
@@ -122,9 +132,10 @@ def edl_gradients(
     exploration rate. feedback, seed, polar_dtype: see FeedbackRule. Raises UnsupportedLayerError for a network that is
     not a sequence of Linear, Conv2d, ReLU and Flatten.
     """
-    rule = FeedbackRule(network, feedback, seed, polar_dtype)
+    chain = Chain(network)
     out = {name: torch.empty_like(p) for name, p in network.named_parameters()}
-    rule.backward(rule.forward(obs), output_error, s, out)
+    with torch.no_grad():
+        FeedbackRule(chain, feedback, seed, polar_dtype).backward(chain.forward(obs), output_error, s, out)
     return out
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from common.config import LearnerSettings
+from learner.arrays import Array, like, namespace
 
 _TINY = 1e-37  # below any square that counts, above the denormals
 
@@ -18,12 +19,15 @@ _TINY = 1e-37  # below any square that counts, above the denormals
 class Optimizer(ABC):
     """Moves parameters theta against their gradient g.
 
-    theta, gradient: float32 [P], read and written in place. buffers: running means by name, float32 [P]. steps: taken.
+    theta, gradient: float32 [P], of PyTorch or numpy, read and written in place. buffers: running means by name,
+    float32 [P]. steps: taken.
     """
 
-    def __init__(self, theta: Tensor, gradient: Tensor, *buffers: str) -> None:
-        self.theta, self.gradient = theta.detach(), gradient
-        self.buffers = {name: torch.zeros_like(gradient) for name in buffers}
+    def __init__(self, theta: Array, gradient: Array, *buffers: str) -> None:
+        self.theta, self.gradient = theta, gradient
+        self._xp = namespace(theta)
+        self.buffers = {name: self._xp.zeros_like(gradient) for name in buffers}
+        self._scratch = self._xp.zeros_like(gradient)
         self.steps = 0
 
     def step(self, rate: float) -> None:
@@ -36,33 +40,55 @@ class Optimizer(ABC):
 
     def state(self) -> dict[str, Tensor | int]:
         """What `load_state` needs; loads with weights_only."""
-        return {"steps": self.steps, **{name: buffer.cpu().clone() for name, buffer in self.buffers.items()}}
+        copies = {name: torch.as_tensor(buffer).cpu().clone() for name, buffer in self.buffers.items()}
+        return {"steps": self.steps, **copies}
 
     def load_state(self, state: dict[str, Tensor | int]) -> None:
         """Go on where `state` was taken."""
         self.steps = int(state["steps"])
         for name, buffer in self.buffers.items():
-            buffer.copy_(torch.as_tensor(state[name]))
+            buffer[:] = like(torch.as_tensor(state[name]), buffer)
 
+    def _times(self, array: Array, factor: float) -> Array:
+        """The product, in the scratch memory."""
+        return self._xp.multiply(array, factor, out=self._scratch)
 
-def _root(square: Tensor, out: Tensor) -> Tensor:
-    """sqrt(square) in `out`, for values >= 0: by rsqrt, since sqrt takes many times as long for 0 and denormals."""
-    return torch.add(square, _TINY, out=out).rsqrt_().mul_(square)
+    def _average(self, name: str, decay: float) -> Array:
+        """Let the buffer follow g: x <- decay x + (1 - decay) g."""
+        buffer = self.buffers[name]
+        buffer *= decay
+        buffer += self._times(self.gradient, 1 - decay)
+        return buffer
+
+    def _average_square(self, decay: float) -> Array:
+        """Let the buffer "square" follow g^2: v <- decay v + (1 - decay) g^2."""
+        square = self.buffers["square"]
+        scratch = self._xp.multiply(self.gradient, self.gradient, out=self._scratch)
+        scratch *= 1 - decay
+        square *= decay
+        square += scratch
+        return square
+
+    def _root(self, square: Array) -> Array:
+        """sqrt(square) in the scratch memory; off 0 and denormals, whose roots take many times as long."""
+        scratch = self._xp.add(square, _TINY, out=self._scratch)
+        return self._xp.sqrt(scratch, out=scratch)
 
 
 class SGD(Optimizer):
     """m <- momentum m + g;  theta <- theta - rate m."""
 
-    def __init__(self, theta: Tensor, gradient: Tensor, momentum: float) -> None:
+    def __init__(self, theta: Array, gradient: Array, momentum: float) -> None:
         super().__init__(theta, gradient, *(["velocity"] if momentum else []))
         self._momentum = momentum
 
     def _step(self, rate: float) -> None:
+        moved = self.gradient
         if self._momentum:
-            velocity = self.buffers["velocity"].mul_(self._momentum).add_(self.gradient)
-            self.theta.sub_(velocity, alpha=rate)
-        else:
-            self.theta.sub_(self.gradient, alpha=rate)
+            moved = self.buffers["velocity"]
+            moved *= self._momentum
+            moved += self.gradient
+        self.theta -= self._times(moved, rate)
 
 
 class RMSProp(Optimizer):
@@ -71,20 +97,20 @@ class RMSProp(Optimizer):
     Then theta <- theta - rate u; with momentum, m <- momentum m + u takes the place of u.
     """
 
-    def __init__(self, theta: Tensor, gradient: Tensor, decay: float, constant: float, momentum: float) -> None:
+    def __init__(self, theta: Array, gradient: Array, decay: float, constant: float, momentum: float) -> None:
         super().__init__(theta, gradient, "square", *(["velocity"] if momentum else []))
         self._decay, self._constant, self._momentum = decay, constant, momentum
-        self._scratch = torch.empty_like(gradient)
 
     def _step(self, rate: float) -> None:
-        g = self.gradient
-        square = self.buffers["square"].mul_(self._decay).addcmul_(g, g, value=1 - self._decay)
-        root = _root(square, self._scratch).add_(self._constant)
+        root = self._root(self._average_square(self._decay))
+        root += self._constant
+        moved = self._xp.divide(self.gradient, root, out=root)
         if self._momentum:
-            velocity = self.buffers["velocity"].mul_(self._momentum).addcdiv_(g, root)
-            self.theta.sub_(velocity, alpha=rate)
-        else:
-            self.theta.addcdiv_(g, root, value=-rate)
+            velocity = self.buffers["velocity"]
+            velocity *= self._momentum
+            velocity += moved
+            moved = velocity
+        self.theta -= self._times(moved, rate)
 
 
 class MnihRMSProp(Optimizer):
@@ -94,17 +120,18 @@ class MnihRMSProp(Optimizer):
     theta <- theta - rate g / sqrt(v - m^2 + constant).
     """
 
-    def __init__(self, theta: Tensor, gradient: Tensor, decay: float, constant: float, momentum: float) -> None:
+    def __init__(self, theta: Array, gradient: Array, decay: float, constant: float, momentum: float) -> None:
         super().__init__(theta, gradient, "square", "mean")
         self._decay, self._constant, self._momentum = decay, constant, momentum
-        self._scratch = torch.empty_like(gradient)
 
     def _step(self, rate: float) -> None:
-        g = self.gradient
-        mean = self.buffers["mean"].lerp_(g, 1 - self._momentum)
-        square = self.buffers["square"].mul_(self._decay).addcmul_(g, g, value=1 - self._decay)
-        inverse = torch.addcmul(square, mean, mean, value=-1, out=self._scratch).add_(self._constant).rsqrt_()
-        self.theta.addcmul_(g, inverse, value=-rate)
+        mean = self._average("mean", self._momentum)
+        square = self._average_square(self._decay)
+        root = self._xp.multiply(mean, mean, out=self._scratch)
+        self._xp.subtract(square, root, out=root)
+        root += self._constant
+        self._xp.sqrt(root, out=root)
+        self.theta -= self._times(self._xp.divide(self.gradient, root, out=root), rate)
 
 
 class Adam(Optimizer):
@@ -114,21 +141,21 @@ class Adam(Optimizer):
     theta <- theta - rate (m / (1 - b1^k)) / (sqrt(v / (1 - b2^k)) + constant).
     """
 
-    def __init__(self, theta: Tensor, gradient: Tensor, decays: tuple[float, float], constant: float) -> None:
+    def __init__(self, theta: Array, gradient: Array, decays: tuple[float, float], constant: float) -> None:
         super().__init__(theta, gradient, "mean", "square")
         self._decays, self._constant = decays, constant
-        self._scratch = torch.empty_like(gradient)
 
     def _step(self, rate: float) -> None:
-        g, (first, second) = self.gradient, self._decays
-        mean = self.buffers["mean"].lerp_(g, 1 - first)
-        square = self.buffers["square"].mul_(second).addcmul_(g, g, value=1 - second)
+        first, second = self._decays
+        mean = self._average("mean", first)
         correction = (1 - second**self.steps) ** 0.5
-        root = _root(square, self._scratch).add_(self._constant * correction)
-        self.theta.addcdiv_(mean, root, value=-rate * correction / (1 - first**self.steps))
+        root = self._root(self._average_square(second))
+        root += self._constant * correction
+        moved = self._xp.divide(mean, root, out=root)
+        self.theta -= self._times(moved, rate * correction / (1 - first**self.steps))
 
 
-def make_optimizer(settings: LearnerSettings, theta: Tensor, gradient: Tensor) -> Optimizer:
+def make_optimizer(settings: LearnerSettings, theta: Array, gradient: Array) -> Optimizer:
     """The configured optimizer of parameters theta, float32 [P], and their gradient."""
     decay, constant, momentum = settings.squared_decay, settings.denominator, settings.momentum
     match settings.optimizer:

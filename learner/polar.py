@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from learner.arrays import Array, like, namespace
+
 _SMALL = 8  # the shorter side up to which an SVD is quicker than the algebra around a Gram matrix
 
 
@@ -23,10 +25,10 @@ class _Limits:
     ratio: float
 
 
-_LIMITS = {torch.float32: _Limits(1e-31, 3e2, 1e-11), torch.float64: _Limits(1e-292, 1e6, 1e-9)}
+_LIMITS = {4: _Limits(1e-31, 3e2, 1e-11), 8: _Limits(1e-292, 1e6, 1e-9)}  # by the bytes of a number
 
 
-def whitened(gram: Tensor, e: Tensor) -> tuple[Tensor, Tensor | None]:
+def whitened(gram: Array, e: Array) -> tuple[Array, Array | None]:
     """G^(-1/2) e, and where that is doubtful and 0 was put: ([..., m], bool [...] or None for nowhere).
 
     gram: float32 or float64 [..., m, m], Gram matrices of matrices in that dtype. e: [..., m], broadcast. Larger than
@@ -35,32 +37,36 @@ def whitened(gram: Tensor, e: Tensor) -> tuple[Tensor, Tensor | None]:
     eps |C^(-1)| <= eps sum_i (C^(-1))_ii: rows of very different length do no harm, rows that are nearly parallel do.
     Those sums are the variance inflation factors of statistics.
     """
-    limits = _LIMITS[gram.dtype]
+    limits = _LIMITS[gram.itemsize]
     if gram.shape[-1] == 2:
         white, doubtful = _whitened_pairs(gram, e, limits)
     else:
-        white, doubtful = _whitened_by_eigh(gram.double(), e.double(), limits)
+        wide, unsafe = _whitened_by_eigh(torch.as_tensor(gram).double(), torch.as_tensor(e).double(), limits)
+        white, doubtful = like(wide, gram), None if unsafe is None else namespace(gram).asarray(unsafe)
     if doubtful is not None:
-        white.masked_fill_(doubtful.unsqueeze(-1), 0)
-    return white.to(gram.dtype), doubtful
+        white[namespace(gram).broadcast_to(doubtful, white.shape[:-1])] = 0
+    return white, doubtful
 
 
-def _whitened_pairs(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Tensor | None]:
+def _whitened_pairs(g: Array, e: Array, limits: _Limits) -> tuple[Array, Array | None]:
     """The closed form for 2 x 2: G^(-1/2) = ((t + d) I - G) / (d sqrt(t + 2 d)) with d^2 = det G and t = tr G.
 
     In g's own dtype: the determinant loses no more to rounding than the limit on inflation allows.
     """
-    a, c, _, b = g.flatten(-2).unbind(-1)
-    first, second = e.unbind(-1)
+    a, b, c = g[..., 0, 0], g[..., 1, 1], g[..., 0, 1]
+    first, second = e[..., 0], e[..., 1]
     product, trace = a * b, a + b
-    determinant = torch.addcmul(product, c, c, value=-1)
+    determinant = product - c * c
     # Both variance inflation factors are product / determinant; determinant / trace is below the shorter row's square.
-    margin = torch.sub(determinant, product, alpha=2 / limits.inflation).sub_(trace, alpha=limits.square)
-    doubtful = None if float(margin.min()) > 0 else (margin > 0).logical_not_()
-    d = determinant.sqrt_()
-    scale = torch.add(trace, d, alpha=2).sqrt_().mul_(d)
-    white = ((b + d) * first).addcmul_(c, second, value=-1), ((a + d) * second).addcmul_(c, first, value=-1)
-    return torch.stack(white, -1).div_(scale.unsqueeze(-1)), doubtful
+    margin = determinant - (2 / limits.inflation) * product - limits.square * trace
+    doubtful = None if float(margin.min()) > 0 else ~(margin > 0)
+    d = determinant**0.5
+    scale = d * (trace + 2 * d) ** 0.5
+    top = ((b + d) * first - c * second) / scale
+    white = namespace(g).empty((*top.shape, 2), dtype=top.dtype, device=top.device)
+    white[..., 0] = top
+    white[..., 1] = ((a + d) * second - c * first) / scale
+    return white, doubtful
 
 
 def _whitened_by_eigh(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Tensor | None]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
-from itertools import groupby
 
 import torch
 from torch import Tensor
 
+from learner.arrays import Array, like, namespace
 from learner.backprop import Chain, Tape
+from learner.dense import DenseChain
 from learner.polar import polar_by_svd, whitened
+
+_SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
 
 
 class Transforms:
@@ -22,104 +24,90 @@ class Transforms:
     network's own dtype. T of a Linear layer at the end is the identity and is not held.
     """
 
-    def __init__(self, chain: Chain, tape: Tape, dtype: torch.dtype | None = None) -> None:
+    def __init__(self, chain: Chain | DenseChain, tape: Tape, dtype: torch.dtype | None = None) -> None:
         """dtype: what to compute the T(i) in, the network's if None; their algebra is done in float32 or better."""
-        output = tape.output
-        self._batch, self._actions = output.shape
-        self._basis = _basis(chain.output_weight, output)
-        walk = chain.walk(
-            tape, self._basis.unsqueeze(0) if dtype is None else self._basis.unsqueeze(0).to(dtype), dtype
-        )
+        self._chain = chain
+        self._batch, self._actions = tape.output.shape
+        self._basis = _basis(chain.output_weight, tape.output)
+        start = self._basis[None] if dtype is None else self._basis[None].to(dtype)
+        walk = chain.walk(tape, start, dtype)
         self._linear_end = next(walk)[0] if chain.output_weight is not None else None
         # The layers held, the last first: step, shape of its output, and T as [batch or 1, A, n].
-        self._layers: list[tuple[int, torch.Size]] = []
-        self._ts: list[Tensor] = []
+        self._layers: list[tuple[int, tuple[int, ...]]] = []
+        self._ts: list[Array] = []
         for index, t in walk:
             self._layers.append((index, t.shape[2:]))
-            self._ts.append(_flat(t) if dtype is None else _flat(t).to(output.dtype))
-        # Neighbours of one shape are handled together: [layers, batch or 1, A, n].
-        groups = [list(group) for _, group in groupby(self._ts, Tensor.size)]
-        self._groups = [torch.stack(group) if len(group) > 1 else group[0].unsqueeze(0) for group in groups]
+            self._ts.append(_flat(t) if dtype is None else _flat(t).to(tape.output.dtype))
 
-    def pull(self, error: Tensor, s: float, polar_only: bool = False) -> Iterator[tuple[int, Tensor]]:
+    def pull(self, error: Array, s: float, polar_only: bool = False) -> Iterator[tuple[int, Array]]:
         """(step, B(i)^T e) for each layer, the last first: error [batch, A] -> [batch, *shape].
 
         polar_only: s (U V^T)^T e instead of (T(i) + s U V^T)^T e.
         """
         if self._linear_end is not None:
-            yield self._linear_end, error * s if polar_only else torch.add(error, error, alpha=s)
-        e = torch.mm(error, self._basis.t())
-        layers = iter(zip(self._layers, self._ts, strict=True))
-        for ts in self._groups:
-            white, doubtful = whitened(self._gram(ts), e)
-            sigmas = _combined(white * s if polar_only else torch.add(e, white, alpha=s), ts)
-            for i, sigma in enumerate(sigmas.unbind(0)):
-                (index, shape), t = next(layers)
-                if doubtful is not None:
-                    where = doubtful[i]
-                    sigma[where] += s * (e[where].unsqueeze(-2) @ self._by_svd(t, where)).squeeze(-2)
-                yield index, _shaped(sigma, shape)
+            yield self._linear_end, error * (s if polar_only else 1 + s)
+        if not self._ts:
+            return
+        e = error @ self._basis.T
+        white, doubtful = whitened(self._grams(), e)
+        weights = s * white if polar_only else e + s * white
+        for i, ((index, shape), t) in enumerate(zip(self._layers, self._ts, strict=True)):
+            sigma = self._chain.combine(weights[i], t)
+            if doubtful is not None and doubtful[i].any():
+                where = doubtful[i]
+                sigma[where] += s * (e[where][:, None] @ self._by_svd(t, where))[:, 0]
+            yield index, _shaped(sigma, shape)
 
-    def matrices(self, s: float) -> list[tuple[int, Tensor]]:
+    def matrices(self, s: float) -> list[tuple[int, Array]]:
         """(step, B(i) = T(i) + s U V^T), the last first: [batch, A, n_i], images in the order of channels first."""
         found = []
-        units = torch.eye(self._actions, dtype=self._basis.dtype, device=self._basis.device)
+        units = like(torch.eye(self._actions), self._basis)
         if self._linear_end is not None:
-            found.append((self._linear_end, (units * (1 + s)).expand(self._batch, -1, -1)))
-        for (index, shape), t in zip(self._layers, self._ts, strict=True):
-            root, doubtful = whitened(self._gram(t.unsqueeze(0))[0].unsqueeze(1), units)
-            b = t + s * (root @ t)
+            whole = (self._batch, self._actions, self._actions)
+            found.append((self._linear_end, namespace(units).broadcast_to(units * (1 + s), whole)))
+        if not self._ts:
+            return found
+        roots, doubtful = whitened(self._grams()[:, :, None], units)
+        for i, ((index, shape), t) in enumerate(zip(self._layers, self._ts, strict=True)):
+            b = t + s * (roots[i] @ t)
             if doubtful is not None:
-                where = doubtful.squeeze(1)
+                where = doubtful[i, :, 0]
                 b[where] += s * self._by_svd(t, where)
             b = self._basis.mT @ b
-            found.append((index, _shaped(b.flatten(0, 1), shape).reshape(b.shape)))
+            found.append((index, _shaped(b.reshape(-1, b.shape[-1]), shape).reshape(b.shape)))
         return found
 
-    def _gram(self, ts: Tensor) -> Tensor:
-        """G(i) = T(i) T(i)^T of layers of one shape: [layers, batch, A, A]."""
-        rows = ts.flatten(0, 1)
-        gram = torch.bmm(rows, rows.mT).view(ts.shape[0], -1, self._actions, self._actions)
-        return gram if gram.shape[1] == self._batch else gram.expand(-1, self._batch, -1, -1)
+    def _grams(self) -> Array:
+        """G(i) = T(i) T(i)^T of every layer held: [layers, batch, A, A]."""
+        xp, shape = namespace(self._basis), (self._batch, self._actions, self._actions)
+        grams = [self._chain.gram(t) for t in self._ts]
+        whole = [gram if len(gram) == self._batch else xp.broadcast_to(gram, shape) for gram in grams]
+        return xp.concatenate(whole).reshape(-1, *shape)
 
-    def _by_svd(self, t: Tensor, where: Tensor) -> Tensor:
+    def _by_svd(self, t: Array, where: Array) -> Array:
         """Polar factors of the samples of T [batch or 1, A, n] that are true in `where`: [k, A, n]."""
-        return polar_by_svd(t.expand(self._batch, -1, -1)[where])
+        chosen = namespace(t).broadcast_to(t, (self._batch, *t.shape[1:]))[where]
+        return like(polar_by_svd(torch.as_tensor(chosen)), t)
 
 
-def _combined(weights: Tensor, ts: Tensor) -> Tensor:
-    """sum_a w_a t_a: weights [layers, batch, A], ts [layers, batch or 1, A, n] -> [layers, batch, n]."""
-    if weights.shape[-1] == 2:
-        (v, w), (t, u) = weights.unsqueeze(-1).unbind(2), ts.unbind(2)
-        return torch.addcmul(v * t, w, u)
-    if ts.shape[1] < weights.shape[1]:
-        return weights @ ts.squeeze(1)
-    return (weights.unsqueeze(-2) @ ts).squeeze(-2)
-
-
-def _basis(output_weight: Tensor | None, like: Tensor) -> Tensor:
+def _basis(output_weight: Array | None, output: Array) -> Array:
     """An orthogonal Q [A, A] such that the rows of Q W, for the output weight W [A, n], are near orthogonal."""
-    actions = like.shape[1]
+    actions = output.shape[1]
     if actions == 2:
-        return _sum_and_difference(like.dtype, like.device)
+        return like(_SUM_AND_DIFFERENCE, output)
     if output_weight is None:
-        return torch.eye(actions, dtype=like.dtype, device=like.device)
-    w = output_weight.double()
+        return like(torch.eye(actions), output)
+    w = torch.as_tensor(output_weight).double()
     vectors: Tensor = torch.linalg.eigh((w @ w.mT).nan_to_num_()).eigenvectors
-    return vectors.mT.to(like.dtype)
+    return like(vectors.mT, output)
 
 
-@cache
-def _sum_and_difference(dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=dtype, device=device).mul_(0.5**0.5)
-
-
-def _flat(t: Tensor) -> Tensor:
+def _flat(t: Array) -> Array:
     """[b, A, channels, height, width] with channels last in memory, as [b, A, n] without a copy."""
-    return t.permute(0, 1, 3, 4, 2).flatten(2) if t.dim() == 5 else t
+    return t.permute(0, 1, 3, 4, 2).flatten(2) if t.ndim == 5 else t
 
 
-def _shaped(rows: Tensor, shape: torch.Size) -> Tensor:
+def _shaped(rows: Array, shape: tuple[int, ...]) -> Array:
     """[rows, n] of `_flat` back to [rows, *shape]."""
     if len(shape) == 1:
         return rows

@@ -62,8 +62,9 @@ class FrameStore:
         slots = np.empty(count, np.intp)
         self._free_count -= recycled
         slots[:recycled] = self._free[self._free_count : self._free_count + recycled]
-        slots[recycled:] = np.arange(self._used, self._used + fresh)
-        self._used += fresh
+        if fresh:
+            slots[recycled:] = np.arange(self._used, self._used + fresh)
+            self._used += fresh
         self._rows[slots] = frames.reshape(count, self._elements)
         self._references[slots] = references
         return slots
@@ -77,7 +78,8 @@ class FrameStore:
         np.subtract.at(self._references, slots, np.int32(1))
         gone = slots[self._references[slots] == 0]
         if len(gone):
-            gone = self._distinct(gone)
+            if len(gone) > 1:
+                gone = self._distinct(gone)
             self._free[self._free_count : self._free_count + len(gone)] = gone
             self._free_count += len(gone)
 

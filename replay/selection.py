@@ -126,7 +126,7 @@ class Uniform:
 
     def draw(self, count: int, size: int) -> tuple[Rows, NDArray[np.float32]]:
         """Independent draws; all weights are 1."""
-        return self._rng.integers(0, size, count, dtype=np.intp), np.ones(count, np.float32)
+        return self._rng.integers(0, size, count), np.ones(count, np.float32)
 
     def prioritise(self, rows: Rows, priorities: Floats) -> None:
         """All are equal."""

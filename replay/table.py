@@ -262,7 +262,8 @@ class Table:
         """
         count = len(segment.frames)
         references = np.bincount(index.reshape(-1), minlength=count)
-        slots = np.full(count, -1, np.intp)
+        slots = np.empty(count, np.intp)
+        slots.fill(-1)
         stream = (segment.incarnation, segment.stream)
         sequence, previous = self._tails.pop(stream, (-1, slots[:0]))
         shared = min(segment.carried, len(previous)) if sequence == segment.sequence - 1 else 0
@@ -271,9 +272,9 @@ class Table:
         tail = max(0, count - max(self.spec.stack, segment.carried))
         references[tail:] += known[tail:] | (references[tail:] > 0)
         wanted = references > 0
-        again = np.flatnonzero(wanted & known)
+        again = (wanted & known).nonzero()[0]
         self._frames.hold(slots[again], references[again])
-        new = np.flatnonzero(wanted & ~known)
+        new = (wanted & ~known).nonzero()[0]
         slots[new] = self._frames.add(segment.frames[as_slice(new)], references[new])
         self._tails[stream] = segment.sequence, slots[tail:].copy()
         if len(self._tails) > MAX_STREAMS:

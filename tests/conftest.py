@@ -8,13 +8,13 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-import torch
 
+from common.threads import use_threads
 from common.transport import Node, new_incarnation, open_session
 from common.types import EnvSpec
 
-# Default threads of several torch processes starve each other.
-torch.set_num_threads(1)
+# With their default threads, several processes starve each other.
+use_threads(1)
 
 # How long an example takes says nothing on a busy machine.
 hypothesis.settings.register_profile("coop", deadline=None)

@@ -1,0 +1,41 @@
+"""A network as training sees it: flat parameters, their gradient, and the passes that make it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from common.networks import FlatNetwork
+from learner.arrays import Array, like, namespace
+from learner.backprop import Chain
+from learner.dense import DenseChain
+
+
+class Trainable:
+    """The network's own parameters and a gradient beside them.
+
+    in_numpy: whether all of it is numpy arrays.
+
+    theta, gradient: <float>[P], in the order of the network's layout. gradients: name -> view of `gradient`, in the
+    shape of the parameter. chain: the network's forward and backward passes. values: its forward pass alone.
+    """
+
+    def __init__(self, network: FlatNetwork, polar_dtype: torch.dtype | None) -> None:
+        """In numpy where the network has a form in it and the polar part (see `FeedbackRule`) no dtype of its own."""
+        dense = network.dense if polar_dtype is None else None
+        self.in_numpy = dense is not None
+        self.chain = Chain(network.module) if dense is None else DenseChain(dense)
+        self.values = dense or network
+        self.theta: Array = network.flat if dense is None else network.flat.numpy()
+        self.gradient: Array = namespace(self.theta).zeros_like(self.theta)
+        self.gradients: dict[str, Array] = {}
+        start = 0
+        for name, shape in network.layout:
+            stop = start + math.prod(shape)
+            self.gradients[name] = self.gradient[start:stop].reshape(shape)
+            start = stop
+
+    def take(self, array: Array) -> Array:
+        """An array of either library as this network's passes take it."""
+        return like(array, self.theta)
