@@ -91,7 +91,7 @@ def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:
         return autograd(config, spec, batch)
     agent = Agent(config, spec)
     if method.endswith("svd"):
-        agent._rules = [SvdRule(trainable.chain) for trainable in agent._trainables]
+        agent._backward = [SvdRule(trainable.chain).backward for trainable in agent._trainables]
     return lambda: agent.update(batch)
 
 

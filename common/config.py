@@ -64,6 +64,8 @@ class LearnerSettings:
     weight_decay: tuple[NonNegative, ...] = ()
     """lambda(i) of each layer, input first; one value holds for all layers; none means 0."""
     device: str = "cpu"
+    compile: bool = False
+    """Run the passes through torch.compile, for GPUs; on a CPU that needs a C++ compiler and gains nothing."""
     threads: Positive = 1
     """CPU threads of torch in the learner."""
     prefetch: Annotated[int, Field(gt=0, le=256)] = 4

@@ -51,7 +51,7 @@ class Dense:
         """What each ReLU makes of x, and the output: [n, batch], a layout in which the products take half the time."""
         column = x.T
         last = len(self.weights) - 1
-        with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges goes on, as it does in PyTorch
+        with np.errstate(over="ignore", invalid="ignore"):  # of networks that diverge, as PyTorch has it
             for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
                 column = weight.dot(column)
                 column += bias

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -31,6 +31,8 @@ from learner.arrays import Array
 from learner.edl import FeedbackRule
 from learner.optimizers import make_optimizer
 from learner.trainable import Trainable
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,16 +72,19 @@ class Agent:
         self.updates = 0
         self.versions = [0, 0]
         polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
-        self._trainables = [Trainable(network, polar_dtype) for network in self.networks]
-        halves = [Trainable(network, polar_dtype) for network in self._halves]
+        in_numpy = polar_dtype is None and not settings.compile
+        self._trainables = [Trainable(network, in_numpy) for network in self.networks]
+        halves = [Trainable(network, in_numpy) for network in self._halves]
         self._targets = halves or self._trainables
         # What the gradient is made of: error-driven feedback needs the accuracy of float32.
         self._sources = self._targets if config.feedback == "none" else self._trainables
         trained = self._trainables if config.two_networks else self._trainables[:1]
         self.optimizers = [make_optimizer(settings, one.theta, one.gradient) for one in trained]
-        self._rules = [
-            FeedbackRule(source.chain, config.feedback, config.seed, polar_dtype) for source in self._sources
-        ]
+        rules = [FeedbackRule(source.chain, config.feedback, config.seed, polar_dtype) for source in self._sources]
+        ready = torch.compile if settings.compile else _as_it_is
+        self._forward = [ready(source.chain.forward) for source in self._sources]
+        self._values = [ready(target.values) for target in self._targets]
+        self._backward = [ready(rule.backward) for rule in rules]
         self._noise = np.random.default_rng([config.seed, 2])
         decay = _decay_vector(settings.weight_decay, self.networks[0].layout)
         self._decay = None if decay is None else self._trainables[0].take(decay)
@@ -93,15 +98,17 @@ class Agent:
         settings, acting = self.config.learner, self.acting
         trained, source, target = self._trainables[acting], self._sources[acting], self._targets[1 - acting]
         s = self._draw_s()
-        with torch.inference_mode():
+        # A run that diverges goes on: numpy then says no more than PyTorch.
+        with torch.inference_mode(), np.errstate(all="ignore"):
             states = self._states(batch)
             obs, next_obs = states[: len(batch)], states[len(batch) :]
             # One pass of the acting network over both where its choice of next actions is asked for.
-            tape = source.chain.forward(source.take(states if settings.double else obs))
-            td_errors, output_error = self._errors(batch, tape.output, target.values(target.take(next_obs)))
+            tape = self._forward[acting](source.take(states if settings.double else obs))
+            next_output = self._values[1 - acting](target.take(next_obs))
+            td_errors, output_error = self._errors(batch, tape.output, next_output)
             if settings.double:
                 tape = tape.head(len(batch))
-            self._rules[acting].backward(tape, source.take(output_error), s, source.gradients)
+            self._backward[acting](tape, source.take(output_error), s, source.gradients)
             if source is not trained:
                 trained.gradient[:] = trained.take(source.gradient)
             if self._decay is not None:
@@ -213,6 +220,10 @@ def make_network(
     """Network 0 or 1 of a run as it starts; the same one for both where the method has one and a copy."""
     seed = int(np.random.SeedSequence([config.seed, number if config.two_networks else 0]).generate_state(1)[0])
     return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
+
+
+def _as_it_is(function: T) -> T:
+    return function
 
 
 def _on_host(values: Array) -> NDArray[np.float32]:

@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -66,20 +65,19 @@ class FeedbackRule:
         """Write one gradient per named parameter into `out`.
 
         tape: of the chain's forward pass. error: [batch, actions], the output error e with the batch mean already in
-        it. s: the exploration rate. The caller keeps autograd off.
+        it. s: the exploration rate. The caller keeps autograd off, and numpy from warning of what is not finite.
         """
-        with np.errstate(all="ignore"):  # a run that diverges goes on, as it does in PyTorch
-            if self.feedback == "random":
-                for index in self.chain.parametrised:
-                    self.chain.write(tape, index, self._aligned(tape, index, error), out)
-            elif self.feedback == "transform" and s != 0:
-                self._transform(tape, error, s, out)
-            else:
-                for index, delta in self.chain.walk(tape, error[:, None]):
-                    self.chain.write(tape, index, delta[:, 0], out)
-                    if self.feedback == "weight-gradient" and s != 0:
-                        gradient = out[self.chain.names[index] + "weight"]
-                        gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index])
+        if self.feedback == "random":
+            for index in self.chain.parametrised:
+                self.chain.write(tape, index, self._aligned(tape, index, error), out)
+        elif self.feedback == "transform" and s != 0:
+            self._transform(tape, error, s, out)
+        else:
+            for index, delta in self.chain.walk(tape, error[:, None]):
+                self.chain.write(tape, index, delta[:, 0], out)
+                if self.feedback == "weight-gradient" and s != 0:
+                    gradient = out[self.chain.names[index] + "weight"]
+                    gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index])
 
     def _transform(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
         """sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e for every layer, then its gradients."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import torch
-
 from common.networks import FlatNetwork
 from learner.arrays import Array, like, namespace
 from learner.backprop import Chain
@@ -21,9 +19,9 @@ class Trainable:
     shape of the parameter. chain: the network's forward and backward passes. values: its forward pass alone.
     """
 
-    def __init__(self, network: FlatNetwork, polar_dtype: torch.dtype | None) -> None:
-        """In numpy where the network has a form in it and the polar part (see `FeedbackRule`) no dtype of its own."""
-        dense = network.dense if polar_dtype is None else None
+    def __init__(self, network: FlatNetwork, in_numpy: bool) -> None:
+        """`in_numpy` asks for numpy, and holds where the network has that form."""
+        dense = network.dense if in_numpy else None
         self.in_numpy = dense is not None
         self.chain = Chain(network.module) if dense is None else DenseChain(dense)
         self.values = dense or network

@@ -13,6 +13,9 @@ from common.threads import use_threads
 from common.transport import Node, new_incarnation, open_session
 from common.types import EnvSpec
 
+# torch.compile's own processes would outlive the tests.
+os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"
+
 # With their default threads, several processes starve each other.
 use_threads(1)
 

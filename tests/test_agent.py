@@ -1,5 +1,6 @@
 """The four methods: who is trained, who gives the targets, and what happens every C updates."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -201,3 +202,24 @@ def test_bfloat16_trains_nearly_as_float32_does(method: Method) -> None:
     resumed.load_state(half.state())
     for batch in _batches(3):
         np.testing.assert_array_equal(resumed.update(batch).td_errors, half.update(batch).td_errors)
+
+
+@pytest.mark.parametrize("method", ["dqn", "coop"])
+def test_a_run_that_diverges_goes_on_quietly(method: Method) -> None:
+    agent = Agent(_config(method), SPEC)
+    for network in agent.networks:
+        network.load(1e20 * network.snapshot())
+    for batch in _batches(3):  # pytest makes an error of every warning
+        result = agent.update(batch)
+    assert not np.isfinite(result.td_errors).all()
+
+
+@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="needs a C++ compiler")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("method", ["dqn", "coop"])
+def test_compiled_updates_are_the_same_updates(method: Method) -> None:
+    plain, compiled = Agent(_config(method), SPEC), Agent(_config(method, compile=True), SPEC)
+    for batch in _batches(5):
+        np.testing.assert_allclose(compiled.update(batch).td_errors, plain.update(batch).td_errors, atol=1e-4)
+    for one, other in zip(plain.networks, compiled.networks, strict=True):
+        torch.testing.assert_close(one.flat, other.flat, rtol=1e-4, atol=1e-5)
