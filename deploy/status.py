@@ -71,11 +71,15 @@ class RunStatus:
         if not told:
             return "waiting for the learner"
         text = (
-            f"step {told['env_steps']:,}/{told['total_steps']:,}  return {told['return_mean_100']:.1f} "
-            f"(last 100 of {told['episodes']:,} episodes)  {told['updates_per_s']:.0f} updates/s  "
+            f"step {told['env_steps']:,}/{told['total_steps']:,}  {self.returns()}  {told['updates_per_s']:.0f} updates/s  "
             f"network {told['acting']} acts  {self.connected()}"
         )
         return f"{text}  [{told['waiting']}]" if told.get("waiting") else text
+
+    def returns(self) -> str:
+        """The mean return, in words."""
+        mean, episodes = self.learner["return_mean_100"], self.learner["episodes"]
+        return f"return {mean:.1f} (last 100 of {episodes:,} episodes)" if episodes else "no episode has ended yet"
 
     def missing(self) -> list[str]:
         """Processes that have gone and that nobody has replaced."""
@@ -130,7 +134,7 @@ class Display(LiveDisplay):
             return table
         rows = {
             "step": f"{told['env_steps']:,} of {told['total_steps']:,}",
-            "return": f"{told['return_mean_100']:.1f}, mean of the last 100 of {told['episodes']:,} episodes",
+            "episodes": self._status.returns(),
             "updates": f"{told['updates']:,}, {told['updates_per_s']:.0f}/s",
             "acting": f"network {told['acting']}, epsilon {told['epsilon']:.3f}, s {told['s']:.3f}",
             "connected": self._status.connected(),
