@@ -71,7 +71,8 @@ class RunStatus:
         if not told:
             return "waiting for the learner"
         text = (
-            f"step {told['env_steps']:,}/{told['total_steps']:,}  {self.returns()}  {told['updates_per_s']:.0f} updates/s  "
+            f"step {told['env_steps']:,}/{told['total_steps']:,}  {self.returns()}  "
+            f"{told['updates_per_s']:.0f} updates/s  "
             f"network {told['acting']} acts  {self.connected()}"
         )
         return f"{text}  [{told['waiting']}]" if told.get("waiting") else text
