@@ -26,6 +26,7 @@ class Optimizer(ABC):
     def __init__(self, theta: Array, gradient: Array, *buffers: str) -> None:
         self.theta, self.gradient = theta, gradient
         self._xp = namespace(theta)
+        self._fused = self._xp is torch  # numpy has no operations that do two things in one pass
         self.buffers = {name: self._xp.zeros_like(gradient) for name in buffers}
         self._scratch = self._xp.zeros_like(gradient)
         self.steps = 0
@@ -49,25 +50,34 @@ class Optimizer(ABC):
         for name, buffer in self.buffers.items():
             buffer[:] = like(torch.as_tensor(state[name]), buffer)
 
-    def _times(self, array: Array, factor: float) -> Array:
-        """The product, in the scratch memory."""
-        return self._xp.multiply(array, factor, out=self._scratch)
-
     def _average(self, name: str, decay: float) -> Array:
-        """Let the buffer follow g: x <- decay x + (1 - decay) g."""
+        """Let a buffer follow g: x <- decay x + (1 - decay) g."""
         buffer = self.buffers[name]
+        if self._fused:
+            return buffer.lerp_(self.gradient, 1 - decay)
         buffer *= decay
-        buffer += self._times(self.gradient, 1 - decay)
+        buffer += self._xp.multiply(self.gradient, 1 - decay, out=self._scratch)
         return buffer
 
     def _average_square(self, decay: float) -> Array:
         """Let the buffer "square" follow g^2: v <- decay v + (1 - decay) g^2."""
         square = self.buffers["square"]
+        square *= decay
+        if self._fused:
+            return square.addcmul_(self.gradient, self.gradient, value=1 - decay)
         scratch = self._xp.multiply(self.gradient, self.gradient, out=self._scratch)
         scratch *= 1 - decay
-        square *= decay
         square += scratch
         return square
+
+    def _descend(self, direction: Array, rate: float, denominator: Array | None = None) -> None:
+        """Let theta <- theta - rate direction / denominator, which may lie in the scratch memory."""
+        if denominator is None:
+            self.theta -= self._xp.multiply(direction, rate, out=self._scratch)
+        elif self._fused:
+            self.theta.addcdiv_(direction, denominator, value=-rate)
+        else:
+            self._descend(self._xp.divide(direction, denominator, out=self._scratch), rate)
 
     def _root(self, square: Array) -> Array:
         """sqrt(square) in the scratch memory; off 0 and denormals, whose roots take many times as long."""
@@ -88,7 +98,7 @@ class SGD(Optimizer):
             moved = self.buffers["velocity"]
             moved *= self._momentum
             moved += self.gradient
-        self.theta -= self._times(moved, rate)
+        self._descend(moved, rate)
 
 
 class RMSProp(Optimizer):
@@ -104,13 +114,13 @@ class RMSProp(Optimizer):
     def _step(self, rate: float) -> None:
         root = self._root(self._average_square(self._decay))
         root += self._constant
-        moved = self._xp.divide(self.gradient, root, out=root)
         if self._momentum:
             velocity = self.buffers["velocity"]
             velocity *= self._momentum
-            velocity += moved
-            moved = velocity
-        self.theta -= self._times(moved, rate)
+            velocity += self._xp.divide(self.gradient, root, out=root)
+            self._descend(velocity, rate)
+        else:
+            self._descend(self.gradient, rate, root)
 
 
 class MnihRMSProp(Optimizer):
@@ -130,8 +140,7 @@ class MnihRMSProp(Optimizer):
         root = self._xp.multiply(mean, mean, out=self._scratch)
         self._xp.subtract(square, root, out=root)
         root += self._constant
-        self._xp.sqrt(root, out=root)
-        self.theta -= self._times(self._xp.divide(self.gradient, root, out=root), rate)
+        self._descend(self.gradient, rate, self._xp.sqrt(root, out=root))
 
 
 class Adam(Optimizer):
@@ -151,8 +160,7 @@ class Adam(Optimizer):
         correction = (1 - second**self.steps) ** 0.5
         root = self._root(self._average_square(second))
         root += self._constant * correction
-        moved = self._xp.divide(mean, root, out=root)
-        self.theta -= self._times(moved, rate * correction / (1 - first**self.steps))
+        self._descend(mean, rate * correction / (1 - first**self.steps), root)
 
 
 def make_optimizer(settings: LearnerSettings, theta: Array, gradient: Array) -> Optimizer:
