@@ -127,7 +127,8 @@ class MnihRMSProp(Optimizer):
     """Mnih et al. 2015: centred, with the constant inside the root.
 
     m <- momentum m + (1 - momentum) g;  v <- decay v + (1 - decay) g^2;
-    theta <- theta - rate g / sqrt(v - m^2 + constant).
+    theta <- theta - rate g / sqrt(max(v - m^2, 0) + constant). The variance v - m^2 is never negative where both decays
+    are equal, as theirs are.
     """
 
     def __init__(self, theta: Array, gradient: Array, decay: float, constant: float, momentum: float) -> None:
@@ -138,7 +139,7 @@ class MnihRMSProp(Optimizer):
         mean = self._average("mean", self._momentum)
         square = self._average_square(self._decay)
         root = self._xp.multiply(mean, mean, out=self._scratch)
-        self._xp.subtract(square, root, out=root)
+        self._xp.clip(self._xp.subtract(square, root, out=root), 0, None, out=root)
         root += self._constant
         self._descend(self.gradient, rate, self._xp.sqrt(root, out=root))
 

@@ -133,6 +133,13 @@ def test_rmsprop_of_mnih() -> None:
     np.testing.assert_allclose(theta.numpy(), expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("momentum", [0.0, 0.9])
+def test_mnihs_rmsprop_stays_finite_where_the_two_decays_differ(momentum: float) -> None:
+    agent = Agent(_config("dqn", optimizer="rmsprop-mnih", momentum=momentum, denominator=0.01), SPEC)
+    for batch in _batches(20):
+        assert np.isfinite(agent.update(batch).td_errors).all()
+
+
 @pytest.mark.parametrize("momentum", [0.0, 0.8])
 @pytest.mark.parametrize(
     ("name", "reference"),
