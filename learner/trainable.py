@@ -11,9 +11,7 @@ from learner.dense import DenseChain
 
 
 class Trainable:
-    """The network's own parameters and a gradient beside them.
-
-    in_numpy: whether all of it is numpy arrays.
+    """The network's own parameters and a gradient beside them, all tensors or, `in_numpy`, all numpy arrays.
 
     theta, gradient: <float>[P], in the order of the network's layout. gradients: name -> view of `gradient`, in the
     shape of the parameter. chain: the network's forward and backward passes. values: its forward pass alone.
