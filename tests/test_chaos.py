@@ -10,7 +10,7 @@ import pytest
 
 @pytest.mark.timeout(240)  # a busy machine starts eight processes slowly
 def test_four_kills(tmp_path: Path) -> None:
-    flags = ["--kills=4", "--total-steps=1200", "--checkpoint-every=200", "--longest-pause=1", "--give-up=200"]
+    flags = ["--kills=4", "--total-steps=3000", "--checkpoint-every=200", "--longest-pause=1", "--give-up=200"]
     done = subprocess.run(
         [sys.executable, "-m", "deploy.chaos", f"--run-dir={tmp_path / 'run'}", *flags],
         capture_output=True,
