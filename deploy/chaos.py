@@ -33,7 +33,7 @@ class ChaosOptions:
     """How many processes to kill with SIGKILL."""
     actors: int = 2
     """Actor processes."""
-    total_steps: int = 20_000
+    total_steps: int = 50_000
     """Environment steps of the run."""
     checkpoint_every: int = 500
     """Updates between epochs."""
