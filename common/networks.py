@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +18,8 @@ from torch import Tensor, nn
 from common.dense import Dense
 from common.errors import UsageError
 from common.types import EnvSpec
+
+ArrayT = TypeVar("ArrayT", Tensor, NDArray[np.float32])
 
 # (out channels, kernel, stride) of each convolution, then the width of the hidden linear layer.
 _CONV_NETWORKS: dict[str, tuple[tuple[tuple[int, int, int], ...], int]] = {
@@ -125,11 +129,8 @@ class FlatNetwork:
         self.module = module
         self.layout: list[tuple[str, tuple[int, ...]]] = [(name, tuple(p.shape)) for name, p in parameters]
         self.flat = torch.cat([p.detach().reshape(-1) for _, p in parameters])
-        start = 0
-        for _, p in parameters:
-            stop = start + p.numel()
-            p.data = self.flat[start:stop].view(p.shape)
-            start = stop
+        for (_, p), view in zip(parameters, self.views(self.flat).values(), strict=True):
+            p.data = view
         self._functions = layer_functions(module)
         self.dense = Dense(module) if Dense.fits(module) else None
 
@@ -138,6 +139,15 @@ class FlatNetwork:
         for function in self._functions:
             x = function(x)
         return x
+
+    def views(self, flat: ArrayT) -> dict[str, ArrayT]:
+        """Each parameter's part of a flat array or tensor [P], by name and in the parameter's shape."""
+        sizes = [math.prod(shape) for _, shape in self.layout]
+        stops = itertools.accumulate(sizes)
+        return {
+            name: flat[stop - size : stop].reshape(shape)
+            for (name, shape), size, stop in zip(self.layout, sizes, stops, strict=True)
+        }
 
     def load(self, flat: Tensor | NDArray[np.float32]) -> None:
         """Overwrite all parameters in place from float32 [P]; raises ValueError for another size."""

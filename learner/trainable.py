@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from common.networks import FlatNetwork
 from learner.arrays import Array, like, namespace
 from learner.backprop import Chain
@@ -25,12 +23,7 @@ class Trainable:
         self.values = dense or network
         self.theta: Array = network.flat if dense is None else network.flat.numpy()
         self.gradient: Array = namespace(self.theta).zeros_like(self.theta)
-        self.gradients: dict[str, Array] = {}
-        start = 0
-        for name, shape in network.layout:
-            stop = start + math.prod(shape)
-            self.gradients[name] = self.gradient[start:stop].reshape(shape)
-            start = stop
+        self.gradients = network.views(self.gradient)
 
     def take(self, array: Array) -> Array:
         """An array of either library as this network's passes take it."""
