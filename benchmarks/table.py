@@ -6,6 +6,7 @@ busy machine. Prints medians with the range over the rounds, then bytes per tran
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -137,6 +138,7 @@ def memory(spec: EnvSpec, capacity: int, steps: int) -> None:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print(
         f"{ROUNDS} alternating rounds of {REPEATS} calls: median (range). x: time over bare copies of the same frames."
     )
