@@ -21,6 +21,9 @@ from common.types import Batch, EnvSpec, Segment
 from common.wire import Message
 
 REPLAY_SHARD = "0"
+# Seconds. A segment may wait behind its whole window while the limiter lets them in one by one; that a peer has gone is
+# noticed sooner, by its link.
+INSERT_TIMEOUT = 60.0
 NO_ANSWER = "the replay service does not answer"
 BAD_ANSWER = "the replay service's answer is bad"
 
@@ -90,7 +93,7 @@ class InsertClient:
                 return False
             self._outstanding.popleft()
         payload = experience.encode_segment(self._node.run, replace(segment, acked=self.acked))
-        self._outstanding.append(_Sent(payload, segment.steps, self._node.begin(self._key, payload)))
+        self._outstanding.append(_Sent(payload, segment.steps, self._send(payload)))
         return True
 
     def drain(self) -> bool:
@@ -113,7 +116,7 @@ class InsertClient:
             except (NoAnswer, BadMessage):
                 return  # the next full window will send it again
             if not accepted:
-                sent.pending = self._node.begin(self._key, sent.payload)
+                sent.pending = self._send(sent.payload)
                 return
             self._outstanding.popleft()
 
@@ -121,7 +124,10 @@ class InsertClient:
         """Wait for one acknowledgement, sending again as often as it takes; False if the stop came first."""
         while True:
             try:
-                if self._accept(sent.pending.wait(), sent):
+                message = self._wait(sent.pending)
+                if message is None:
+                    return False
+                if self._accept(message, sent):
                     return True
             except NoAnswer:
                 self.waiting = NO_ANSWER
@@ -130,7 +136,19 @@ class InsertClient:
             self._on_wait()
             if self._backoff.pause(self._stop):
                 return False
-            sent.pending = self._node.begin(self._key, sent.payload)
+            sent.pending = self._send(sent.payload)
+
+    def _wait(self, pending: Pending) -> Message | None:
+        """The answer, None if the stop came first; raises as `Pending.ready`."""
+        looks = Backoff(0.001, 0.05)
+        while (message := pending.ready()) is None:
+            if looks.pause(self._stop):
+                return None
+            self._on_wait()
+        return message
+
+    def _send(self, payload: bytearray) -> Pending:
+        return self._node.begin(self._key, payload, INSERT_TIMEOUT)
 
     def _accept(self, message: Message, sent: _Sent) -> bool:
         if message.kind == "retry":
