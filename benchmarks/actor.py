@@ -1,9 +1,9 @@
 """An actor process beside a bare loop of the same emulators and network: `python benchmarks/actor.py`.
 
 The actor is a real `coop-actor` that publishes to a real `coop-replay`; it is stopped by signal while the bare loop, in
-a process of its own, takes its turn: emulation alone, inference alone, then both. Ratios are taken in each round, so
-that they hold on a busy machine, and also from steps per second of processor time, of all threads of the process;
-printed are medians with their range.
+a process of its own, takes its turn: emulation alone, inference alone, then both, and both in two processes at once.
+Ratios are taken in each round, so that they hold on a busy machine, and also from processor time, of all threads of the
+process; printed are medians with their range.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import time
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,9 +38,17 @@ from learner.agent import Agent
 from learner.broadcast import Broadcaster
 from learner.reception import Reception
 
-Figures = tuple[float, float]  # steps per second, steps per second of processor time
 EPSILON = 0.1
 RUN = "bench"
+
+
+class Figures(NamedTuple):
+    """Seconds for a step, and of them those in the emulators and those in the network; processor seconds for a step."""
+
+    step: float
+    emulation: float
+    inference: float
+    processor: float
 
 
 def run_config(envs: int, dtype: str) -> RunConfig:
@@ -63,14 +72,43 @@ def bare(config: RunConfig, end: Connection) -> None:
     actions = policy.act(obs, EPSILON)
     while (work := end.recv()) is not None:
         what, seconds = work
-        steps, begun, processor = 0, time.perf_counter(), time.process_time()
-        while (spent := time.perf_counter() - begun) < seconds:
+        steps, emulation, inference = 0, 0.0, 0.0
+        begun, processor = time.perf_counter(), time.process_time()
+        now = begun
+        while now - begun < seconds:
             if what != "emulation":
                 actions = policy.act(obs, EPSILON)
+            acted = time.perf_counter()
+            inference += acted - now
             if what != "inference":
                 obs = env.step(actions).obs
+            now = time.perf_counter()
+            emulation += now - acted
             steps += envs
-        end.send((steps / spent, steps / (time.process_time() - processor)))
+        spent = (now - begun, emulation, inference, time.process_time() - processor)
+        end.send(Figures(*(value / steps for value in spent)))
+
+
+class BareLoops:
+    """Two processes of `bare`."""
+
+    def __init__(self, stack: ExitStack, config: RunConfig) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self._ends: list[Connection] = []
+        for _ in range(2):
+            ours, theirs = spawn.Pipe()
+            process = spawn.Process(target=bare, args=(config, theirs))
+            process.start()
+            stack.callback(process.join)
+            stack.callback(ours.send, None)
+            self._ends.append(ours)
+
+    def figures(self, what: str, seconds: float, processes: int = 1) -> list[Figures]:
+        """Of so many of them at once."""
+        ends = self._ends[:processes]
+        for end in ends:
+            end.send((what, seconds))
+        return [end.recv() for end in ends]
 
 
 class Topology:
@@ -96,8 +134,8 @@ class Topology:
             time.sleep(0.1)
         self._actor.send_signal(signal.SIGSTOP)
 
-    def figures(self, seconds: float) -> Figures:
-        """Of what the actor inserts, from one change of the count to another."""
+    def figures(self, seconds: float) -> tuple[float, float]:
+        """Seconds and processor seconds for a step that the actor inserts, from one change of the count to another."""
         self._actor.send_signal(signal.SIGCONT)
         changes = [(time.perf_counter(), self._processor_seconds(), self._inserted())]
         while len(changes) < 4 or changes[-1][0] - changes[0][0] < seconds:
@@ -107,7 +145,7 @@ class Topology:
         self._actor.send_signal(signal.SIGSTOP)
         # The first turn after the stop is not whole.
         seconds, processor, steps = (last - first for first, last in zip(changes[1], changes[-1], strict=True))
-        return steps / seconds, steps / processor
+        return seconds / steps, processor / steps
 
     def _processor_seconds(self) -> float:
         fields = Path(f"/proc/{self._actor.pid}/stat").read_text().rpartition(")")[2].split()
@@ -131,31 +169,34 @@ def main() -> None:
     config = run_config(options.envs, options.dtype)
     figures: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        spawn = multiprocessing.get_context("spawn")
-        ours, theirs = spawn.Pipe()
-        process = spawn.Process(target=bare, args=(config, theirs))
-        process.start()
-        stack.callback(process.join)
-        stack.callback(ours.send, None)
+        loops = BareLoops(stack, config)
         topology = Topology(stack, config, Path(folder))
         for _ in range(options.rounds):
-            speed = {}
-            for what in ("emulation", "inference", "both"):
-                ours.send((what, options.seconds))
-                speed[what] = ours.recv()
-            speed["actor"] = topology.figures(options.seconds)
-            for name, pair in speed.items():
-                figures.setdefault(f"{name}: steps/s", []).append(pair[0])
-            for place, unit in enumerate(("time", "processor time")):
-                emulation, inference, both, actor = (pair[place] for pair in speed.values())
-                parts = 1 / emulation + 1 / inference
-                figures.setdefault(f"{unit} of both / of emulation + inference", []).append(1 / both / parts)
-                figures.setdefault(f"{unit} of both / of actor", []).append(actor / both)
+            alone = (loops.figures(what, options.seconds)[0] for what in ("emulation", "inference", "both"))
+            emulation, inference, both = alone
+            two = loops.figures("both", options.seconds, processes=2)
+            actor, actor_processor = topology.figures(options.seconds)
+            measured = {
+                "emulation: steps/s": 1 / emulation.step,
+                "inference: steps/s": 1 / inference.step,
+                "both: steps/s": 1 / both.step,
+                "actor: steps/s": 1 / actor,
+                "time of both / of actor": both.step / actor,
+                "processor time of both / of actor": both.processor / actor_processor,
+                "time of both / of emulation + inference in it": both.step / (both.emulation + both.inference),
+                "time of both / of emulation + inference alone": both.step / (emulation.step + inference.step),
+                "  emulation in both / alone": both.emulation / emulation.step,
+                "  inference in both / alone": both.inference / inference.step,
+                "processor time of the same": both.processor / (emulation.processor + inference.processor),
+                "speed of two processes / of one": sum(1 / loop.step for loop in two) * both.step,
+            }
+            for name, value in measured.items():
+                figures.setdefault(name, []).append(value)
     print(f"{options.envs} emulators, {options.rounds} rounds of {options.seconds:g} s: median (lowest to highest)")
     for name, values in figures.items():
         digits = 0 if "steps/s" in name else 3
         middle, low, high = (f"{x:,.{digits}f}" for x in (statistics.median(values), min(values), max(values)))
-        print(f"  {name:45}{middle:>9} ({low} to {high})")
+        print(f"  {name:47}{middle:>9} ({low} to {high})")
 
 
 if __name__ == "__main__":
