@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
 from pathlib import Path
-from typing import Any
 
 import msgpack
 import numpy as np
@@ -23,6 +21,7 @@ from learner.agent import Agent
 from learner.curve import draw_learning_curve
 from learner.epochs import load_learner, save_epoch
 from learner.run_directory import RunDirectory
+from learner.summary import Summary, summarise
 from learner.telemetry import Telemetry
 from replay.core import make_table
 
@@ -145,30 +144,10 @@ class Lockstep:
         return sizes
 
 
-def summary(run: Lockstep, started: float, outcome: str) -> dict[str, Any]:
-    """summary.json of a lockstep run."""
-    config, telemetry = run.config, run.telemetry
-    return {
-        "method": config.method,
-        "env": config.env.id,
-        "seed": config.seed,
-        "env_steps": run.step,
-        "updates": run.agent.updates,
-        "episodes": telemetry.episodes,
-        "return_mean_100": telemetry.return_mean,
-        "return_sd_100": telemetry.return_sd,
-        "wall_seconds": round(time.monotonic() - started, 3),
-        "transitions_accepted": run.step,
-        "transitions_lost": 0,
-        "duplicates_refused": 0,
-        "exit": outcome,
-    }
-
-
-def finish(run: Lockstep, directory: RunDirectory, started: float, outcome: str) -> dict[str, Any]:
+def finish(run: Lockstep, directory: RunDirectory, started: float, outcome: str) -> Summary:
     """Write what a run leaves at its end."""
     run.save(directory)
-    values = summary(run, started, outcome)
-    directory.summary(values)
-    draw_learning_curve(directory.path, f"{values['env']}, {values['method']}, seed {values['seed']}, lockstep")
-    return values
+    summary = summarise(run.agent, run.telemetry, started, outcome, run.step)
+    directory.summary(summary)
+    draw_learning_curve(directory.path, f"{summary.title}, lockstep")
+    return summary

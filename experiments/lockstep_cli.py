@@ -35,12 +35,9 @@ def _run() -> None:
     sizes = None if epoch is None else run.restore(epoch)
     with RunDirectory(path, config, sizes) as directory:
         outcome = _play(run, directory, stop)
-        values = finish(run, directory, started, outcome)
+        summary = finish(run, directory, started, outcome)
     run.env.close()
-    print(
-        f"{outcome}: {run.step:,} steps, {run.agent.updates:,} updates, return of the last 100 episodes "
-        f"{values['return_mean_100']:.1f} ({values['return_sd_100']:.1f}), {values['wall_seconds']:.0f} s; {path}"
-    )
+    print(f"{summary}; {path}")
 
 
 def _play(run: Lockstep, directory: RunDirectory, stop: Stop) -> str:
@@ -57,6 +54,8 @@ def _play(run: Lockstep, directory: RunDirectory, stop: Stop) -> str:
             run.save(directory)
         if time.monotonic() >= due:
             due = time.monotonic() + PROGRESS_EVERY
-            text = f"step {run.step:,}/{config.total_steps:,}  return {run.telemetry.return_mean:.1f}"
+            known = run.telemetry.episodes > 0
+            returns = f"return {run.telemetry.return_mean:.1f}" if known else "no episode has ended yet"
+            text = f"step {run.step:,}/{config.total_steps:,}  {returns}"
             print(text, end="\r" if sys.stdout.isatty() else "\n", flush=True)
     return stop.reason or "complete"

@@ -62,9 +62,4 @@ def _run() -> None:
         if state is not None:
             print(f"goes on from epoch {agent.updates}", flush=True)
         summary = LearnerService(node, stop, agent, directory, samples, checkpoints, state).run()
-    print(
-        f"{summary['exit']}: {summary['env_steps']:,} steps, {summary['updates']:,} updates, return of the last "
-        f"100 episodes {summary['return_mean_100']:.1f} ({summary['return_sd_100']:.1f}), "
-        f"{summary['wall_seconds']:.0f} s",
-        flush=True,
-    )
+    print(summary, flush=True)

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import secrets
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -16,6 +17,7 @@ from common.experience import EpisodeRecord
 from common.files import LineFile, write_whole
 from common.tables import to_toml
 from learner.board import Board
+from learner.summary import Summary
 
 EPISODE_FIELDS = (
     "episode", "env_step", "update", "actor", "stream", "return", "length",
@@ -72,9 +74,9 @@ class RunDirectory:
                 self._board.add(f"train/{name}", value, row["env_step"])
         self._look()
 
-    def summary(self, values: dict[str, Any]) -> None:
+    def summary(self, summary: Summary) -> None:
         """Write summary.json, whole or not at all."""
-        write_whole(self.path / "summary.json", f"{json.dumps(values, indent=2)}\n".encode())
+        write_whole(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
 
     def sizes(self) -> dict[str, int]:
         """How long the files that grow are now, in bytes."""

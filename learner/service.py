@@ -19,6 +19,7 @@ from learner.broadcast import Broadcaster
 from learner.checkpoints import Checkpoints
 from learner.curve import draw_learning_curve
 from learner.run_directory import RunDirectory
+from learner.summary import Summary, summarise
 from learner.targets import target_reached
 from learner.telemetry import Telemetry
 
@@ -67,7 +68,7 @@ class LearnerService:
             self._drawn = Drawn(**state["drawn"], episodes=())
             self._started -= state["seconds"]
 
-    def run(self) -> dict[str, Any]:
+    def run(self) -> Summary:
         """Train to the end; the summary, as it is on disk.
 
         Raises:
@@ -170,13 +171,17 @@ class LearnerService:
         if self._agent.updates:
             self._checkpoints.save(self._state())
 
-    def _finish(self, outcome: str) -> dict[str, Any]:
+    def _finish(self, outcome: str) -> Summary:
         """Collect the last counters, write the summary, and send everybody home."""
         self._node.presence.on_change(lambda: None)
         try:
-            summary = self._summary(outcome, self._replay_stats())
+            stats = self._replay_stats()
+            steps, lost, duplicates = (
+                (self._drawn.inserted, None, None) if stats is None else (stats.inserted, stats.lost, stats.duplicates)
+            )
+            summary = summarise(self._agent, self._telemetry, self._started, outcome, steps, lost, duplicates)
             self._directory.summary(summary)
-            draw_learning_curve(self._directory.path, f"{summary['env']}, {summary['method']}, seed {summary['seed']}")
+            draw_learning_curve(self._directory.path, summary.title)
         finally:
             self._farewell(outcome)
         return summary
@@ -196,25 +201,6 @@ class LearnerService:
             "told": self._samples.episodes,
             "sizes": self._directory.sizes(),
             "seconds": time.monotonic() - self._started,
-        }
-
-    def _summary(self, outcome: str, stats: ReplayStats | None) -> dict[str, Any]:
-        config, telemetry = self._config, self._telemetry
-        inserted = self._drawn.inserted if stats is None else stats.inserted
-        return {
-            "method": config.method,
-            "env": config.env.id,
-            "seed": config.seed,
-            "env_steps": inserted,
-            "updates": self._agent.updates,
-            "episodes": telemetry.episodes,
-            "return_mean_100": telemetry.return_mean,
-            "return_sd_100": telemetry.return_sd,
-            "wall_seconds": round(time.monotonic() - self._started, 3),
-            "transitions_accepted": inserted,
-            "transitions_lost": None if stats is None else stats.lost,
-            "duplicates_refused": None if stats is None else stats.duplicates,
-            "exit": outcome,
         }
 
     def _farewell(self, outcome: str) -> None:

@@ -51,6 +51,13 @@ def test_killed_and_resumed_to_the_byte(tmp_path: Path) -> None:
     assert episodes[0] == episodes[1]
 
 
+def test_a_run_without_an_ended_episode_says_so(tmp_path: Path) -> None:
+    flags = ["--total-steps", "5", "--replay.start", "4", "--run-dir", str(tmp_path / "run")]
+    done = subprocess.run([COMMAND, *flags], capture_output=True, text=True, check=True)
+    assert "updates, no episode ended, " in done.stdout
+    assert not (tmp_path / "run" / "learning_curve.png").exists()
+
+
 def test_resuming_something_else_is_refused(tmp_path: Path) -> None:
     _run(tmp_path / "a", "coop", 5)
     for flags in (["--run-dir", str(tmp_path / "none")], ["--run-dir", str(tmp_path / "a"), "--seed", "9"]):

@@ -14,7 +14,7 @@ import pytest
 from rliable import metrics
 
 from common.errors import RunError, UsageError
-from experiments.lockstep import Lockstep, summary
+from experiments.lockstep import Lockstep
 from experiments.report import cli
 from experiments.report.figures import figures
 from experiments.report.measures import breaking_point, improvement, iqm_by_task, running_mean
@@ -24,6 +24,7 @@ from experiments.report.study import load_study
 from experiments.report.writer import write_report
 from experiments.sweep.grid import load_grid
 from learner.run_directory import RunDirectory
+from learner.summary import summarise
 
 pytestmark = pytest.mark.timeout(300)  # eight small runs come before the first test
 GRID = """
@@ -48,7 +49,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
             with RunDirectory(folder / cell.name, cell.config) as directory:
                 for _ in range(cell.config.total_steps):
                     run.play(directory)
-                directory.summary(summary(run, time.monotonic(), "complete"))
+                directory.summary(summarise(run.agent, run.telemetry, time.monotonic(), "complete", run.step))
             run.env.close()
     torn = folder / "edql-capacity=60-seed=0"
     torn.mkdir()
