@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from common.capacity import estimated_bytes
 from common.types import EnvSpec, Segment
-from replay.stats import estimated_bytes
 from replay.table import Table
 
 ROUNDS = 9
@@ -138,7 +138,9 @@ def memory(spec: EnvSpec, capacity: int, steps: int) -> None:
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--capacity", type=int, default=20_000, help="of the table whose memory is measured")
+    options = parser.parse_args()
     print(
         f"{ROUNDS} alternating rounds of {REPEATS} calls: median (range). x: time over bare copies of the same frames."
     )
@@ -147,8 +149,7 @@ def main() -> None:
     for spec, capacity, steps in ((ATARI, 10_000, 64), (CARTPOLE, 5_000, 16)):
         for eviction, sampling in POLICIES:
             speed(spec, capacity, steps, eviction, sampling)
-    memory(ATARI, 20_000, 64)
-    memory(ATARI, 10_000, 64)
+    memory(ATARI, options.capacity, 64)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from common.capacity import check_memory
 from common.config import RunConfig, check_distributed
 from common.environments import env_spec
 from common.errors import RunError, UsageError
@@ -130,7 +131,7 @@ def _run() -> None:
         raise UsageError(f"--actors {options.actors}: must be at least 1")
     config = options.run_config()
     check_distributed(config)
-    env_spec(config.env)  # refuses what can't be played before anything starts
+    check_memory(config, env_spec(config.env))  # refuses what can't be played or held before anything starts
     directory = options.directory()
     stop = Stop()
     stop.on_signals()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from replay.epochs import ReplayEpochs
 from replay.journal import Journal, journal_files
 from replay.recovery import recover
 from replay.service import ReplayService
-from replay.stats import estimated_bytes
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,6 @@ def _run() -> None:
         request = Join("replay", incarnation, locators(session))
         joined = join(node, stop, request, options.connect, options.join_timeout)
         if joined is not None:
-            _check_memory(joined)
             service = _service(node, joined, options)
             service.start()
             membership = Membership(node, stop, request, joined, options.connect, options.patience)
@@ -89,17 +86,3 @@ def _service(node: Node, joined: Joined, options: ReplayOptions) -> ReplayServic
         epochs = ReplayEpochs(options.run_dir, joined.run_id, journal)
     print(found, flush=True)
     return ReplayService(node, core, epochs)
-
-
-def _check_memory(joined: Joined) -> None:
-    """Refuse a table that this machine can't hold; other evictions than fifo may keep stack + 1 frames a transition."""
-    config = joined.config
-    capacity = config.replay.capacity
-    copies = 1 if config.replay.eviction == "fifo" else joined.spec.stack + 1
-    needed = estimated_bytes(joined.spec, min(capacity, config.total_steps)) * copies
-    present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if needed > present:
-        raise RunError(
-            f"replay.capacity = {capacity:,}: needs up to {needed / 2**30:.1f} GiB, this machine has "
-            f"{present / 2**30:.1f} GiB"
-        )

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from common.capacity import check_memory
 from common.config import RunConfig
 from common.errors import RunError
 from common.experience import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
@@ -260,7 +261,8 @@ class ReplayCore:
 
 
 def make_table(config: RunConfig, spec: EnvSpec) -> Table:
-    """The table of a run as it starts."""
+    """The table of a run as it starts; raises UsageError where this machine can't hold it."""
+    check_memory(config, spec)
     settings = config.replay
     return Table(
         spec,

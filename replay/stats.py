@@ -1,4 +1,4 @@
-"""What a table tells of itself: counts, reuse, its state at one moment, and the memory that it will need."""
+"""What a table tells of itself: counts, reuse, and its state at one moment."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Array, EnvSpec
+from common.types import Array
 from replay.frames import PinnedFrames
 
 REUSE_BUCKETS = 16
-# actions, rewards, terminated, param_version, ids, reuse; three counters of the frame's slot.
-ROW_BYTES = 4 + 4 + 1 + 8 + 8 + 4 + 3 * 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +47,6 @@ class TableSnapshot(NamedTuple):
     meta: dict[str, Any]
     arrays: dict[str, Array]
     frames: PinnedFrames
-
-
-def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
-    """Memory of a full table whose transitions add one frame each, with the frames' counters and uniform sampling."""
-    frame = int(np.prod(spec.frame_shape)) * np.dtype(spec.frame_dtype).itemsize
-    return capacity * (frame + ROW_BYTES + 2 * 4 * spec.stack)
 
 
 def reuse_histogram(reuse: NDArray[np.int32]) -> NDArray[np.intp]:

@@ -18,21 +18,23 @@ LOCAL = Path(sysconfig.get_path("scripts")) / "coop-local"
         ("--env.id CartPole-v0", 1, ["'nature' needs frames [height, width], CartPole-v0 has (4,)"]),
         (
             "--replay.capacity 1000000000 --total-steps 1000000000",
-            1,
+            2,
             ["replay.capacity = 1,000,000,000: needs up to 6639.4 GiB, this machine has"],
         ),
     ],
 )
 def test_refused(flags: str, status: int, words: list[str], tmp_path: Path) -> None:
-    check([*flags.split(), "--run-dir", str(tmp_path / "run")], status, words)
+    check(flags.split(), tmp_path / "run", status, words)
 
 
 def test_a_missing_rom_is_refused(tmp_path: Path) -> None:
-    check(["--run-dir", str(tmp_path / "run")], 2, ["the ROM of 'breakout'"], {"ALE_ROMS_DIR": str(tmp_path)})
+    check([], tmp_path / "run", 2, ["the ROM of 'breakout'"], {"ALE_ROMS_DIR": str(tmp_path)})
 
 
-def check(flags: list[str], status: int, words: list[str], environment: dict[str, str] | None = None) -> None:
-    command = [str(LOCAL), "--preset", "breakout", *flags]
+def check(
+    flags: list[str], run_dir: Path, status: int, words: list[str], environment: dict[str, str] | None = None
+) -> None:
+    command = [str(LOCAL), "--preset", "breakout", *flags, "--run-dir", str(run_dir)]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=60, check=False, env={**os.environ, **(environment or {})}
     )
@@ -40,3 +42,4 @@ def check(flags: list[str], status: int, words: list[str], environment: dict[str
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("coop-local: error: ")
     assert not [word for word in words if word not in done.stderr], done.stderr
+    assert status != 2 or not run_dir.exists(), "refused before anything is written"

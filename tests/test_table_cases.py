@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from table_reference import Copies, Stream, check_references, make_spec
 
+from common.capacity import estimated_bytes
 from common.errors import UsageError
 from common.types import Segment
 from replay import table as table_module
-from replay.stats import estimated_bytes, reuse_histogram
+from replay.stats import reuse_histogram
 from replay.table import Table
 
 
