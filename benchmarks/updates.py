@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+import torch
 from table import ATARI, segments
 
 from common import messages
@@ -45,10 +46,11 @@ FILLED = 4096  # transitions before the measurements
 Figures = tuple[float, float]  # updates per second, updates per second of processor time
 
 
-def run_config(method: str, dtype: str) -> RunConfig:
+def run_config(method: str, dtype: str, batch_size: int, device: str) -> RunConfig:
     """Breakout as Mnih played it, with a limiter that never says no."""
     tables = load_tables("breakout", None)
     tables["network"] |= {"dtype": dtype}
+    tables["learner"] |= {"batch_size": batch_size, "device": device}
     tables["replay"] |= {"capacity": 10_000, "start": 1000, "tolerance": 1e12}
     return resolve({**tables, "run": RUN, "total_steps": 10**12}, method)
 
@@ -61,7 +63,7 @@ def bare(config: RunConfig, core: int | None, end: Connection) -> None:
     table = Table(ATARI, 1024, rng=np.random.default_rng(0))
     table.insert(next(segments(ATARI, 1024)))
     agent, batch = Agent(config, ATARI), table.sample(config.learner.batch_size)
-    turns = {"constant": lambda: agent.update(batch), "sb3": rival(config.learner.batch_size)}
+    turns = {"constant": lambda: agent.update(batch), "sb3": rival(config.learner.batch_size, config.learner.device)}
     for turn in turns.values():
         turn()
     while (work := end.recv()) is not None:
@@ -73,7 +75,7 @@ def bare(config: RunConfig, core: int | None, end: Connection) -> None:
         end.send((updates / spent, updates / (time.thread_time() - processor)))
 
 
-def rival(batch_size: int) -> Callable[[], None]:
+def rival(batch_size: int, device: str) -> Callable[[], None]:
     """One `DQN.train` step of Stable-Baselines3, with the same network and a filled buffer."""
     import gymnasium  # noqa: PLC0415
     from stable_baselines3 import DQN  # noqa: PLC0415
@@ -85,7 +87,7 @@ def rival(batch_size: int) -> Callable[[], None]:
         observation_space = gymnasium.spaces.Box(0, 255, ATARI.obs_shape, np.uint8)
         action_space = gymnasium.spaces.Discrete(ATARI.num_actions)
 
-    model = DQN("CnnPolicy", Pictures(), buffer_size=1024, batch_size=batch_size, device="cpu", seed=0)
+    model = DQN("CnnPolicy", Pictures(), buffer_size=1024, batch_size=batch_size, device=device, seed=0)
     model.set_logger(Logger(None, []))
     rng = np.random.default_rng(0)
     for _ in range(256):
@@ -190,13 +192,21 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement; a stop of 10 s cuts links")
     parser.add_argument("--dtype", default="float32", help="network.dtype; Stable-Baselines3 has float32 only")
+    parser.add_argument("--batch-size", type=int, default=32)
+    parser.add_argument("--device", default="cpu", help="of the updates, as PyTorch names it")
     parser.add_argument("--core", type=int, help="core of the learner and of those that it is compared with")
     options = parser.parse_args()
+    try:
+        torch.empty(0, device=options.device)
+    except (RuntimeError, AssertionError) as error:
+        parser.error(f"--device {options.device}: {str(error).splitlines()[0]}")
     keep_off(options.core)
     for method in options.methods:
-        figures = measure(run_config(method, options.dtype), options.rounds, options.seconds, options.core)
+        config = run_config(method, options.dtype, options.batch_size, options.device)
+        figures = measure(config, options.rounds, options.seconds, options.core)
         print(
-            f"{method}, {options.dtype}, {options.rounds} rounds of {options.seconds:g} s: median (lowest to highest)"
+            f"{method}, batches of {options.batch_size}, {options.dtype} on {options.device}, {options.rounds} rounds "
+            f"of {options.seconds:g} s: median (lowest to highest)"
         )
         for unit, place in (("updates/s", 0), ("updates/processor s", 1)):
             columns = {name: [pair[place] for pair in pairs] for name, pairs in figures.items()}
