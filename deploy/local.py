@@ -75,6 +75,7 @@ class Topology:
 
         Raises:
             RunError: a role gave up by itself, or dies again and again.
+            UsageError: a role found the config wrong.
         """
         if self.learner.exit_status() == 0 or (self._interrupted and self.learner.was_interrupted()):
             return True
@@ -97,7 +98,7 @@ class Topology:
             if not policy.ended(now):
                 raise RunError(f"{process.why()}; it has been started again {RESTARTS} times")
             if status > 0 and not process.name.startswith("actor"):
-                raise RunError(process.why())
+                raise (UsageError if status == UsageError.exit_status else RunError)(process.why())
             if status:
                 display.say(f"{process.why()}; starting it again")
             else:

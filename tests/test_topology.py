@@ -180,12 +180,11 @@ def test_ctrl_c_a_killed_actor_and_resume(tmp_path: Path) -> None:
 
 
 def test_a_role_that_gives_up_ends_the_run_and_is_named(tmp_path: Path) -> None:
-    huge = str(10**12)
-    done = run("coop-local", "--replay.capacity", huge, "--total-steps", huge, "--run-dir", str(tmp_path / "run"))
-    assert done.returncode == 1
+    done = run("coop-local", "--learner.weight-decay", "0.1", "0.2", "--run-dir", str(tmp_path / "run"))
+    assert done.returncode == 2
     assert done.stderr.count("\n") == 1
-    assert "replay ended (exit status 1)" in done.stderr
-    assert "replay.capacity" in done.stderr
+    assert "learner ended (exit status 2)" in done.stderr
+    assert "learner.weight_decay" in done.stderr
 
 
 def test_a_port_in_use(tmp_path: Path) -> None:
