@@ -27,7 +27,7 @@ from common.errors import UsageError
 from common.networks import FlatNetwork, build_network, preprocess
 from common.randomness import generator_state, set_generator_state
 from common.types import Batch, EnvSpec
-from learner.arrays import Array
+from learner.arrays import Array, assign
 from learner.edl import FeedbackRule
 from learner.optimizers import make_optimizer
 from learner.trainable import Trainable
@@ -110,7 +110,7 @@ class Agent:
                 tape = tape.head(len(batch))
             self._backward[acting](tape, source.take(output_error), s, source.gradients)
             if source is not trained:
-                trained.gradient[:] = trained.take(source.gradient)
+                assign(trained.gradient, source.gradient)
             if self._decay is not None:
                 trained.gradient += self._decay * trained.theta
             progress = self.updates / max(1, self.config.planned_updates)

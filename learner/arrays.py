@@ -24,3 +24,8 @@ def like(values: Array, array: Array) -> Array:
     if isinstance(values, torch.Tensor) and values.dtype == torch.bfloat16:  # which numpy does not know
         values = values.float()
     return namespace(array).asarray(values, dtype=array.dtype, device=array.device)
+
+
+def assign(array: Array, values: Array) -> None:
+    """Overwrite `array` with `values`, of either library and any dtype, in one pass."""
+    array[:] = values if namespace(values) is namespace(array) else like(values, array)

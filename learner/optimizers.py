@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from common.config import LearnerSettings
-from learner.arrays import Array, like, namespace
+from learner.arrays import Array, assign, namespace
 
 _TINY = 1e-37  # below any square that counts, above the denormals
 
@@ -48,7 +48,7 @@ class Optimizer(ABC):
         """Go on where `state` was taken."""
         self.steps = int(state["steps"])
         for name, buffer in self.buffers.items():
-            buffer[:] = like(torch.as_tensor(state[name]), buffer)
+            assign(buffer, torch.as_tensor(state[name]))
 
     def _average(self, name: str, decay: float) -> Array:
         """Let a buffer follow g: x <- decay x + (1 - decay) g."""
@@ -78,6 +78,13 @@ class Optimizer(ABC):
             self.theta.addcdiv_(direction, denominator, value=-rate)
         else:
             self._descend(self._xp.divide(direction, denominator, out=self._scratch), rate)
+
+    def _variance(self, square: Array, mean: Array) -> Array:
+        """The variance square - mean^2 in the scratch memory."""
+        if self._fused:
+            return self._xp.addcmul(square, mean, mean, value=-1, out=self._scratch)
+        scratch = self._xp.multiply(mean, mean, out=self._scratch)
+        return self._xp.subtract(square, scratch, out=scratch)
 
     def _root(self, square: Array) -> Array:
         """sqrt(square) in the scratch memory; off 0 and denormals, whose roots take many times as long."""
@@ -138,8 +145,8 @@ class MnihRMSProp(Optimizer):
     def _step(self, rate: float) -> None:
         mean = self._average("mean", self._momentum)
         square = self._average_square(self._decay)
-        root = self._xp.multiply(mean, mean, out=self._scratch)
-        self._xp.clip(self._xp.subtract(square, root, out=root), 0, None, out=root)
+        root = self._variance(square, mean)
+        self._xp.clip(root, 0, None, out=root)
         root += self._constant
         self._descend(self.gradient, rate, self._xp.sqrt(root, out=root))
 
