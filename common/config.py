@@ -52,7 +52,8 @@ class LearnerSettings:
     double: bool = False
     """Take the target's value at the action that the trained network prefers, as in double Q-learning."""
     optimizer: OptimizerName = "rmsprop"
-    """rmsprop is PyTorch's; rmsprop-mnih is centred, with the constant inside the root."""
+    """rmsprop is PyTorch's; rmsprop-mnih is centred, with the constant inside the root, beside gradients summed over
+    the batch."""
     learning_rate: PositiveFloat = 1e-3
     learning_rate_final: Annotated[float, Field(gt=0, le=1)] = 1.0
     """The learning rate falls exponentially to this share of itself over the whole run."""

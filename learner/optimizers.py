@@ -180,6 +180,7 @@ def make_optimizer(settings: LearnerSettings, theta: Array, gradient: Array) -> 
         case "rmsprop":
             return RMSProp(theta, gradient, decay, constant, momentum)
         case "rmsprop-mnih":
-            return MnihRMSProp(theta, gradient, decay, constant, momentum)
+            # Mnih's gradients are sums over the batch, these are means; the update notices by this constant alone.
+            return MnihRMSProp(theta, gradient, decay, constant / settings.batch_size**2, momentum)
         case "adam":
             return Adam(theta, gradient, (momentum or 0.9, decay), constant)

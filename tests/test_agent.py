@@ -133,9 +133,25 @@ def test_rmsprop_of_mnih() -> None:
     np.testing.assert_allclose(theta.numpy(), expected, rtol=1e-5)
 
 
+def test_rmsprop_of_mnih_moves_as_with_gradients_summed_over_the_batch() -> None:
+    settings = LearnerSettings(
+        optimizer="rmsprop-mnih", batch_size=32, momentum=0.95, squared_decay=0.95, denominator=0.01
+    )
+    moved, summed = torch.zeros(50), torch.zeros(50)
+    gradient = torch.zeros(50)
+    of_means, of_sums = make_optimizer(settings, moved, gradient), MnihRMSProp(summed, 32 * gradient, 0.95, 0.01, 0.95)
+    for k in range(20):
+        gradient.copy_(1e-3 * torch.linspace(-1, 1, 50).roll(k))
+        of_sums.gradient.copy_(32 * gradient)
+        of_means.step(0.1)
+        of_sums.step(0.1)
+    torch.testing.assert_close(moved, summed)
+
+
 @pytest.mark.parametrize("momentum", [0.0, 0.9])
 def test_mnihs_rmsprop_stays_finite_where_the_two_decays_differ(momentum: float) -> None:
-    agent = Agent(_config("dqn", optimizer="rmsprop-mnih", momentum=momentum, denominator=0.01), SPEC)
+    settings = {"optimizer": "rmsprop-mnih", "momentum": momentum, "denominator": 0.01, "learning_rate": 3e-5}
+    agent = Agent(_config("dqn", **settings), SPEC)
     for batch in _batches(20):
         assert np.isfinite(agent.update(batch).td_errors).all()
 
