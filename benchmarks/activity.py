@@ -1,0 +1,69 @@
+"""Do the layers of a run's networks tell states apart? `python benchmarks/activity.py RUN_DIR`.
+
+Shows the acting network of the newest epoch, and for comparison the same network as the run began, the states that the
+replay service's part of the epoch holds: after every ReLU the share of its units that are positive, and the standard
+deviation over states of a unit (mean over units); then that of the greatest Q-value, and how often each action is best.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from common.environments import env_spec
+from common.networks import FlatNetwork, preprocess
+from common.tables import load_tables, resolve
+from common.threads import use_threads
+from learner.agent import Agent
+from learner.epochs import load_learner, newest_epoch
+from learner.run_directory import read_run_id
+from replay.core import ReplayCore
+from replay.storage import load_snapshot
+
+
+def show(network: FlatNetwork, x: Tensor) -> None:
+    """Print a line for each ReLU, and one for the output."""
+    relus = 0
+    for layer in network.module:
+        x = layer(x)
+        if isinstance(layer, nn.ReLU):
+            relus += 1
+            units = x.flatten(1)
+            active, spread = (units > 0).float().mean(), units.std(0).mean()
+            print(f"  ReLU {relus}: {units.shape[1]:,} units, {active:.1%} active, sd over states {spread:.5f}")
+    best = np.bincount(x.argmax(1).numpy(), minlength=x.shape[1]).tolist()
+    print(f"  Q: mean {x.mean():.4f}, sd of the greatest over states {x.amax(1).std():.5f}; best action: {best}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run_dir", type=Path)
+    parser.add_argument("--states", type=int, default=500)
+    options = parser.parse_args()
+    use_threads(1)
+    epoch = newest_epoch(options.run_dir)
+    if epoch is None:
+        sys.exit(f"{options.run_dir}: no finished epoch")
+    config = resolve(load_tables(None, options.run_dir / "config.toml"))
+    spec = env_spec(config.env)
+    core = ReplayCore(config, spec)
+    load_snapshot(core, epoch / "replay", read_run_id(options.run_dir))
+    batch = core.table.sample(options.states)
+    fresh, trained = Agent(config, spec), Agent(config, spec)
+    trained.load_state(load_learner(epoch)["agent"])
+    acting = trained.acting
+    with torch.inference_mode():
+        x = preprocess(torch.from_numpy(batch.frames[batch.obs_index]).view(-1, *spec.obs_shape), spec)
+        print(f"{epoch}: network {acting + 1} acts")
+        show(trained.networks[acting], x)
+        print("as the run began")
+        show(fresh.networks[acting], x)
+
+
+if __name__ == "__main__":
+    main()
