@@ -192,10 +192,13 @@ def test_a_port_in_use(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        done = run("coop-learner", "--listen", endpoint, "--run-dir", str(tmp_path / "run"))
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert endpoint in done.stderr
+        flags = ["--listen", endpoint, "--run-dir", str(tmp_path / "run")]
+        alone, supervised = run("coop-learner", *flags), run("coop-local", *flags)
+    for done in (alone, supervised):
+        assert done.returncode == 1
+        assert done.stderr.count("\n") == 1
+        assert endpoint in done.stderr
+    assert "learner ended (exit status 1)" in supervised.stderr
 
 
 @pytest.mark.parametrize("name", ["coop-actor", "coop-replay"])
