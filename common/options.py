@@ -37,13 +37,13 @@ class RunOptions(RunConfig):
     """The fields of a run's config, and where they come from and go to."""
 
     preset: str | None = None
-    """Settings that come with the package (cartpole if neither this nor --config is given)."""
+    """Settings that come with the package (cartpole if neither this nor --config is given, and no run resumed)."""
     config: Path | None = None
     """A TOML file with the fields below, for example the config.toml of another run."""
     run_dir: Path | None = None
     """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
     resume: bool = False
-    """Go on with the run in --run-dir, from its newest epoch."""
+    """Go on with the run in --run-dir and its config, from its newest epoch."""
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
     shared_memory: bool = False
@@ -75,7 +75,7 @@ class RunOptions(RunConfig):
         saved = resolve(load_tables(None, path / "config.toml"))
         if problem := first_difference(identity(self.run_config()), identity(saved)):
             name, here, there = problem
-            raise UsageError(f"--resume: {name} = {here}, but {there} in {path / 'config.toml'}; --config takes it")
+            raise UsageError(f"--resume: {name} = {here}, but {there} in {path / 'config.toml'}, which goes on")
         return path
 
 
@@ -83,7 +83,7 @@ OptionsT = TypeVar("OptionsT", bound=RunOptions)
 
 
 def parse_run(kind: type[OptionsT], program: str, description: str) -> OptionsT:
-    """Parse flags over the config that `--preset` or `--config` names.
+    """Parse flags over the config that `--preset`, `--config` or `--resume` names.
 
     Raises:
         UsageError: whatever is wrong with them, in one line.

@@ -46,7 +46,8 @@ def test_killed_and_resumed_to_the_byte(tmp_path: Path) -> None:
             time.sleep(0.01)
         process.kill()
     assert not (tmp_path / "b" / "summary.json").exists()
-    subprocess.run([*torn, "--resume"], capture_output=True, check=True)
+    resumed = [COMMAND, "--resume", "--run-dir", str(tmp_path / "b")]  # the rest it finds there
+    subprocess.run(resumed, capture_output=True, check=True)
     episodes = [(tmp_path / name / "episodes.csv").read_bytes() for name in "ab"]
     assert episodes[0] == episodes[1]
 
