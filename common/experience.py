@@ -18,7 +18,7 @@ from common.errors import BadMessage
 from common.messages import INCARNATION
 from common.schema import Int, ListOf, Real, Row, Rule, Schema
 from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
-from common.wire import Message
+from common.wire import Message, Source
 
 MAX_SEGMENT_STEPS = 4096
 MAX_EPISODES = 1000  # told with one batch; later ones come with the next
@@ -203,14 +203,13 @@ def decode_sample(message: Message) -> DrawRequest:
     return request
 
 
-_BATCH_ARRAYS = (*_SEGMENT_ARRAYS, "weights", "ids", "age", "reuse")
-
-
-def encode_batch(run: str, batch: Batch, drawn: Drawn) -> bytearray:
-    """Build the answer to a draw."""
+def encode_batch(
+    run: str, frames: Array | Source, columns: Mapping[str, Array], drawn: Drawn, into: bytearray | None = None
+) -> bytearray:
+    """Build the answer to a draw: the frames of a batch and its other fields; into: see `wire.encode`."""
     fields = {name: getattr(drawn, name) for name in _DRAWN_FIELDS}
     fields["episodes"] = [astuple(record) for record in drawn.episodes]
-    return wire.encode("batch", run, fields, {name: getattr(batch, name) for name in _BATCH_ARRAYS})
+    return wire.encode("batch", run, fields, {"frames": frames, **columns}, into)
 
 
 class BatchReader:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -113,3 +113,7 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    def columns(self) -> dict[str, Array]:
+        """Everything but the frames, by name."""
+        return {column.name: getattr(self, column.name) for column in fields(self) if column.name != "frames"}

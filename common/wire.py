@@ -11,7 +11,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from reprlib import repr as shown
-from typing import Any
+from typing import Any, Protocol
 
 import msgpack
 import numpy as np
@@ -46,25 +46,72 @@ class Message:
     payload: bytes = b""
 
 
-def encode(kind: str, run: str, fields: Mapping[str, Any], arrays: Mapping[str, Array] | None = None) -> bytearray:
-    """Build one message; each array is copied once, into its place."""
+class Source(Protocol):
+    """An array that lies elsewhere, and that is copied straight into its place in a message."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of its elements, one of `DTYPES`."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """As it will be read back."""
+
+    @property
+    def nbytes(self) -> int:
+        """That it takes in the message."""
+
+    def copy_to(self, out: Array) -> None:
+        """Copy it to `out`, contiguous memory of this dtype and shape."""
+
+
+def encode(
+    kind: str,
+    run: str,
+    fields: Mapping[str, Any],
+    arrays: Mapping[str, Array | Source] | None = None,
+    into: bytearray | None = None,
+) -> bytearray:
+    """Build one message; each array is copied once, into its place.
+
+    into: a message of before, whose memory is used again: what is in the processor's caches need not be fetched anew.
+    """
     arrays = arrays or {}
     table: list[tuple[str, str, tuple[int, ...], int]] = []
-    data: list[memoryview | bytes] = []
-    offset = 0
+    size = 0
     for name, array in arrays.items():
-        padding = -offset % ALIGNMENT
-        offset += padding
-        dtype = _NAMES[array.dtype]
-        table.append((name, dtype, array.shape, offset))
-        offset += array.nbytes
-        data += (bytes(padding), np.ascontiguousarray(array, _DTYPES[dtype]).data)
+        offset = _aligned(size)
+        table.append((name, _NAMES[array.dtype], array.shape, offset))
+        size = offset + array.nbytes
     header = msgpack.packb(
         {"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": table}, use_bin_type=True
     )
-    start = _PREFIX.size + len(header)
-    # Joined, because a payload of zeros to write into would be written twice.
-    return bytearray().join((_PREFIX.pack(MAGIC, len(header)), header, bytes(-start % ALIGNMENT), *data))
+    head = _PREFIX.pack(MAGIC, len(header)) + header
+    start = _aligned(len(head))
+    payload = _sized(into, start + size)
+    payload[:start] = head.ljust(start, b"\0")
+    end = start
+    for (_, dtype, shape, offset), array in zip(table, arrays.values(), strict=True):
+        begin = start + offset
+        payload[end:begin] = bytes(begin - end)
+        end = begin + array.nbytes
+        if array.nbytes:
+            place = np.frombuffer(payload, _DTYPES[dtype], math.prod(shape), begin).reshape(shape)
+            if isinstance(array, np.ndarray):
+                place[...] = array
+            else:
+                array.copy_to(place)
+    return payload
+
+
+def _sized(memory: bytearray | None, size: int) -> bytearray:
+    if memory is None:
+        return bytearray(size)
+    if len(memory) > size:
+        del memory[size:]
+    else:
+        memory.extend(bytes(size - len(memory)))
+    return memory
 
 
 def decode(payload: bytes) -> Message:

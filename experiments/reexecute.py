@@ -17,7 +17,6 @@ from common.errors import RunError, UsageError
 from common.experience import DrawRequest
 from common.tables import load_tables, resolve
 from common.threads import use_threads
-from common.types import Batch
 from learner.agent import Agent
 from learner.epochs import complete_epochs, load_learner, newest_epoch
 from learner.run_directory import read_run_id
@@ -25,6 +24,7 @@ from replay.core import ReplayCore
 from replay.epochs import ReplayEpochs
 from replay.journal import DRAW, TornFile, journal_files, read_draw, read_file
 from replay.recovery import carry_out, following_files
+from replay.table import PinnedBatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ def reexecute(run_dir: Path) -> Outcome:
     waiting = {drawn.sequence: batch for batch, drawn in core.repeatable() if drawn.sequence not in counts}
     for place, (request, batch) in enumerate(_draws(core, folder, files, run_id)):
         if counts[request.sequence] == place:
-            waiting[request.sequence] = batch
+            waiting[request.sequence] = batch.read()
         while agent.updates < expected["updates"] and agent.updates in waiting:
             agent.update(waiting.pop(agent.updates))
     if agent.updates < expected["updates"]:
@@ -114,7 +114,7 @@ def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:
     return last
 
 
-def _draws(core: ReplayCore, folder: Path, files: list[int], run_id: int) -> Iterator[tuple[DrawRequest, Batch]]:
+def _draws(core: ReplayCore, folder: Path, files: list[int], run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
     for number in files:
         try:
             yield from carry_out(core, folder, number, run_id)

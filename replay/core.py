@@ -16,7 +16,7 @@ from common.experience import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
 from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
 from replay.dedup import SeenWindow
 from replay.limiter import RateLimiter
-from replay.table import Table, TableSnapshot
+from replay.table import PinnedBatch, Table, TableSnapshot
 
 LEARNERS_KEPT = 64  # learners that others have taken over from, and that are refused
 
@@ -69,6 +69,13 @@ class CoreSnapshot(NamedTuple):
     replies: list[tuple[Batch, Drawn]]
 
 
+class Reply(NamedTuple):
+    """The answer to a draw; the frames of its batch are held until the learner can't ask for it again."""
+
+    batch: PinnedBatch
+    drawn: Drawn
+
+
 @dataclass(slots=True)
 class _Account:
     """Transitions of one actor process: accepted here, and acknowledged according to the actor."""
@@ -102,7 +109,7 @@ class ReplayCore:
         self._episodes: list[EpisodeRecord] = []
         self._accounts: dict[int, _Account] = {}
         self._learners: list[int] = []  # the last one is served
-        self._replies: dict[int, tuple[Batch, Drawn]] = {}
+        self._replies: dict[int, Reply] = {}
 
     @property
     def lost(self) -> int:
@@ -153,7 +160,7 @@ class ReplayCore:
         )
         self.table.insert(segment)
 
-    def draw(self, request: DrawRequest) -> tuple[Batch, Drawn] | Wait:
+    def draw(self, request: DrawRequest) -> Reply | Wait:
         """Draw a batch, or give the one that this request drew before, or the limiter's reason.
 
         Raises:
@@ -172,17 +179,17 @@ class ReplayCore:
         if reason:
             return Wait(reason)
         reply = self.give(request)
-        self.recorder.draw(request, reply[0].ids)
+        self.recorder.draw(request, reply.batch.columns["ids"])
         return reply
 
-    def give(self, request: DrawRequest) -> tuple[Batch, Drawn]:
+    def give(self, request: DrawRequest) -> Reply:
         """Carry out a draw that was admitted, now or, according to a journal, before; raises as `draw`."""
         self._follow(request)
         table = self.table
         if request.priorities:
             numbers, priorities = zip(*request.priorities, strict=True)
             table.update_priorities(np.array(numbers, np.int64), np.array(priorities))
-        batch = table.sample(request.batch_size)
+        batch = table.sample_pinned(request.batch_size)
         self.drawn = max(self.drawn, request.sequence + 1)
         first = max(request.episodes_from, self._first_episode)
         start = first - self._first_episode
@@ -196,8 +203,9 @@ class ReplayCore:
             episodes=tuple(self._episodes[start : start + MAX_EPISODES]),
             planned=self.limiter.draws_total or 0,
         )
-        self._replies[request.sequence] = batch, drawn
-        return batch, drawn
+        self._forget([request.sequence])
+        self._replies[request.sequence] = reply = Reply(batch, drawn)
+        return reply
 
     def limit(self, limiter: RateLimiter) -> None:
         """Go on under other settings; raises OSError where they can't be recorded."""
@@ -216,12 +224,12 @@ class ReplayCore:
             "learners": list(self._learners),
             "limiter": asdict(self.limiter),
         }
-        replies = [reply for sequence, reply in self._replies.items() if sequence >= base]
+        replies = [reply for reply in self.repeatable() if reply[1].sequence >= base]
         return CoreSnapshot(books, self.table.snapshot(), replies)
 
     def repeatable(self) -> list[tuple[Batch, Drawn]]:
         """The draws that the learner may ask for again."""
-        return list(self._replies.values())
+        return [(batch.read(), drawn) for batch, drawn in self._replies.values()]
 
     def restore(
         self,
@@ -242,7 +250,7 @@ class ReplayCore:
         self._accounts = {actor: _Account(accepted, acked) for actor, accepted, acked in books["accounts"]}
         self._learners = list(books["learners"])
         self.limiter = RateLimiter.from_table(books["limiter"])
-        self._replies = {drawn.sequence: (batch, drawn) for batch, drawn in replies}
+        self._replies = {drawn.sequence: Reply(self.table.pin(batch), drawn) for batch, drawn in replies}
 
     def _follow(self, request: DrawRequest) -> None:
         """Let the learner's count of updates be the count of draws where one of us has come back from an epoch."""
@@ -251,13 +259,19 @@ class ReplayCore:
             if request.incarnation in self._learners:
                 raise RunError("another learner has taken over this run")
             self._learners = [*self._learners[-LEARNERS_KEPT:], request.incarnation]
-            self._replies.clear()
+            self._forget(list(self._replies))
         if not known or request.base > self.drawn:
             self.drawn = request.base
             self._first_episode = max(self._first_episode, request.episodes_from - len(self._episodes))
         # Keeping more than can be asked for again costs memory and the processor's caches.
-        for sequence in [number for number in self._replies if number < request.base]:
-            del self._replies[sequence]
+        self._forget([sequence for sequence in self._replies if sequence < request.base])
+
+    def _forget(self, sequences: Iterable[int]) -> None:
+        """Drop replies, those of them that are there."""
+        for sequence in sequences:
+            reply = self._replies.pop(sequence, None)
+            if reply is not None:
+                reply.batch.frames.release()
 
 
 def make_table(config: RunConfig, spec: EnvSpec) -> Table:

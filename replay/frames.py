@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,9 +95,11 @@ class FrameStore:
         self._mark[distinct] = np.arange(len(distinct), dtype=np.int32)
         return distinct, self._mark[flat].reshape(slots.shape)
 
-    def read(self, slots: Slots) -> Array:
-        """Copy of the frames in `slots`: [n, *frame_shape]."""
-        return self._rows.take(slots, axis=0).reshape(len(slots), *self.frame_shape)
+    def read(self, slots: Slots, out: Array | None = None) -> Array:
+        """Copy of the frames in `slots`: [n, *frame_shape]; in `out`, contiguous memory, if it is given."""
+        rows = None if out is None else out.reshape(len(slots), self._elements)
+        # mode: without it numpy copies to memory of its own first
+        return self._rows.take(slots, axis=0, out=rows, mode="clip").reshape(len(slots), *self.frame_shape)
 
     def pin(self, slots: Slots) -> PinnedFrames:
         """Hold distinct slots as they are now, to be copied out later."""
@@ -123,7 +126,7 @@ class FrameStore:
 
 
 class PinnedFrames:
-    """Frames of a store that stay as they are until `release`, whatever is evicted meanwhile."""
+    """Frames of a store that stay as they are until `release`, whatever is evicted meanwhile; a `wire.Source`."""
 
     def __init__(self, store: FrameStore, slots: Slots) -> None:
         self._store = store
@@ -133,8 +136,27 @@ class PinnedFrames:
     def __len__(self) -> int:
         return len(self._slots)
 
-    def read(self, start: int, stop: int) -> Array:
-        """Copy of the pinned frames start..stop: [stop - start, *frame_shape]."""
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of a frame's elements."""
+        return self._store.dtype
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(n, *frame_shape)."""
+        return len(self._slots), *self._store.frame_shape
+
+    @property
+    def nbytes(self) -> int:
+        """Of all of them."""
+        return len(self._slots) * self._store.frame_bytes
+
+    def copy_to(self, out: Array) -> None:
+        """Copy them all to `out`, contiguous memory [n, *frame_shape]."""
+        self._store.read(self._slots, out)
+
+    def read(self, start: int = 0, stop: int | None = None) -> Array:
+        """Copy of the pinned frames start..stop, all if not given: [stop - start, *frame_shape]."""
         return self._store.read(self._slots[start:stop])
 
     def release(self) -> None:

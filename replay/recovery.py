@@ -11,9 +11,9 @@ import numpy as np
 from common import wire
 from common.errors import RunError
 from common.experience import DrawRequest, SegmentReader
-from common.types import Batch
 from replay.core import ReplayCore
 from replay.journal import DRAW, LIMITER, SEGMENT, TornFile, journal_files, read_draw, read_file, read_limiter
+from replay.table import PinnedBatch
 
 
 def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[int, str]:
@@ -39,8 +39,8 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
     return first + len(numbers), f"{taken:,} transitions and {draws:,} batches from the journal"
 
 
-def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Iterator[tuple[DrawRequest, Batch]]:
-    """Carry out one file; gives every draw when it has been carried out. Raises as `recover`."""
+def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
+    """Carry out one file; gives every draw, to be read before the next one. Raises as `recover`."""
     read = SegmentReader(core.table.spec)
     for kind, payload in read_file(folder, number, run_id):
         if kind == SEGMENT:
@@ -48,7 +48,7 @@ def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Itera
         elif kind == DRAW:
             request, ids = read_draw(payload)
             batch, _ = core.give(request)
-            if not np.array_equal(batch.ids, ids):
+            if not np.array_equal(batch.columns["ids"], ids):
                 raise RunError(f"{folder}: file {number}, batch {request.sequence}: not the transitions taken down")
             yield request, batch
         elif kind == LIMITER:

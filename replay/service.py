@@ -14,7 +14,7 @@ from typing import TypeVar
 from common import experience, limits, messages
 from common.clients import replay_key
 from common.errors import BadMessage, RunError
-from common.experience import SegmentReader
+from common.experience import DrawRequest, SegmentReader
 from common.lifecycle import Stop
 from common.limits import Limits
 from common.messages import ReplayStats
@@ -56,6 +56,7 @@ class ReplayService:
         self._inserts = _Gate()
         self._draws = _Gate()
         self._closing = False
+        self._batch = bytearray()  # the last one answered; one thread answers, and sending has copied it
 
     def start(self) -> None:
         """Begin to answer."""
@@ -118,10 +119,18 @@ class ReplayService:
         request = experience.decode_sample(message)
         if request.batch_size != self._core.batch_size:
             raise BadMessage("fields.batch_size", f"{request.batch_size}; this run draws {self._core.batch_size}")
-        outcome = self._admit(self._draws, lambda: self._core.draw(request))
+        outcome = self._admit(self._draws, lambda: self._draw(request))
         if isinstance(outcome, Wait):
             return messages.encode_retry(self._node.run, outcome.reason)
-        return experience.encode_batch(self._node.run, *outcome)
+        return outcome
+
+    def _draw(self, request: DrawRequest) -> bytearray | Wait:
+        """A batch as a message, its frames copied from where they lie straight into it."""
+        reply = self._core.draw(request)
+        if isinstance(reply, Wait):
+            return reply
+        batch, drawn = reply
+        return experience.encode_batch(self._node.run, batch.frames, batch.columns, drawn, into=self._batch)
 
     def _admit(self, gate: _Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
         """Try, and try again whenever the core has changed, until the gate's deadline."""

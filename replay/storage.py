@@ -79,7 +79,9 @@ def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path, mark: 
                 piece = frames.read(start, min(len(frames), start + FRAMES_AT_ONCE))
             file.write(piece.tobytes())
     files["frames"] = file.size, file.checksum
-    replies = [bytes(experience.encode_batch("", batch, drawn)) for batch, drawn in snapshot.replies]
+    replies = [
+        bytes(experience.encode_batch("", batch.frames, batch.columns(), drawn)) for batch, drawn in snapshot.replies
+    ]
     state = {"books": snapshot.books, "table": meta, "replies": replies, "mark": mark, "files": files}
     packed = msgpack.packb(state)
     write_whole(part / STATE, zlib.crc32(packed).to_bytes(4, "little") + packed)

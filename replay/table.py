@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,28 @@ from numpy.typing import NDArray
 from common.errors import UsageError
 from common.randomness import generator_state, set_generator_state
 from common.types import Array, Batch, EnvSpec, Segment
-from replay.frames import FrameStore, Slots, as_slice
+from replay.frames import FrameStore, PinnedFrames, Slots, as_slice
 from replay.selection import make_eviction, make_sampling
 from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
 
-__all__ = ["Table", "TableSnapshot", "TableStats"]
+__all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
 
 MAX_STREAMS = 4096
 COLUMNS = ("actions", "rewards", "terminated", "param_version", "ids", "reuse", "priorities")
+
+
+class PinnedBatch(NamedTuple):
+    """A batch whose frames lie in the table, held there until they are released.
+
+    columns: the other fields of a `Batch`, by name.
+    """
+
+    frames: PinnedFrames
+    columns: dict[str, Array]
+
+    def read(self) -> Batch:
+        """The batch, with a copy of the frames."""
+        return Batch(frames=self.frames.read(), **self.columns)
 
 
 class Table:
@@ -120,6 +134,23 @@ class Table:
 
     def sample(self, batch_size: int) -> Batch:
         """Draw transitions with replacement by the sampling policy. Raises ValueError while the table is empty."""
+        slots, columns = self._draw(batch_size)
+        return Batch(frames=self._frames.read(slots), **columns)
+
+    def sample_pinned(self, batch_size: int) -> PinnedBatch:
+        """`sample`, with the frames left where they lie."""
+        slots, columns = self._draw(batch_size)
+        return PinnedBatch(self._frames.pin(slots), columns)
+
+    def pin(self, batch: Batch) -> PinnedBatch:
+        """Take in the frames of a batch that was drawn before this table came back from its state."""
+        slots = self._frames.add(batch.frames, np.ones(len(batch.frames), np.intp))
+        pinned = self._frames.pin(slots)
+        self._frames.drop(slots)
+        return PinnedBatch(pinned, batch.columns())
+
+    def _draw(self, batch_size: int) -> tuple[Slots, dict[str, Array]]:
+        """Slots of the distinct frames of a batch, and its other fields."""
         size = len(self)
         if size == 0:
             raise ValueError("an empty table has nothing to sample")
@@ -130,19 +161,18 @@ class Table:
         self.batches += 1
         self._sampled += batch_size
         ids = self._ids[rows]
-        return Batch(
-            frames=self._frames.read(distinct),
-            obs_index=np.ascontiguousarray(index[:, : self.spec.stack]),
-            next_index=np.ascontiguousarray(index[:, self.spec.stack :]),
-            actions=self._actions[rows],
-            rewards=self._rewards[rows],
-            terminated=self._terminated[rows],
-            weights=weights,
-            ids=ids,
-            param_version=self._param_version[rows],
-            age=self.inserted - 1 - ids,
-            reuse=self._reuse[rows],
-        )
+        return distinct, {
+            "obs_index": np.ascontiguousarray(index[:, : self.spec.stack]),
+            "next_index": np.ascontiguousarray(index[:, self.spec.stack :]),
+            "actions": self._actions[rows],
+            "rewards": self._rewards[rows],
+            "terminated": self._terminated[rows],
+            "weights": weights,
+            "ids": ids,
+            "param_version": self._param_version[rows],
+            "age": self.inserted - 1 - ids,
+            "reuse": self._reuse[rows],
+        }
 
     def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.floating[Any]]) -> None:
         """Give transitions new priorities (float [n], usually |TD error|); ids no longer held are ignored.

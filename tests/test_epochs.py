@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from samples import make_segment
+from table_reference import check_references
 
 from common.config import LearnerSettings, ReplaySettings, RunConfig
 from common.errors import RunError, UsageError
@@ -54,10 +55,21 @@ def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
         first, second = core.draw(request), twin.draw(request)
         assert not isinstance(first, Wait)
         assert not isinstance(second, Wait)
-        np.testing.assert_array_equal(first[0].ids, second[0].ids)
-        np.testing.assert_array_equal(first[0].frames, second[0].frames)
-        assert first[1] == second[1]
+        for name in ("ids", "frames", "obs_index"):
+            np.testing.assert_array_equal(getattr(first.batch.read(), name), getattr(second.batch.read(), name))
+        assert first.drawn == second.drawn
     assert twin.snapshot(base).books == core.snapshot(base).books
+
+
+def test_the_frames_of_old_answers_are_given_back(spec: EnvSpec, tmp_path: Path) -> None:
+    core, twin = _used_core(spec), ReplayCore(CONFIG, spec)
+    save(core, ReplayEpochs(tmp_path, 5), core.drawn - 2)
+    ReplayEpochs(tmp_path, 5).restore(twin, core.drawn - 2)
+    for one in (core, twin):
+        assert len(one.repeatable()) == 2
+        assert isinstance(one.draw(DrawRequest(1, one.drawn, one.drawn, 4, 0)), Wait)
+        assert not one.repeatable()
+        check_references(one.table)
 
 
 def test_torn_parts_are_passed_over_and_old_ones_go(spec: EnvSpec, tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def test_priorities_are_carried_out_again(spec: EnvSpec, tmp_path: Path) -> None
     for sequence in range(20):
         assert not isinstance(_insert(core, spec, sequence), Wait)
         while not isinstance(got := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, 0, priorities)), Wait):
-            priorities = tuple((number, 0.1 + number % 7) for number in got[0].ids.tolist())
+            priorities = tuple((number, 0.1 + number % 7) for number in got.batch.columns["ids"].tolist())
     assert len(set(core.table.snapshot().arrays["priorities"].tolist())) > 3
     twin = ReplayCore(config, spec)
     recover(twin, tmp_path, 1, 5)

@@ -20,9 +20,9 @@ from common.experience import BatchReader, Drawn, DrawRequest, EpisodeRecord, Se
 from common.limits import Limits
 from common.messages import Join, Joined, ReplayStats, Role
 from common.tables import to_tables
-from common.types import Batch, EnvSpec, EpisodeEnd
+from common.types import EnvSpec, EpisodeEnd
 from common.wire import Message
-from replay.table import Table
+from replay.table import PinnedBatch, Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]
@@ -34,11 +34,16 @@ TABLES = to_tables(RunConfig())
 FLAT = np.arange(3, dtype=np.float32)
 
 
-def _batch() -> tuple[Batch, Drawn]:
+def _batch() -> tuple[PinnedBatch, Drawn]:
     table = Table(SPEC, 100, rng=np.random.default_rng(0))
     table.insert(make_segment(SPEC))
     end = EpisodeRecord(4, 7, 0, EpisodeEnd(3, 1.5, 4, 0.1, 0.2, 0.3, 5))
-    return table.sample(8), Drawn(3, 4, 4, 0, 0, 0, (end,))
+    return table.sample_pinned(8), Drawn(3, 4, 4, 0, 0, 0, (end,))
+
+
+def _encoded_batch() -> bytearray:
+    batch, drawn = _batch()
+    return experience.encode_batch("r", batch.frames, batch.columns, drawn)
 
 
 READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
@@ -49,7 +54,7 @@ READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "retry": (messages.encode_retry("r", "later"), messages.decode_retry),
     "error": (messages.encode_error("r", BadMessage("f", "wrong")), messages.decode_error),
     "sample": (experience.encode_sample("r", DrawRequest(1, 3, 2, 4, 5, ((7, 0.5),))), experience.decode_sample),
-    "batch": (experience.encode_batch("r", *_batch()), BatchReader(SPEC)),
+    "batch": (_encoded_batch(), BatchReader(SPEC)),
     "weights": (messages.encode_weights("r", 2, 8, FLAT), partial(messages.decode_weights, parameters=3)),
     "role": (messages.encode_role("r", Role(2, (4, 5), 6)), messages.decode_role),
     "stats": (messages.encode_stats("r", STATS), messages.decode_stats),
@@ -105,7 +110,7 @@ def test_arrays_come_back() -> None:
     batch_back, drawn_back = READERS["batch"][1](_valid("batch"))
     assert drawn_back == drawn
     for name in ("frames", "obs_index", "next_index", "actions", "rewards", "weights", "ids", "age", "reuse"):
-        np.testing.assert_array_equal(getattr(batch_back, name), getattr(batch, name))
+        np.testing.assert_array_equal(getattr(batch_back, name), getattr(batch.read(), name))
 
 
 def _spec(**changes: object) -> dict[str, object]:

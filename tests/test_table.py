@@ -9,7 +9,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from table_reference import Copies, Stream, check_references, held_ids, make_spec
 
@@ -114,6 +114,32 @@ def test_restored_table_continues_to_the_bit(
                 one.update_priorities(batch.ids, batch.rewards)
         assert held_ids(table) == held_ids(twin)
     check_references(twin)
+
+
+@settings(max_examples=60)
+@given(case=cases, steps=events, tail=events)
+def test_pinned_batch_stays_while_the_table_goes_on(
+    case: dict[str, Any], steps: list[tuple[str, int]], tail: list[tuple[str, int]]
+) -> None:
+    *_, (table, _, streams) = play(case, steps)
+    assume(len(table))
+    pinned = table.sample_pinned(8)
+    expected = pinned.read()
+    moved = table.pin(expected)
+    for event, count in tail:
+        if event == "sample":
+            table.sample(count)
+        else:
+            table.insert(streams[0].segment(count))
+    for batch in (pinned, moved):
+        assert_same(batch.read(), expected)
+        out = np.empty(batch.frames.shape, batch.frames.dtype)
+        batch.frames.copy_to(out)
+        np.testing.assert_array_equal(out, expected.frames)
+    check_references(table, np.concatenate([pinned.frames._slots, moved.frames._slots]))
+    for batch in (pinned, moved):
+        batch.frames.release()
+    check_references(table)
 
 
 @settings(max_examples=60)

@@ -30,6 +30,15 @@ def test_what_goes_in_comes_out(arrays: dict[str, np.ndarray], number: int) -> N
         assert message.arrays[name].tobytes() == array.tobytes()
 
 
+@given(st.lists(st.lists(ARRAYS, max_size=3), max_size=5))
+def test_memory_used_again_leaves_nothing_behind(messages: list[list[np.ndarray]]) -> None:
+    memory = bytearray()
+    for arrays in messages:
+        named = {str(number): array for number, array in enumerate(arrays)}
+        assert wire.encode("k", "r", {}, named, into=memory) is memory
+        assert memory == wire.encode("k", "r", {}, named)
+
+
 def test_arrays_are_aligned_and_viewed_in_place() -> None:
     payload = bytes(wire.encode("k", "r", {}, {"a": np.zeros(3, np.uint8), "b": np.arange(5, dtype=np.int64)}))
     b = wire.decode(payload).arrays["b"]
