@@ -21,6 +21,7 @@ from deploy.supervisor import RESTARTS, RestartPolicy
 
 TICK = 0.1  # seconds
 GRACE = 30.0  # seconds that a role gets for a clean stop
+JOIN_TIMEOUT = 3600.0  # seconds; that the learner has ended is noticed here, and a busy machine may start it slowly
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Topology:
         self.endpoint = options.listen or free_endpoint()
         common = [f"--zenoh-config={options.zenoh_config}"] if options.zenoh_config else []
         common += ["--shared-memory"] if options.shared_memory else []
-        joining = [f"--run={config.run}", "--connect", self.endpoint, *common]
+        joining = [f"--run={config.run}", "--connect", self.endpoint, f"--join-timeout={JOIN_TIMEOUT}", *common]
         # --resume, also at the first start: one that is started again goes on from the newest epoch.
         files = [f"--run-dir={directory}", "--resume", *common]
         learning = [f"--config={resolved}", "--listen", self.endpoint, *files]
