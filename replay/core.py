@@ -224,12 +224,11 @@ class ReplayCore:
             "learners": list(self._learners),
             "limiter": asdict(self.limiter),
         }
-        replies = [reply for reply in self.repeatable() if reply[1].sequence >= base]
-        return CoreSnapshot(books, self.table.snapshot(), replies)
+        return CoreSnapshot(books, self.table.snapshot(), self.repeatable(base))
 
-    def repeatable(self) -> list[tuple[Batch, Drawn]]:
-        """The draws that the learner may ask for again."""
-        return [(batch.read(), drawn) for batch, drawn in self._replies.values()]
+    def repeatable(self, base: int = 0) -> list[tuple[Batch, Drawn]]:
+        """The draws from number `base` on that the learner may ask for again."""
+        return [(batch.read(), drawn) for batch, drawn in self._replies.values() if drawn.sequence >= base]
 
     def restore(
         self,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,13 +10,13 @@ from numpy.typing import NDArray
 from common.errors import UsageError
 from common.randomness import generator_state, set_generator_state
 from common.types import Array, Batch, EnvSpec, Segment
-from replay.frames import FrameStore, PinnedFrames, Slots, as_slice
+from replay.frames import FrameStore, PinnedFrames, Slots
 from replay.selection import make_eviction, make_sampling
 from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
+from replay.streams import StreamTails
 
 __all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
 
-MAX_STREAMS = 4096
 COLUMNS = ("actions", "rewards", "terminated", "param_version", "ids", "reuse", "priorities")
 
 
@@ -86,8 +85,7 @@ class Table:
         self._row_of: dict[int, int] | None = {} if self._prioritized and eviction != "fifo" else None
         self._eviction = make_eviction(eviction, rng, self._ids, self._priorities)
         self._sampling = make_sampling(sampling, rng, capacity, priority_exponent, importance_exponent)
-        # Per stream: sequence of its last segment and the slots of that segment's last frames (-1: not stored).
-        self._tails: OrderedDict[tuple[int, int], tuple[int, Slots]] = OrderedDict()
+        self._tails = StreamTails(self._frames, spec.stack)
         self._sampled = 0
         self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
 
@@ -110,7 +108,7 @@ class Table:
         first = self.inserted
         rows, kept = self._eviction.place(first, segment.steps)
         index = np.concatenate((segment.obs_index[kept], segment.next_index[kept]), axis=1)
-        slots, dropped = self._store(segment, index)
+        slots, dropped = self._tails.store(segment, index)
         replaced = rows if size == self.capacity else rows[rows < size]
         self._reuse_evicted += reuse_histogram(self._reuse[replaced])
         self._reuse_evicted[0] += segment.steps - len(rows)
@@ -218,8 +216,7 @@ class Table:
     def snapshot(self) -> TableSnapshot:
         """Freeze the state as it is now while the table goes on: small arrays are copied, frames only held."""
         size = len(self)
-        tails = [tail for _, tail in self._tails.values()]
-        tail_slots = np.concatenate([*tails, np.empty(0, np.intp)])
+        tail_slots = self._tails.slots()
         stored = tail_slots >= 0
         slots = self._slots[:size]
         distinct, index = self._frames.unique(np.concatenate((slots.reshape(-1), tail_slots[stored])))
@@ -232,7 +229,7 @@ class Table:
             "sampled": self._sampled,
             "max_priority": self._max_priority,
             "reuse_evicted": self._reuse_evicted.tolist(),
-            "streams": [[*key, sequence, len(tail)] for key, (sequence, tail) in self._tails.items()],
+            "streams": self._tails.streams(),
             "rng": generator_state(self._rng),
         }
         arrays = {name: self._column(name)[:size].copy() for name in COLUMNS}
@@ -267,11 +264,7 @@ class Table:
         self._slots[:size] = slots[arrays["slots"]]
         for name in COLUMNS:
             self._column(name)[:size] = arrays[name]
-        start = 0
-        for incarnation, stream, sequence, length in meta["streams"]:
-            tail = tails[start : start + length]
-            self._tails[incarnation, stream] = sequence, np.where(tail >= 0, slots[tail], -1)
-            start += length
+        self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
         self.inserted = meta["inserted"]
         self.batches = meta["batches"]
         self._sampled = meta["sampled"]
@@ -283,33 +276,6 @@ class Table:
             self._row_of.update(zip(self._ids[rows].tolist(), rows.tolist(), strict=True))
         if self._prioritized:
             self._set_priorities(rows, self._priorities[rows])
-
-    def _store(self, segment: Segment, index: NDArray[np.int32]) -> tuple[Slots, Slots]:
-        """Store the frames of a segment that `index` names, each once.
-
-        Returns (slots of all its frames, -1 where not stored; slots to drop once the transitions are in place).
-        The stream keeps a reference on its last frames, as many as the next segment is likely to carry.
-        """
-        count = len(segment.frames)
-        references = np.bincount(index.reshape(-1), minlength=count)
-        slots = np.empty(count, np.intp)
-        slots.fill(-1)
-        stream = (segment.incarnation, segment.stream)
-        sequence, previous = self._tails.pop(stream, (-1, slots[:0]))
-        shared = min(segment.carried, len(previous)) if sequence == segment.sequence - 1 else 0
-        slots[segment.carried - shared : segment.carried] = previous[len(previous) - shared :]
-        known = slots >= 0
-        tail = max(0, count - max(self.spec.stack, segment.carried))
-        references[tail:] += known[tail:] | (references[tail:] > 0)
-        wanted = references > 0
-        again = (wanted & known).nonzero()[0]
-        self._frames.hold(slots[again], references[again])
-        new = (wanted & ~known).nonzero()[0]
-        slots[new] = self._frames.add(segment.frames[as_slice(new)], references[new])
-        self._tails[stream] = segment.sequence, slots[tail:].copy()
-        if len(self._tails) > MAX_STREAMS:
-            previous = np.concatenate((previous, self._tails.popitem(last=False)[1][1]))
-        return slots, previous[previous >= 0]
 
     def _set_priorities(self, rows: Slots, priorities: NDArray[np.float64]) -> None:
         self._priorities[rows] = priorities

@@ -138,7 +138,8 @@ def held_ids(table: Table) -> list[int]:
 
 def check_references(table: Table, pinned: Array | None = None) -> None:
     """Every slot has exactly the references of the transitions, streams and snapshots that name it."""
-    named: list[Array] = [tail[tail >= 0] for _, tail in table._tails.values()]
+    tails = table._tails.slots()
+    named: list[Array] = [tails[tails >= 0]]
     named += [table._slots[: len(table)].reshape(-1), *([] if pinned is None else [pinned])]
     references = table._frames.references
     expected = np.bincount(np.concatenate(named).astype(np.intp), minlength=len(references))

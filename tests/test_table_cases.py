@@ -11,7 +11,7 @@ from table_reference import Copies, Stream, check_references, make_spec
 from common.capacity import estimated_bytes
 from common.errors import UsageError
 from common.types import Segment
-from replay import table as table_module
+from replay import streams
 from replay.stats import reuse_histogram
 from replay.table import Table
 
@@ -64,12 +64,12 @@ def test_n_step_transitions_carry_more_than_a_stack() -> None:
 
 
 def test_streams_used_least_recently_give_their_frames_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table_module, "MAX_STREAMS", 3)
+    monkeypatch.setattr(streams, "MAX_STREAMS", 3)
     table = Table(make_spec(2), 4, rng=np.random.default_rng(0))
     for number in range(10):
         table.insert(Stream(make_spec(2), number, np.random.default_rng(0), 50).segment(4))
         check_references(table)
-    assert [stream for _, stream in table._tails] == [7, 8, 9]
+    assert [stream for _, stream, *_ in table._tails.streams()] == [7, 8, 9]
     assert table.stats().frames_held == 5 + 2 * 2
 
 
