@@ -97,9 +97,11 @@ class FrameStore:
 
     def read(self, slots: Slots, out: Array | None = None) -> Array:
         """Copy of the frames in `slots`: [n, *frame_shape]; in `out`, contiguous memory, if it is given."""
-        rows = None if out is None else out.reshape(len(slots), self._elements)
+        if out is None:
+            return self._rows.take(slots, axis=0).reshape(len(slots), *self.frame_shape)
         # mode: without it numpy copies to memory of its own first
-        return self._rows.take(slots, axis=0, out=rows, mode="clip").reshape(len(slots), *self.frame_shape)
+        self._rows.take(slots, axis=0, out=out.reshape(len(slots), self._elements), mode="clip")
+        return out
 
     def pin(self, slots: Slots) -> PinnedFrames:
         """Hold distinct slots as they are now, to be copied out later."""
