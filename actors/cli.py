@@ -9,17 +9,17 @@ import torch
 
 from actors.policy import Policy
 from actors.service import ActorService
-from common import cli
-from common.environments import make_vector_env
+from common.envs.environments import make_vector_env
 from common.errors import JoinError, PeerLost
-from common.joining import Membership, join
-from common.lifecycle import Stop, run_main
-from common.memory import keep_freed_memory
-from common.messages import Join, Joined
-from common.networks import FlatNetwork, build_network
-from common.options import RoleOptions
-from common.threads import use_threads
-from common.transport import Node, new_incarnation, open_session
+from common.messaging.joining import Membership, join
+from common.messaging.messages import Join, Joined
+from common.messaging.transport import Node, new_incarnation, open_session
+from common.networks.network import FlatNetwork, build_network
+from common.process import cli
+from common.process.lifecycle import Stop, run_main
+from common.process.memory import keep_freed_memory
+from common.process.threads import use_threads
+from common.settings.options import RoleOptions
 
 
 @dataclass(frozen=True)

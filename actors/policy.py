@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.networks import FlatNetwork, preprocess
+from common.networks.network import FlatNetwork, preprocess
 from common.types import Array, EnvSpec
 
 

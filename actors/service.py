@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from actors.policy import Policy
 from actors.segments import EpisodeTracker, SegmentAssembler
 from actors.weights import WeightsFollower
-from common import schedules
-from common.clients import InsertClient
-from common.config import ActorSettings
-from common.environments import Steps, VectorEnv
-from common.lifecycle import Stop
-from common.transport import Node
+from common.envs.environments import Steps, VectorEnv
+from common.messaging.clients import InsertClient
+from common.messaging.transport import Node
+from common.process.lifecycle import Stop
+from common.settings import schedules
+from common.settings.config import ActorSettings
 from common.types import Array, EpisodeEnd
 
 STATUS_EVERY = 0.5  # seconds

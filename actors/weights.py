@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 
 from actors.policy import Policy
-from common import messages
 from common.errors import BadMessage
-from common.transport import NoAnswer, Node
-from common.wire import Message
+from common.messaging import messages
+from common.messaging.transport import NoAnswer, Node
+from common.messaging.wire import Message
 
 GRACE = 0.5  # seconds that a broadcast may take before the weights are asked for
 

@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from common.environments import env_spec
-from common.networks import FlatNetwork, preprocess
-from common.tables import load_tables, resolve
-from common.threads import use_threads
+from common.envs.environments import env_spec
+from common.networks.network import FlatNetwork, preprocess
+from common.process.threads import use_threads
+from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
-from learner.epochs import load_learner, newest_epoch
-from learner.run_directory import read_run_id
+from learner.records.epochs import load_learner, newest_epoch
+from learner.records.run_directory import read_run_id
 from replay.core import ReplayCore
-from replay.storage import load_snapshot
+from replay.persistence.storage import load_snapshot
 
 
 def show(network: FlatNetwork, x: Tensor) -> None:

@@ -25,15 +25,15 @@ import numpy as np
 import torch
 
 from actors.policy import Policy
-from common import messages
-from common.clients import replay_key
-from common.config import RunConfig
-from common.environments import env_spec, make_vector_env
-from common.networks import FlatNetwork, build_network
-from common.processes import ChildProcess, command, free_endpoint
-from common.tables import load_tables, resolve
-from common.threads import use_threads
-from common.transport import NoAnswer, Node, new_incarnation, open_session
+from common.envs.environments import env_spec, make_vector_env
+from common.messaging import messages
+from common.messaging.clients import replay_key
+from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
+from common.networks.network import FlatNetwork, build_network
+from common.process.processes import ChildProcess, command, free_endpoint
+from common.process.threads import use_threads
+from common.settings.config import RunConfig
+from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
 from learner.broadcast import Broadcaster
 from learner.reception import Reception

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from common.processes import command
-from common.tables import load_tables, resolve, shortened
+from common.process.processes import command
+from common.settings.tables import load_tables, resolve, shortened
 from common.types import Array
 
 FRAME_BYTES = 84 * 84

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from common.processes import command
+from common.process.processes import command
 
 TARGET, LIMIT = 0.9, 600.0  # return; seconds
 

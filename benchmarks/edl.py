@@ -19,15 +19,15 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import torch
 
-from common.config import RunConfig
-from common.networks import build_network
-from common.tables import validated
-from common.threads import use_threads
+from common.networks.network import build_network
+from common.process.threads import use_threads
+from common.settings.config import RunConfig
+from common.settings.tables import validated
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
-from learner.arrays import Array, like
-from learner.backprop import Tape
-from learner.edl import FeedbackRule
+from learner.edl.arrays import Array, like
+from learner.edl.backprop import Tape
+from learner.edl.feedback import FeedbackRule
 
 BATCH, GAMMA, RATE = 32, 0.99, 0.1
 BLOCKS = 5

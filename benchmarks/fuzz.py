@@ -26,17 +26,17 @@ import numpy as np
 from mutations import mutate
 from roles import Roles, replay_stats, running, wait_until
 
-from common import experience, limits, messages, wire
-from common.clients import replay_key
 from common.errors import BadMessage, CoopError, RunError
-from common.experience import DrawRequest, SegmentReader
-from common.joining import join, join_key
-from common.lifecycle import Stop
-from common.messages import Join, Joined
-from common.processes import free_endpoint
-from common.transport import Node, Pending, Refused, new_incarnation, open_session
+from common.messaging import experience, limits, messages, wire
+from common.messaging.clients import replay_key
+from common.messaging.experience import DrawRequest, SegmentReader
+from common.messaging.joining import join, join_key
+from common.messaging.messages import Join, Joined
+from common.messaging.transport import Node, Pending, Refused, new_incarnation, open_session
+from common.messaging.wire import Message
+from common.process.lifecycle import Stop
+from common.process.processes import free_endpoint
 from common.types import EpisodeEnd, Segment
-from common.wire import Message
 
 RUN = "fuzz"
 WINDOW = 64  # broken messages under way at once

@@ -19,13 +19,13 @@ from pathlib import Path
 
 from table import ATARI, segments
 
-from common import messages
-from common.clients import InsertClient, replay_key
-from common.lifecycle import Stop
-from common.memory import keep_freed_memory
-from common.processes import ChildProcess, command, free_endpoint
-from common.tables import validated
-from common.transport import NoAnswer, Node, new_incarnation, open_session
+from common.messaging import messages
+from common.messaging.clients import InsertClient, replay_key
+from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
+from common.process.lifecycle import Stop
+from common.process.memory import keep_freed_memory
+from common.process.processes import ChildProcess, command, free_endpoint
+from common.settings.tables import validated
 from learner.reception import Reception
 
 STEPS, WINDOW, CAPACITY = 64, 16, 5000

@@ -20,10 +20,10 @@ import gymnasium
 from stable_baselines3 import DQN
 from stable_baselines3.common.logger import Logger
 
-from common.cli import base_config
-from common.threads import use_threads
+from common.process.cli import base_config
+from common.process.threads import use_threads
 from experiments.lockstep import Lockstep
-from learner.run_directory import RunDirectory
+from learner.records.run_directory import RunDirectory
 
 METHODS = ("dqn", "edql", "g-coop", "coop")
 WARM_UP = 500  # steps, more than either waits for before it learns

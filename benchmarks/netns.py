@@ -22,7 +22,7 @@ from audit import audit
 from roles import ActorWatch, Roles, replay_stats, running, wait_until
 
 from common.errors import CoopError, RunError
-from common.transport import Node, new_incarnation, open_session
+from common.messaging.transport import Node, new_incarnation, open_session
 
 RUN = "netns"
 ACTORS = 2

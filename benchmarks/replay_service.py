@@ -26,13 +26,13 @@ import numpy as np
 import zenoh
 from table import ATARI, segments
 
-from common import experience
-from common.clients import InsertClient, SampleClient
-from common.lifecycle import Stop
-from common.memory import keep_freed_memory
-from common.processes import ChildProcess, command, free_endpoint
-from common.tables import validated
-from common.transport import Node, new_incarnation, open_session
+from common.messaging import experience
+from common.messaging.clients import InsertClient, SampleClient
+from common.messaging.transport import Node, new_incarnation, open_session
+from common.process.lifecycle import Stop
+from common.process.memory import keep_freed_memory
+from common.process.processes import ChildProcess, command, free_endpoint
+from common.settings.tables import validated
 from learner.reception import Reception
 
 BATCH, PREFETCH, STEPS = 32, 4, 32

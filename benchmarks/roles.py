@@ -11,12 +11,12 @@ from typing import Any, Self
 
 import zenoh
 
-from common import messages, wire
-from common.clients import replay_key
 from common.errors import RunError
-from common.messages import ReplayStats
-from common.processes import ChildProcess, command
-from common.transport import Node
+from common.messaging import messages, wire
+from common.messaging.clients import replay_key
+from common.messaging.messages import ReplayStats
+from common.messaging.transport import Node
+from common.process.processes import ChildProcess, command
 
 GRACE = 60.0  # seconds that a role gets to end
 

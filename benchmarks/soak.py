@@ -19,7 +19,7 @@ from statistics import median
 from roles import Roles, running
 
 from common.errors import CoopError, RunError
-from common.processes import free_endpoint
+from common.process.processes import free_endpoint
 
 ACTORS = 2
 WARM_UP = 60.0  # seconds

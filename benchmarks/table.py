@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from common.capacity import estimated_bytes
+from common.settings.capacity import estimated_bytes
 from common.types import EnvSpec, Segment
-from replay.table import Table
+from replay.table.table import Table
 
 ROUNDS = 9
 REPEATS = 200

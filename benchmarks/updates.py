@@ -26,19 +26,19 @@ import numpy as np
 import torch
 from table import ATARI, segments
 
-from common import messages
-from common.clients import InsertClient, replay_key
-from common.config import RunConfig
-from common.joining import join
-from common.lifecycle import Stop
-from common.memory import keep_freed_memory
-from common.messages import Join
-from common.processes import ChildProcess, command, free_endpoint
-from common.tables import load_tables, resolve, to_toml
-from common.threads import use_threads
-from common.transport import NoAnswer, Node, new_incarnation, open_session
+from common.messaging import messages
+from common.messaging.clients import InsertClient, replay_key
+from common.messaging.joining import join
+from common.messaging.messages import Join
+from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
+from common.process.lifecycle import Stop
+from common.process.memory import keep_freed_memory
+from common.process.processes import ChildProcess, command, free_endpoint
+from common.process.threads import use_threads
+from common.settings.config import RunConfig
+from common.settings.tables import load_tables, resolve, to_toml
 from learner.agent import Agent
-from replay.table import Table
+from replay.table.table import Table
 
 RUN = "bench"
 STEPS = 32

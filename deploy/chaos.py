@@ -11,11 +11,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from common import cli
 from common.errors import RunError, UsageError
-from common.lifecycle import run_main
-from common.processes import ChildProcess, command, free_endpoint
-from common.transport import new_incarnation
+from common.messaging.transport import new_incarnation
+from common.process import cli
+from common.process.lifecycle import run_main
+from common.process.processes import ChildProcess, command, free_endpoint
 from deploy.status import RunStatus
 
 TICK = 0.05  # seconds

@@ -6,16 +6,16 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.capacity import check_memory
-from common.config import RunConfig, check_distributed
-from common.environments import env_spec
+from common.envs.environments import env_spec
 from common.errors import RunError, UsageError
-from common.files import write_whole
-from common.lifecycle import Stop, run_main
-from common.options import RunOptions, parse_run
-from common.processes import ChildProcess, command, free_endpoint
-from common.tables import to_toml
-from common.transport import new_incarnation
+from common.messaging.transport import new_incarnation
+from common.process.files import write_whole
+from common.process.lifecycle import Stop, run_main
+from common.process.processes import ChildProcess, command, free_endpoint
+from common.settings.capacity import check_memory
+from common.settings.config import RunConfig, check_distributed
+from common.settings.options import RunOptions, parse_run
+from common.settings.tables import to_toml
 from deploy.status import Display, RunStatus
 from deploy.supervisor import RESTARTS, RestartPolicy
 

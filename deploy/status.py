@@ -11,11 +11,11 @@ from rich.console import Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from common.display import LiveDisplay
-from common.lifecycle import Stop
-from common.schema import Int, ListOf, Real, Rule, Text
-from common.schema import Table as TableOf
-from common.transport import Node, open_session
+from common.messaging.schema import Int, ListOf, Real, Rule, Text
+from common.messaging.schema import Table as TableOf
+from common.messaging.transport import Node, open_session
+from common.process.display import LiveDisplay
+from common.process.lifecycle import Stop
 
 # What a display needs of the learner's status; a status where it does not fit is not shown.
 _SHOWN: dict[str, Rule] = {

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.cli import parse
 from common.errors import JoinError, PeerLost
-from common.lifecycle import Stop, run_main
-from common.transport import new_incarnation
+from common.messaging.transport import new_incarnation
+from common.process.cli import parse
+from common.process.lifecycle import Stop, run_main
 from deploy.status import Display, RunStatus
 
 TICK = 0.1  # seconds

@@ -10,11 +10,11 @@ import torch
 
 from actors.policy import Policy
 from actors.segments import EpisodeTracker
-from common.environments import make_vector_env
+from common.envs.environments import make_vector_env
 from common.errors import UsageError
-from common.tables import load_tables, resolve
+from common.settings.tables import load_tables, resolve
 from learner.agent import make_network
-from learner.epochs import complete_epochs, load_learner
+from learner.records.epochs import complete_epochs, load_learner
 
 CPU = torch.device("cpu")
 

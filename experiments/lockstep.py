@@ -10,19 +10,19 @@ import numpy as np
 
 from actors.policy import Policy
 from actors.segments import EpisodeTracker, SegmentAssembler
-from common import schedules
-from common.config import RunConfig
-from common.environments import Steps, make_vector_env
+from common.envs.environments import Steps, make_vector_env
 from common.errors import UsageError
-from common.experience import Drawn, EpisodeRecord
-from common.randomness import generator_state, set_generator_state
+from common.messaging.experience import Drawn, EpisodeRecord
+from common.process.randomness import generator_state, set_generator_state
+from common.settings import schedules
+from common.settings.config import RunConfig
 from common.types import EpisodeEnd
 from learner.agent import Agent
-from learner.curve import draw_learning_curve
-from learner.epochs import load_learner, save_epoch
-from learner.run_directory import RunDirectory
-from learner.summary import Summary, summarise
-from learner.telemetry import Telemetry
+from learner.records.curve import draw_learning_curve
+from learner.records.epochs import load_learner, save_epoch
+from learner.records.run_directory import RunDirectory
+from learner.records.summary import Summary, summarise
+from learner.records.telemetry import Telemetry
 from replay.core import make_table
 
 METRICS_EVERY = 200  # updates

@@ -6,12 +6,12 @@ import math
 import sys
 import time
 
-from common.lifecycle import Stop, run_main
-from common.options import RunOptions, parse_run
-from common.threads import use_threads
+from common.process.lifecycle import Stop, run_main
+from common.process.threads import use_threads
+from common.settings.options import RunOptions, parse_run
 from experiments.lockstep import Lockstep, finish
-from learner.epochs import newest_epoch
-from learner.run_directory import RunDirectory
+from learner.records.epochs import newest_epoch
+from learner.records.run_directory import RunDirectory
 from learner.targets import target_reached
 
 PROGRESS_EVERY = 5.0  # seconds

@@ -11,20 +11,20 @@ from typing import Any
 
 import torch
 
-from common.config import RunConfig
-from common.environments import env_spec
+from common.envs.environments import env_spec
 from common.errors import RunError, UsageError
-from common.experience import DrawRequest
-from common.tables import load_tables, resolve
-from common.threads import use_threads
+from common.messaging.experience import DrawRequest
+from common.process.threads import use_threads
+from common.settings.config import RunConfig
+from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
-from learner.epochs import complete_epochs, load_learner, newest_epoch
-from learner.run_directory import read_run_id
+from learner.records.epochs import complete_epochs, load_learner, newest_epoch
+from learner.records.run_directory import read_run_id
 from replay.core import ReplayCore
-from replay.epochs import ReplayEpochs
-from replay.journal import DRAW, TornFile, journal_files, read_draw, read_file
-from replay.recovery import carry_out, following_files
-from replay.table import PinnedBatch
+from replay.persistence.epochs import ReplayEpochs
+from replay.persistence.journal import DRAW, TornFile, journal_files, read_draw, read_file
+from replay.persistence.recovery import carry_out, following_files
+from replay.table.table import PinnedBatch
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from common import cli
-from common.lifecycle import run_main
+from common.process import cli
+from common.process.lifecycle import run_main
 from experiments.reexecute import reexecute
 
 

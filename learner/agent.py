@@ -21,16 +21,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common import schedules
-from common.config import RunConfig
 from common.errors import UsageError
-from common.networks import FlatNetwork, build_network, preprocess
-from common.randomness import generator_state, set_generator_state
+from common.networks.network import FlatNetwork, build_network, preprocess
+from common.process.randomness import generator_state, set_generator_state
+from common.settings import schedules
+from common.settings.config import RunConfig
 from common.types import Batch, EnvSpec
-from learner.arrays import Array, assign
-from learner.edl import FeedbackRule
+from learner.edl.arrays import Array, assign
+from learner.edl.feedback import FeedbackRule
+from learner.edl.trainable import Trainable
 from learner.optimizers import make_optimizer
-from learner.trainable import Trainable
 
 T = TypeVar("T")
 

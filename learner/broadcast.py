@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from common import messages
-from common.messages import Role
-from common.transport import Node
-from common.wire import Message
+from common.messaging import messages
+from common.messaging.messages import Role
+from common.messaging.transport import Node
+from common.messaging.wire import Message
 from learner.agent import Agent
 
 

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from common import messages
-from common.clients import SampleClient, replay_key
 from common.errors import CoopError, RunError
-from common.transport import NoAnswer, Node
-from common.wire import Message
-from learner.epochs import complete_epochs, save_epoch
+from common.messaging import messages
+from common.messaging.clients import SampleClient, replay_key
+from common.messaging.transport import NoAnswer, Node
+from common.messaging.wire import Message
+from learner.records.epochs import complete_epochs, save_epoch
 
 PATIENCE = 5.0  # seconds that the replay service may take to answer
 PAUSE = 0.05  # seconds between questions

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.clients import SampleClient
-from common.config import check_distributed
-from common.environments import env_spec
-from common.lifecycle import Stop, run_main
-from common.options import RunOptions, parse_run
-from common.threads import use_threads
-from common.transport import Node, locators, new_incarnation, open_session
+from common.envs.environments import env_spec
+from common.messaging.clients import SampleClient
+from common.messaging.transport import Node, locators, new_incarnation, open_session
+from common.process.lifecycle import Stop, run_main
+from common.process.threads import use_threads
+from common.settings.config import check_distributed
+from common.settings.options import RunOptions, parse_run
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
-from learner.epochs import go_back
 from learner.reception import Reception
-from learner.run_directory import RunDirectory
+from learner.records.epochs import go_back
+from learner.records.run_directory import RunDirectory
 from learner.service import LearnerService
 
 

@@ -10,8 +10,8 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 
-from common.config import LearnerSettings
-from learner.arrays import Array, assign, namespace
+from common.settings.config import LearnerSettings
+from learner.edl.arrays import Array, assign, namespace
 
 _TINY = 1e-37  # below any square that counts, above the denormals
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from common import messages
-from common.config import RunConfig
 from common.errors import BadMessage
-from common.joining import join_key
-from common.messages import Joined
-from common.transport import Node
+from common.messaging import messages
+from common.messaging.joining import join_key
+from common.messaging.messages import Joined
+from common.messaging.transport import Node
+from common.messaging.wire import Message
+from common.settings.config import RunConfig
 from common.types import EnvSpec
-from common.wire import Message
 
 
 class Reception:

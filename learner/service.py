@@ -8,20 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from common import messages, schedules
-from common.clients import SampleClient, replay_key
-from common.experience import Drawn
-from common.lifecycle import Stop
-from common.messages import ReplayStats
-from common.transport import NoAnswer, Node
+from common.messaging import messages
+from common.messaging.clients import SampleClient, replay_key
+from common.messaging.experience import Drawn
+from common.messaging.messages import ReplayStats
+from common.messaging.transport import NoAnswer, Node
+from common.process.lifecycle import Stop
+from common.settings import schedules
 from learner.agent import Agent
 from learner.broadcast import Broadcaster
 from learner.checkpoints import Checkpoints
-from learner.curve import draw_learning_curve
-from learner.run_directory import RunDirectory
-from learner.summary import Summary, summarise
+from learner.records.curve import draw_learning_curve
+from learner.records.run_directory import RunDirectory
+from learner.records.summary import Summary, summarise
+from learner.records.telemetry import Telemetry
 from learner.targets import target_reached
-from learner.telemetry import Telemetry
 
 METRICS_EVERY = 200  # updates
 STATUS_EVERY = 0.5  # seconds

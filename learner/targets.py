@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from common.config import RunConfig
-from learner.telemetry import Telemetry
+from common.settings.config import RunConfig
+from learner.records.telemetry import Telemetry
 
 
 def target_reached(config: RunConfig, updates: int, telemetry: Telemetry) -> str:

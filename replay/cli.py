@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from common import cli
 from common.errors import PeerLost, RunError, UsageError
-from common.joining import Membership, join
-from common.lifecycle import Stop, run_main
-from common.memory import keep_freed_memory
-from common.messages import Join, Joined
-from common.options import RoleOptions
-from common.transport import Node, locators, new_incarnation, open_session
+from common.messaging.joining import Membership, join
+from common.messaging.messages import Join, Joined
+from common.messaging.transport import Node, locators, new_incarnation, open_session
+from common.process import cli
+from common.process.lifecycle import Stop, run_main
+from common.process.memory import keep_freed_memory
+from common.settings.options import RoleOptions
 from replay.core import ReplayCore
-from replay.epochs import ReplayEpochs
-from replay.journal import Journal, journal_files
-from replay.recovery import recover
+from replay.persistence.epochs import ReplayEpochs
+from replay.persistence.journal import Journal, journal_files
+from replay.persistence.recovery import recover
 from replay.service import ReplayService
 
 

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from common.capacity import check_memory
-from common.config import RunConfig
 from common.errors import RunError
-from common.experience import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
+from common.messaging.experience import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
+from common.settings.capacity import check_memory
+from common.settings.config import RunConfig
 from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
 from replay.dedup import SeenWindow
 from replay.limiter import RateLimiter
-from replay.table import PinnedBatch, Table, TableSnapshot
+from replay.table.table import PinnedBatch, Table, TableSnapshot
 
 LEARNERS_KEPT = 64  # learners that others have taken over from, and that are refused
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common import cli, limits, messages
-from common.clients import replay_key
 from common.errors import RunError
-from common.joining import join
-from common.lifecycle import Stop, run_main
-from common.limits import Limits
-from common.messages import Join
-from common.options import RoleOptions
-from common.transport import NoAnswer, Node, Refused, new_incarnation, open_session
+from common.messaging import limits, messages
+from common.messaging.clients import replay_key
+from common.messaging.joining import join
+from common.messaging.limits import Limits
+from common.messaging.messages import Join
+from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation, open_session
+from common.process import cli
+from common.process.lifecycle import Stop, run_main
+from common.settings.options import RoleOptions
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,17 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from common import experience, limits, messages
-from common.clients import replay_key
 from common.errors import BadMessage, RunError
-from common.experience import DrawRequest, SegmentReader
-from common.lifecycle import Stop
-from common.limits import Limits
-from common.messages import ReplayStats
-from common.transport import Node
-from common.wire import Message
+from common.messaging import experience, limits, messages
+from common.messaging.clients import replay_key
+from common.messaging.experience import DrawRequest, SegmentReader
+from common.messaging.limits import Limits
+from common.messaging.messages import ReplayStats
+from common.messaging.transport import Node
+from common.messaging.wire import Message
+from common.process.lifecycle import Stop
 from replay.core import ReplayCore, Wait
-from replay.epochs import ReplayEpochs
+from replay.persistence.epochs import ReplayEpochs
 
 HOLD = 1.0  # seconds
 STATUS_EVERY = 0.5  # seconds

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.types import Array
-from replay.frames import PinnedFrames
+from replay.table.frames import PinnedFrames
 
 REUSE_BUCKETS = 16
 

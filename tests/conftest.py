@@ -9,8 +9,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from common.threads import use_threads
-from common.transport import Node, new_incarnation, open_session
+from common.messaging.transport import Node, new_incarnation, open_session
+from common.process.threads import use_threads
 from common.types import EnvSpec
 
 # torch.compile's own processes would outlive the tests.

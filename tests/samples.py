@@ -3,7 +3,7 @@
 import numpy as np
 
 from actors.segments import SegmentAssembler
-from common.environments import EnvSettings, Steps, make_vector_env
+from common.envs.environments import EnvSettings, Steps, make_vector_env
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
 
 INCARNATION = 77

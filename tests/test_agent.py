@@ -9,12 +9,12 @@ import pytest
 import torch
 from samples import make_segment
 
-from common.config import EdlSettings, LearnerSettings, Method, NetworkSettings, OptimizerName, RunConfig
 from common.errors import UsageError
+from common.settings.config import EdlSettings, LearnerSettings, Method, NetworkSettings, OptimizerName, RunConfig
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
 from learner.optimizers import MnihRMSProp, make_optimizer
-from replay.table import Table
+from replay.table.table import Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 

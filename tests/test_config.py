@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from common import schedules
-from common.cli import base_config
-from common.config import ActorSettings, EdlSettings, LearnerSettings
 from common.errors import UsageError
-from common.options import RunOptions, parse_run
-from common.tables import load_tables, preset_names, resolve, to_toml
+from common.process.cli import base_config
+from common.settings import schedules
+from common.settings.config import ActorSettings, EdlSettings, LearnerSettings
+from common.settings.options import RunOptions, parse_run
+from common.settings.tables import load_tables, preset_names, resolve, to_toml
 
 
 @pytest.mark.parametrize("preset", preset_names())

@@ -9,13 +9,13 @@ from contextlib import ExitStack
 
 import pytest
 
-from common import messages
-from common.transport import Node, locators, new_incarnation, open_session
+from common.messaging import messages
+from common.messaging.transport import Node, locators, new_incarnation, open_session
 
 FROZEN = 3  # more than the threads that Zenoh receives with, left to itself
 LISTENER = """
 import sys, time
-from common.transport import open_session
+from common.messaging.transport import open_session
 session = open_session((), (sys.argv[1],))
 subscriber = session.declare_subscriber("coop/test/weights/1", lambda sample: None)
 print("ready", flush=True)

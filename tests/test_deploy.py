@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from actors.cli import ActorOptions
-from common import cli
-from common.options import RoleOptions, RunOptions, parse_run
+from common.process import cli
+from common.settings.options import RoleOptions, RunOptions, parse_run
 from learner.cli import LearnerOptions
 from replay.cli import ReplayOptions
 

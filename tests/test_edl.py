@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from common.networks import build_network
+from common.networks.network import build_network
 from common.types import EnvSpec
-from learner.edl import edl_gradients, feedback_matrices
+from learner.edl.feedback import edl_gradients, feedback_matrices
 
 
 def _spec(kind: str, actions: int) -> EnvSpec:

@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from common.networks import build_network
+from common.networks.network import build_network
 from common.types import EnvSpec
-from learner.edl import edl_gradients
+from learner.edl.feedback import edl_gradients
 
 
 def _network(seed: int, actions: int, widths: tuple[int, ...]) -> nn.Sequential:

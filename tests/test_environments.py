@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from common import catch
-from common.environments import EnvSettings, Steps, env_spec, make_vector_env
+from common.envs import catch
+from common.envs.environments import EnvSettings, Steps, env_spec, make_vector_env
+from common.envs.pictures import Shrink
 from common.errors import UsageError
-from common.pictures import Shrink
 from common.types import Array, EnvSpec
 
 

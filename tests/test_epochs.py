@@ -9,13 +9,13 @@ import torch
 from samples import make_segment
 from table_reference import check_references
 
-from common.config import LearnerSettings, ReplaySettings, RunConfig
 from common.errors import RunError, UsageError
-from common.experience import DrawRequest
+from common.messaging.experience import DrawRequest
+from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec
-from learner.epochs import complete_epochs, go_back, load_learner, newest_epoch, save_epoch
+from learner.records.epochs import complete_epochs, go_back, load_learner, newest_epoch, save_epoch
 from replay.core import ReplayCore, Wait
-from replay.epochs import ReplayEpochs
+from replay.persistence.epochs import ReplayEpochs
 
 CONFIG = RunConfig(
     run="test",

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from learner.epochs import load_learner
+from learner.records.epochs import load_learner
 
 FUZZ = Path(__file__).parents[1] / "benchmarks" / "fuzz.py"
 

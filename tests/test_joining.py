@@ -7,20 +7,20 @@ from pathlib import Path
 import pytest
 from samples import make_segment
 
-from common import experience, limits, messages, wire
-from common.clients import replay_key
-from common.config import RunConfig
 from common.errors import JoinError
-from common.experience import DrawRequest
-from common.joining import difference, join, join_key
-from common.lifecycle import Stop
-from common.messages import Join, Joined
-from common.transport import Node, Refused, new_incarnation, open_session
+from common.messaging import experience, limits, messages, wire
+from common.messaging.clients import replay_key
+from common.messaging.experience import DrawRequest
+from common.messaging.joining import difference, join, join_key
+from common.messaging.messages import Join, Joined
+from common.messaging.transport import Node, Refused, new_incarnation, open_session
+from common.process.lifecycle import Stop
+from common.settings.config import RunConfig
 from common.types import EnvSpec
 from deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
 from learner.reception import Reception
 from replay.core import ReplayCore
-from replay.epochs import ReplayEpochs
+from replay.persistence.epochs import ReplayEpochs
 from replay.service import ReplayService
 
 REQUEST = Join("actor", 3, [])

@@ -11,15 +11,15 @@ import pytest
 from samples import make_segment
 from test_epochs import CONFIG, save
 
-from common import experience
 from common.errors import RunError, UsageError
-from common.experience import DrawRequest
-from common.files import LineFile
+from common.messaging import experience
+from common.messaging.experience import DrawRequest
+from common.process.files import LineFile
 from common.types import EnvSpec
 from replay.core import ReplayCore, Wait
-from replay.epochs import ReplayEpochs
-from replay.journal import Journal, journal_files
-from replay.recovery import recover
+from replay.persistence.epochs import ReplayEpochs
+from replay.persistence.journal import Journal, journal_files
+from replay.persistence.recovery import recover
 
 
 def _insert(core: ReplayCore, spec: EnvSpec, sequence: int) -> int | Wait:

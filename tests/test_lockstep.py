@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from common.cli import base_config
-from common.config import Method
+from common.process.cli import base_config
+from common.settings.config import Method
 from experiments.lockstep import Lockstep
-from learner.run_directory import RunDirectory
+from learner.records.run_directory import RunDirectory
 
 COMMAND = str(Path(sysconfig.get_path("scripts")) / "coop-lockstep")
 

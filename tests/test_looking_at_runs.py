@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from common.cli import base_config
+from common.process.cli import base_config
 from experiments import evaluation_cli
 from experiments.evaluation import evaluate
 from experiments.lockstep import Lockstep, finish
-from learner.run_directory import RunDirectory
+from learner.records.run_directory import RunDirectory
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 

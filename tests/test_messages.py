@@ -13,16 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import make_segment
 
-from common import experience, limits, messages, wire
-from common.config import RunConfig
 from common.errors import BadMessage, RunError
-from common.experience import BatchReader, Drawn, DrawRequest, EpisodeRecord, SegmentReader
-from common.limits import Limits
-from common.messages import Join, Joined, ReplayStats, Role
-from common.tables import to_tables
+from common.messaging import experience, limits, messages, wire
+from common.messaging.experience import BatchReader, Drawn, DrawRequest, EpisodeRecord, SegmentReader
+from common.messaging.limits import Limits
+from common.messaging.messages import Join, Joined, ReplayStats, Role
+from common.messaging.wire import Message
+from common.settings.config import RunConfig
+from common.settings.tables import to_tables
 from common.types import EnvSpec, EpisodeEnd
-from common.wire import Message
-from replay.table import PinnedBatch, Table
+from replay.table.table import PinnedBatch, Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]

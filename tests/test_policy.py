@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from actors.policy import Policy
-from common.networks import FlatNetwork, build_network
+from common.networks.network import FlatNetwork, build_network
 from common.types import EnvSpec
 
 SPEC = EnvSpec("made-up", (84, 84), "uint8", 4, 6)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from samples import make_segment
 
-from common import experience, messages
-from common.clients import InsertClient, SampleClient, replay_key
-from common.config import LearnerSettings, ReplaySettings, RunConfig
 from common.errors import RunError
-from common.experience import DrawRequest
-from common.lifecycle import Stop
-from common.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, locators, new_incarnation, open_session
+from common.messaging import experience, messages
+from common.messaging.clients import InsertClient, SampleClient, replay_key
+from common.messaging.experience import DrawRequest
+from common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, locators, new_incarnation, open_session
+from common.process.lifecycle import Stop
+from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec
 from replay.core import ReplayCore, Wait
-from replay.epochs import ReplayEpochs
+from replay.persistence.epochs import ReplayEpochs
 from replay.service import ReplayService
 
 CONFIG = RunConfig(

@@ -23,8 +23,8 @@ from experiments.report.results import breaking_table
 from experiments.report.study import load_study
 from experiments.report.writer import write_report
 from experiments.sweep.grid import load_grid
-from learner.run_directory import RunDirectory
-from learner.summary import summarise
+from learner.records.run_directory import RunDirectory
+from learner.records.summary import summarise
 
 pytestmark = pytest.mark.timeout(300)  # eight small runs come before the first test
 GRID = """

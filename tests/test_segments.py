@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from samples import INCARNATION, cut, record
 
 from actors.segments import EpisodeTracker, FinishedEpisode, SegmentAssembler
-from common.environments import EnvSettings, Steps
+from common.envs.environments import EnvSettings, Steps
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
 
 

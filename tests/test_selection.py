@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from replay.selection import Fifo, LowestPriority, Proportional, Reservoir, Rows, SumTree, Uniform
+from replay.table.selection import Fifo, LowestPriority, Proportional, Reservoir, Rows, SumTree, Uniform
 
 
 def fill(place: Callable[[int, int], tuple[Rows, slice | Rows]], capacity: int, lengths: list[int]) -> list[int]:

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import Seen, cut, record
 
-from common.environments import EnvSettings
+from common.envs.environments import EnvSettings
 from common.types import EnvSpec
-from replay.table import Table
+from replay.table.table import Table
 
 
 @cache

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import UsageError
-from common.tables import resolve
+from common.settings.tables import resolve
 from experiments.sweep.cli import main
 from experiments.sweep.grid import load_grid, shipped_grids
 

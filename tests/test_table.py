@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from table_reference import Copies, Stream, check_references, held_ids, make_spec
 
 from common.types import Batch
-from replay.selection import EVICTIONS, SAMPLINGS
-from replay.table import Table
+from replay.table.selection import EVICTIONS, SAMPLINGS
+from replay.table.table import Table
 
 
 def assert_same(one: Batch, other: Batch) -> None:

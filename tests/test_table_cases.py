@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from table_reference import Copies, Stream, check_references, make_spec
 
-from common.capacity import estimated_bytes
 from common.errors import UsageError
+from common.settings.capacity import estimated_bytes
 from common.types import Segment
-from replay import streams
 from replay.stats import reuse_histogram
-from replay.table import Table
+from replay.table import streams
+from replay.table.table import Table
 
 
 @pytest.mark.parametrize("stack", [1, 4])

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from experiments.reexecute import reexecute
-from learner.epochs import load_learner
+from learner.records.epochs import load_learner
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 EPISODES = "episode,env_step,update,actor,stream,return,length,epsilon,s,q1_mean,q2_mean,param_version"

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from common import experience, limits, messages
-from common.clients import replay_key
-from common.experience import DrawRequest
-from common.joining import join_key
-from common.messages import Join, ReplayStats
-from common.processes import ChildProcess, command, free_endpoint
-from common.transport import NoAnswer, Node, new_incarnation, open_session
+from common.messaging import experience, limits, messages
+from common.messaging.clients import replay_key
+from common.messaging.experience import DrawRequest
+from common.messaging.joining import join_key
+from common.messaging.messages import Join, ReplayStats
+from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
+from common.process.processes import ChildProcess, command, free_endpoint
 
 MAKE_KEYS = Path(__file__).parents[1] / "deploy" / "zenoh" / "make_keys.sh"
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="the script that makes keys needs openssl")

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from common.networks import build_network
+from common.networks.network import build_network
 from common.types import EnvSpec
-from learner.edl import edl_gradients
-from learner.polar import polar, polar_of_product
+from learner.edl.feedback import edl_gradients
+from learner.edl.polar import polar, polar_of_product
 
 S = 0.3
 

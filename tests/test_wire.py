@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common import wire
 from common.errors import BadMessage
+from common.messaging import wire
 
 ARRAYS = hnp.arrays(
     st.sampled_from([np.dtype(name) for name in sorted(wire.DTYPES)]),

@@ -9,9 +9,9 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from common.cli import parse
 from common.errors import UsageError
-from common.lifecycle import run_main
+from common.process.cli import parse
+from common.process.lifecycle import run_main
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.config import RunConfig
 from common.errors import RunError, UsageError
-from common.tables import identity, load_tables, resolve
+from common.settings.config import RunConfig
+from common.settings.tables import identity, load_tables, resolve
 from experiments.sweep.folder import CellFolder
 from experiments.sweep.grid import Grid, load_grid
 

@@ -10,9 +10,9 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from common.cli import parse
 from common.errors import RunError, UsageError
-from common.lifecycle import Stop, run_main
+from common.process.cli import parse
+from common.process.lifecycle import Stop, run_main
 from experiments.sweep import slurm
 from experiments.sweep.display import SweepDisplay
 from experiments.sweep.folder import CellFolder

@@ -8,7 +8,7 @@ from rich.console import Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from common.display import LiveDisplay
+from common.process.display import LiveDisplay
 from experiments.sweep.runner import Runner
 
 PLAIN_EVERY = 30.0  # seconds between lines where the output is no terminal

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common.errors import UsageError
-from common.tables import identity, resolve, to_toml
+from common.settings.tables import identity, resolve, to_toml
 from experiments.sweep.grid import Cell
 
 TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 
-from common.processes import ChildProcess, command
+from common.process.processes import ChildProcess, command
 from experiments.sweep.folder import CellFolder, Progress
 from experiments.sweep.grid import GridFile
 

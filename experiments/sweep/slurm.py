@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 
 from common.errors import RunError
-from common.processes import command
+from common.process.processes import command
 from experiments.sweep.grid import GridFile
 
 

@@ -1,0 +1,1 @@
+"""Environments: one interface to ALE games, gymnasium environments and the built-in catch."""

@@ -1,0 +1,112 @@
+"""Atari games in ALE's native vector environment: C++ threads, frame skip, max-pool, 84x84 grayscale, stacking."""
+
+from __future__ import annotations
+
+import ale_py
+import numpy as np
+from ale_py import roms
+from ale_py.vector_env import AtariVectorEnv
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from common.envs.environments import EnvSettings, Steps
+from common.errors import UsageError
+from common.types import Array, EnvSpec
+
+FRAME_LIMIT = 108_000  # emulator frames of an episode, half an hour of play
+
+
+class AtariEnv:
+    """Emulators of one game, as `VectorEnv`.
+
+    After a reset the stack holds zeros and the first frame. A lost life does not touch the stack: with
+    `episodic_life` it is terminal for learning only. The limit on an episode's length counts from the first
+    frame after the no-ops. The emulator stops mid-skip where a game or its time ends, so the last frame of such
+    an episode is pooled from the frames seen until then.
+    An action out of range would stop the emulators' threads for good, so it is refused here.
+    """
+
+    def __init__(self, settings: EnvSettings, game: str, seeds: list[int]) -> None:
+        self.spec = atari_spec(settings, game)
+        self.num_envs = len(seeds)
+        self._seeds = np.array(seeds)
+        self._clip = settings.clip_rewards
+        limit = settings.max_episode_steps * settings.frame_skip
+        self._ale = AtariVectorEnv(
+            game,
+            self.num_envs,
+            autoreset_mode=AutoresetMode.SAME_STEP,
+            max_num_frames_per_episode=limit or FRAME_LIMIT,
+            repeat_action_probability=settings.repeat_action_probability,
+            full_action_space=settings.full_action_space,
+            stack_num=settings.stack,
+            frameskip=settings.frame_skip,
+            noop_max=settings.noop_max + 1,  # ALE draws from 0..noop_max-1
+            use_fire_reset=False,
+            # This one ends learning's episode and keeps the game; ALE's `episodic_life` would reset the emulator.
+            life_loss_info=settings.episodic_life,
+            reward_clipping=False,
+        )
+        self._game_start = np.empty(0)
+
+    def reset(self) -> Array:
+        """Start every emulator from its seed: uint8 [envs, *obs_shape]."""
+        obs, info = self._ale.reset(seed=self._seeds)
+        self._game_start = info["frame_number"] - info["episode_frame_number"]
+        return self._shape(obs)
+
+    def send(self, actions: NDArray[np.int32]) -> None:
+        """Let the emulators' threads begin to play one action, int32 [envs], in each.
+
+        Raises:
+            ValueError: an action out of range.
+        """
+        if actions.min() < 0 or actions.max() >= self.spec.num_actions:
+            raise ValueError(f"actions: {actions.tolist()}; allowed are 0..{self.spec.num_actions - 1}")
+        self._ale.send(actions)
+
+    def recv(self) -> Steps:
+        """Wait for all emulators."""
+        obs, rewards, terminated, _, info = self._ale.recv()
+        # The frames played before the current game change exactly when the emulator was reset: `terminated` is
+        # also set by a lost life, and a reset with `truncated` unset is possible when both fall together.
+        game_start = info["frame_number"] - info["episode_frame_number"]
+        restarted = game_start != self._game_start
+        self._game_start = game_start
+        obs = next_obs = self._shape(obs)
+        if np.count_nonzero(restarted):
+            next_obs = obs.copy()
+            next_obs[restarted] = self._shape(info["final_obs"])[restarted]
+        raw_rewards = rewards.astype(np.float64)
+        learned = np.clip(rewards, -1, 1) if self._clip else rewards
+        return Steps(obs, next_obs, learned.astype(np.float32), raw_rewards, terminated, restarted, restarted)
+
+    def step(self, actions: NDArray[np.int32]) -> Steps:
+        """`send`, then `recv`; raises as `send`."""
+        self.send(actions)
+        return self.recv()
+
+    def close(self) -> None:
+        """Join the emulators' threads."""
+        del self._ale
+
+    def _shape(self, obs: Array) -> Array:
+        return obs.reshape(self.num_envs, *self.spec.obs_shape)
+
+
+def atari_spec(settings: EnvSettings, game: str) -> EnvSpec:
+    """The specification of a game, named as its ROM.
+
+    Raises:
+        UsageError: the ROM's file is missing or is not the known one.
+    """
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
+    emulator = ale_py.ALEInterface()
+    try:
+        rom = roms.get_rom_path(game)
+        assert rom is not None  # a name that ale-py knows
+        emulator.loadROM(rom)
+    except OSError as error:
+        raise UsageError(f"env.id: the ROM of {game!r} can't be read: {error}") from None
+    actions = emulator.getLegalActionSet() if settings.full_action_space else emulator.getMinimalActionSet()
+    return EnvSpec(settings.id, (84, 84), "uint8", settings.stack, len(actions))

@@ -1,0 +1,1 @@
+"""How processes talk: the wire format, the messages of each conversation, and Zenoh underneath."""

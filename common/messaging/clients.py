@@ -1,0 +1,267 @@
+"""Clients of the replay service: acked inserts in a bounded window, and prefetched draws.
+
+Neither has a thread of its own: Zenoh works in the background, and the caller settles what has come back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import BadMessage
+from common.messaging import experience, messages
+from common.messaging.experience import MAX_AHEAD, BatchReader, Drawn, DrawRequest
+from common.messaging.transport import NoAnswer, Node, Pending
+from common.messaging.wire import Message
+from common.process.lifecycle import Stop
+from common.types import Batch, EnvSpec, Segment
+
+REPLAY_SHARD = "0"
+# Seconds. A segment may wait behind its whole window while the limiter lets them in one by one; that a peer has gone is
+# noticed sooner, by its link.
+INSERT_TIMEOUT = 60.0
+NO_ANSWER = "the replay service does not answer"
+BAD_ANSWER = "the replay service's answer is bad"
+
+
+def replay_key(node: Node, what: str) -> str:
+    """Key of one of the replay service's queryables: insert, sample, stats or snapshot."""
+    return node.key("replay", REPLAY_SHARD, what)
+
+
+class Backoff:
+    """Pauses that double from `first` to `longest` seconds, until `reset`."""
+
+    def __init__(self, first: float = 0.02, longest: float = 1.0) -> None:
+        self._first = self._next = first
+        self._longest = longest
+
+    def pause(self, stop: Stop) -> bool:
+        """Sleep; True if the stop came."""
+        pause, self._next = self._next, min(self._longest, 2 * self._next)
+        return stop.wait(pause)
+
+    def reset(self) -> None:
+        """Begin with the shortest pause again."""
+        self._next = self._first
+
+
+@dataclass(slots=True)
+class _Sent:
+    payload: bytearray
+    steps: int
+    pending: Pending
+
+
+class InsertClient:
+    """Sends segments until each is acknowledged, at most `window` of them at a time.
+
+    Args:
+        on_wait: called again and again while nothing moves.
+
+    Attributes:
+        acked: transitions acknowledged.
+        inserted: the table's count of accepted transitions, as last told.
+        waiting: why nothing moves, in words; empty while it does.
+    """
+
+    def __init__(self, node: Node, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
+        self.acked = 0
+        self.inserted = 0
+        self.waiting = ""
+        self._node = node
+        self._stop = stop
+        self._window = window
+        self._on_wait = on_wait
+        self._key = replay_key(node, "insert")
+        self._outstanding: deque[_Sent] = deque()
+        self._backoff = Backoff()
+
+    def submit(self, segment: Segment) -> bool:
+        """Send a segment, waiting for a place in the window; False if the stop came first.
+
+        Raises:
+            Refused: the replay service found a segment bad.
+        """
+        self._settle_ready()
+        while len(self._outstanding) >= self._window:
+            if not self._settle(self._outstanding[0]):
+                return False
+            self._outstanding.popleft()
+        payload = experience.encode_segment(self._node.run, replace(segment, acked=self.acked))
+        self._outstanding.append(_Sent(payload, segment.steps, self._send(payload)))
+        return True
+
+    def drain(self) -> bool:
+        """Wait until everything sent is acknowledged; False if the stop came first."""
+        while self._outstanding:
+            if not self._settle(self._outstanding[0]):
+                return False
+            self._outstanding.popleft()
+        return True
+
+    def _settle_ready(self) -> None:
+        """Take the acknowledgements that are there, without waiting."""
+        while self._outstanding:
+            sent = self._outstanding[0]
+            try:
+                message = sent.pending.ready()
+                if message is None:
+                    return
+                accepted = self._accept(message, sent)
+            except (NoAnswer, BadMessage):
+                return  # the next full window will send it again
+            if not accepted:
+                sent.pending = self._send(sent.payload)
+                return
+            self._outstanding.popleft()
+
+    def _settle(self, sent: _Sent) -> bool:
+        """Wait for one acknowledgement, sending again as often as it takes; False if the stop came first."""
+        while True:
+            try:
+                message = self._wait(sent.pending)
+                if message is None:
+                    return False
+                if self._accept(message, sent):
+                    return True
+            except NoAnswer:
+                self.waiting = NO_ANSWER
+            except BadMessage as error:
+                self.waiting = f"{BAD_ANSWER}: {error}"
+            self._on_wait()
+            if self._backoff.pause(self._stop):
+                return False
+            sent.pending = self._send(sent.payload)
+
+    def _wait(self, pending: Pending) -> Message | None:
+        """The answer, None if the stop came first; raises as `Pending.ready`."""
+        looks = Backoff(0.001, 0.05)
+        while (message := pending.ready()) is None:
+            if looks.pause(self._stop):
+                return None
+            self._on_wait()
+        return message
+
+    def _send(self, payload: bytearray) -> Pending:
+        return self._node.begin(self._key, payload, INSERT_TIMEOUT)
+
+    def _accept(self, message: Message, sent: _Sent) -> bool:
+        if message.kind == "retry":
+            self.waiting = messages.decode_retry(message)
+            return False
+        self.inserted = max(self.inserted, messages.decode_ack(message))
+        self.acked += sent.steps
+        self.waiting = ""
+        self._backoff.reset()
+        return True
+
+
+class SampleClient:
+    """Draws batches, keeping `prefetch` requests under way.
+
+    Args:
+        first: number of the first batch: updates that the learner has done before.
+        episodes: episodes that the learner has been told of before.
+
+    Attributes:
+        episodes: episodes told so far.
+        waiting: why no batch comes, in words; empty while they do.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        stop: Stop,
+        incarnation: int,
+        spec: EnvSpec,
+        batch_size: int,
+        prefetch: int,
+        first: int = 0,
+        episodes: int = 0,
+    ) -> None:
+        self.episodes = episodes
+        self.waiting = ""
+        self._node = node
+        self._stop = stop
+        self._incarnation = incarnation
+        self._batch_size = batch_size
+        self._prefetch = prefetch
+        self._read = BatchReader(spec)
+        self._key = replay_key(node, "sample")
+        self._outstanding: deque[tuple[int, Pending]] = deque()
+        self._next = first
+        self._done = first
+        self._pinned: int | None = None
+        self._trained: list[tuple[int, float]] = []  # priorities that no request has taken along yet
+        self._carried: dict[int, tuple[tuple[int, float], ...]] = {}  # by number of the request that takes them
+        self._backoff = Backoff()
+
+    def pin(self) -> int:
+        """Keep every batch after the last one taken repeatable until `release`; the number of batches taken."""
+        self._pinned = self._done
+        return self._done
+
+    def release(self) -> None:
+        """End `pin`."""
+        self._pinned = None
+
+    def prioritise(self, batch: Batch, priorities: NDArray[np.float32]) -> None:
+        """Let the next request set the priorities, float32 [batch], of the transitions of a batch."""
+        self._trained.extend(zip(batch.ids.tolist(), priorities.tolist(), strict=True))
+
+    def next(self) -> tuple[Batch, Drawn] | None:
+        """The next batch and the episodes that are new since the last one; None if there is none for now.
+
+        Raises:
+            Refused: the replay service found a request bad, or serves another learner now.
+        """
+        while len(self._outstanding) < self._prefetch and self._next < self._base + MAX_AHEAD:
+            self._carried[self._next], self._trained = tuple(self._trained), []
+            self._outstanding.append((self._next, self._request(self._next)))
+            self._next += 1
+        if not self._outstanding:
+            self.waiting = "the replay service has not begun its part of the epoch"
+            self._backoff.pause(self._stop)
+            return None
+        sequence, pending = self._outstanding[0]
+        try:
+            message = pending.wait()
+            if message.kind != "retry":
+                accepted = self._accept(message, sequence)
+                self._outstanding.popleft()
+                return accepted
+            self.waiting = messages.decode_retry(message)
+        except NoAnswer:
+            self.waiting = NO_ANSWER
+        except BadMessage as error:
+            self.waiting = f"{BAD_ANSWER}: {error}"
+        self._backoff.pause(self._stop)
+        self._outstanding[0] = (sequence, self._request(sequence))
+        return None
+
+    @property
+    def _base(self) -> int:
+        return self._done if self._pinned is None else self._pinned
+
+    def _request(self, sequence: int) -> Pending:
+        priorities = self._carried[sequence]
+        request = DrawRequest(self._incarnation, sequence, self._base, self._batch_size, self.episodes, priorities)
+        return self._node.begin(self._key, experience.encode_sample(self._node.run, request))
+
+    def _accept(self, message: Message, sequence: int) -> tuple[Batch, Drawn]:
+        batch, drawn = self._read(message)
+        if drawn.sequence != sequence:
+            raise BadMessage("fields.sequence", f"{drawn.sequence} instead of {sequence}")
+        self._backoff.reset()
+        self.waiting = ""
+        self._done = sequence + 1
+        del self._carried[sequence]
+        first = max(self.episodes, drawn.first_episode)
+        fresh = drawn.episodes[first - drawn.first_episode :]
+        self.episodes = first + len(fresh)
+        return batch, replace(drawn, first_episode=first, episodes=fresh)

@@ -1,0 +1,289 @@
+"""Zenoh as this system uses it: one session per process, queries that are answered, puts where the latest value wins.
+
+A `Node` is one process's place in a run. Everything that must not be lost is a query (`ask`, `begin`) answered by a
+`serve` loop in a thread of its own; weights, role and status are `publish`ed and read as `latest`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import secrets
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+
+from common.errors import BadMessage, CoopError, RunError, UsageError
+from common.messaging import messages, wire
+from common.messaging.links import never_linger
+from common.messaging.presence import LEASE_MS, Presence
+from common.messaging.wire import Message
+from common.process.lifecycle import Stop
+
+ASK_TIMEOUT = 5.0  # seconds
+
+_QUIET = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "adminspace/enabled": True,
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+    "listen/exit_on_failure": True,
+    "transport/link/tx/lease": LEASE_MS,
+    "transport/link/rx/buffer_size": 4 << 20,
+    "transport/link/rx/max_message_size": wire.MAX_PAYLOAD + (1 << 16),
+    "transport/link/tx/queue/size/data": 16,
+    "transport/shared_memory/enabled": False,
+}
+
+
+class NoAnswer(RunError):
+    """Nobody answered a query in time; asking again is the caller's choice."""
+
+
+class Refused(RunError):
+    """The peer found our message bad or could not do what it asks, and said why."""
+
+
+def new_incarnation() -> int:
+    """A random id that a process draws at its start: 63 bits."""
+    return secrets.randbits(63)
+
+
+def open_session(
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    zenoh_config: Path | None = None,
+    shared_memory: bool = False,
+) -> zenoh.Session:
+    """Open a peer session with explicit endpoints, no scouting and quick reconnection.
+
+    Raises:
+        UsageError: a Zenoh config file or an endpoint that can't be read.
+        RunError: an endpoint that can't be listened on, for example because its port is in use.
+    """
+    zenoh.init_log_from_env_or("off")
+    try:
+        config = zenoh.Config.from_file(str(zenoh_config)) if zenoh_config else zenoh.Config()
+        for key, value in _QUIET.items():
+            config.insert_json5(key, json.dumps(value))
+        config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
+        config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+        config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+    except zenoh.ZError as error:
+        raise UsageError(f"zenoh configuration: {_first_line(error)}") from error
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise RunError(f"can't listen on {', '.join(listen) or 'any endpoint'}: {_first_line(error)}") from error
+    never_linger(session)
+    return session
+
+
+def locators(session: zenoh.Session) -> list[str]:
+    """The endpoints that this session really listens on (a port of 0 resolved)."""
+    for reply in session.get(f"@/{session.zid()}/peer", timeout=2.0):
+        if reply.ok is not None:
+            return [str(locator) for locator in json.loads(reply.ok.payload.to_string())["locators"]]
+    return []
+
+
+class Pending:
+    """A query under way."""
+
+    def __init__(self, handler: Any, key: str) -> None:  # noqa: ANN401 (zenoh's handler of replies)
+        self._handler = handler
+        self._key = key
+
+    def ready(self) -> Message | None:
+        """The answer if it is there, else None; raises as `wait`."""
+        try:
+            reply = self._handler.try_recv()
+        except zenoh.ZError as error:
+            raise NoAnswer(f"no answer to {self._key}") from error
+        return None if reply is None else _answer(reply)
+
+    def wait(self) -> Message:
+        """Wait for the answer.
+
+        Raises:
+            NoAnswer: nobody serves this key, or the time-out passed.
+            Refused: the peer found the message bad, or could not do what it asks.
+        """
+        try:
+            return _answer(self._handler.recv())
+        except zenoh.ZError as error:
+            raise NoAnswer(f"no answer to {self._key}") from error
+
+
+class Node:
+    """One process's place in a run.
+
+    Args:
+        run: name of the run, the prefix of every key.
+        role: "learner", "replay", "actor" or "watch".
+        incarnation: the random id drawn at start.
+
+    Attributes:
+        presence: who else is connected.
+    """
+
+    def __init__(self, session: zenoh.Session, run: str, role: str, incarnation: int) -> None:
+        self.session = session
+        self.run = run
+        self.bad_messages = 0
+        self._counting = threading.Lock()
+        self._name = f"{role}/{incarnation:x}"
+        self._threads: list[threading.Thread] = []
+        self._closing = False
+        self._status = session.declare_publisher(self.key("metrics", self._name))
+        self.presence = Presence(session, self.key("alive"))
+        self._token = session.liveliness().declare_token(self.key("alive", self._name))
+
+    def key(self, *parts: str) -> str:
+        """A key of this run."""
+        return "/".join(("coop", self.run, *parts))
+
+    def begin(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Pending:
+        """Send a query and return at once."""
+        handler = self.session.get(
+            key,
+            handler=zenoh.handlers.FifoChannel(2),
+            payload=payload,
+            timeout=timeout,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        return Pending(handler, key)
+
+    def ask(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Message:
+        """Send a query and wait for its answer; raises as `Pending.wait`."""
+        return self.begin(key, payload, timeout).wait()
+
+    def serve(self, key: str, answer: Callable[[Message], bytearray], depth: int = 64) -> None:
+        """Answer the queries on `key`, one after the other, in a thread of its own, until the session closes.
+
+        A message that does not decode, names another run, or that `answer` refuses with BadMessage gets an error
+        reply, is counted, and changes nothing. Any other CoopError of `answer` becomes an error reply too.
+        """
+        queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(depth), complete=True)
+        thread = threading.Thread(target=self._serve, args=(queryable, key, answer), name=f"serve {key}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _serve(self, queryable: Any, key: str, answer: Callable[[Message], bytearray]) -> None:  # noqa: ANN401
+        while not self._closing:
+            try:
+                query = queryable.recv()
+            except zenoh.ZError:
+                return  # the session was closed
+            with query:
+                try:
+                    reply = answer(self.read(query.payload))
+                except CoopError as error:
+                    if isinstance(error, BadMessage):
+                        self.count_bad()
+                    with contextlib.suppress(zenoh.ZError):
+                        query.reply_err(messages.encode_error(self.run, error))
+                    continue
+                with contextlib.suppress(zenoh.ZError):  # the asker may be gone, and will ask again if it is not
+                    query.reply(key, reply)
+
+    def read(self, payload: zenoh.ZBytes | None) -> Message:
+        """Decode a payload of this run; raises BadMessage."""
+        message = wire.decode(b"" if payload is None else payload.to_bytes())
+        if message.run != self.run:
+            raise BadMessage("run", f"{message.run!r}; this is run {self.run!r}")
+        return message
+
+    def count_bad(self) -> None:
+        """Count a message that was refused; safe for threads."""
+        with self._counting:
+            self.bad_messages += 1
+
+    def publish(self, key: str, payload: bytearray) -> None:
+        """Broadcast a value of which only the latest matters; never blocks."""
+        self.session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
+
+    def announce(self, key: str, payload: bytearray) -> None:
+        """Broadcast a value that should reach everybody who listens; may block for a moment."""
+        self.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def publish_status(self, status: dict[str, Any]) -> None:
+        """Tell displays what this process does."""
+        self._status.put(wire.encode("status", self.run, status))
+
+    def latest(self, key: str) -> Latest:
+        """Follow a key of which only the latest value matters."""
+        return Latest(self, self.session.declare_subscriber(key, zenoh.handlers.RingChannel(1)))
+
+    def follow_stop(self, stop: Stop) -> None:
+        """Stop when the learner says so."""
+
+        def stopped(sample: zenoh.Sample) -> None:
+            try:
+                stop.set(messages.decode_stop(self.read(sample.payload)))
+            except BadMessage:
+                self.count_bad()
+
+        self.session.declare_subscriber(self.key("stop"), stopped)
+
+    def close(self) -> None:
+        """Close the session and wait for the serving threads."""
+        self._closing = True
+        self.session.close()  # type: ignore[no-untyped-call]
+        for thread in self._threads:
+            thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Latest:
+    """The newest value of a broadcast key."""
+
+    def __init__(self, node: Node, subscriber: Any) -> None:  # noqa: ANN401 (zenoh's subscriber)
+        self._node = node
+        self._subscriber = subscriber
+
+    def take(self) -> Message | None:
+        """The newest value that has not been taken yet; None if there is none or it is not a valid message."""
+        sample = self._subscriber.try_recv()
+        if sample is None:
+            return None
+        try:
+            return self._node.read(sample.payload)
+        except BadMessage:
+            self._node.count_bad()
+            return None
+
+
+def _answer(reply: zenoh.Reply) -> Message:
+    part = reply.ok or reply.err
+    assert part is not None
+    raw = part.payload.to_bytes()
+    try:
+        message = wire.decode(raw)
+        problem = None if reply.ok is not None else messages.decode_error(message)
+    except BadMessage as error:
+        if error.field == "protocol":  # asking again would not help
+            raise Refused(str(error)) from error
+        text = f"an answer that can't be read: {error}" if reply.ok is not None else raw.decode(errors="replace")
+        raise NoAnswer(text) from error
+    if problem is not None:
+        raise Refused(problem)
+    return message
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0].split(" at ")[0]

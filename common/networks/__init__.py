@@ -1,0 +1,1 @@
+"""Q-networks over one flat parameter vector."""

@@ -1,0 +1,167 @@
+"""Q-networks by name, and the flat buffer that holds all parameters of one of them."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself uses
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from common.errors import UsageError
+from common.networks.dense import Dense
+from common.types import EnvSpec
+
+ArrayT = TypeVar("ArrayT", Tensor, NDArray[np.float32])
+
+# (out channels, kernel, stride) of each convolution, then the width of the hidden linear layer.
+_CONV_NETWORKS: dict[str, tuple[tuple[tuple[int, int, int], ...], int]] = {
+    "nature": (((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512),  # Mnih et al. 2015
+    "nips2013": (((16, 8, 4), (32, 4, 2)), 256),  # Mnih et al. 2013
+}
+NETWORK_KINDS = ("mlp", *_CONV_NETWORKS)
+
+
+def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) -> nn.Sequential:
+    """A Q-network float32 [batch, *input] -> [batch, num_actions] with PyTorch's default initialisation.
+
+    kind: "mlp" (linear layers of the widths in `hidden`, ReLU between), "nature" or "nips2013" (`hidden` unused).
+    The parameters depend on `seed` alone and the global random state stays as it was.
+
+    Raises UsageError for an unknown kind, and for a convolutional kind where frames are not images or too small.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        if kind == "mlp":
+            return _mlp(spec, hidden)
+        if kind in _CONV_NETWORKS:
+            return _conv(kind, spec)
+    raise UsageError(f"network kind: {kind!r} is not one of {', '.join(NETWORK_KINDS)}")
+
+
+def _mlp(spec: EnvSpec, hidden: Sequence[int]) -> nn.Sequential:
+    layers: OrderedDict[str, nn.Module] = OrderedDict()
+    if len(spec.obs_shape) > 1:
+        layers["flatten"] = nn.Flatten()
+    width = math.prod(spec.obs_shape)
+    for i, size in enumerate(hidden, start=1):
+        layers[f"fc{i}"] = nn.Linear(width, size)
+        layers[f"relu{i}"] = nn.ReLU()
+        width = size
+    layers["out"] = nn.Linear(width, spec.num_actions)
+    return nn.Sequential(layers)
+
+
+def _conv(kind: str, spec: EnvSpec) -> nn.Sequential:
+    if len(spec.frame_shape) != 2:
+        raise UsageError(f"network kind: {kind!r} needs frames [height, width], {spec.env_id} has {spec.frame_shape}")
+    convs, width = _CONV_NETWORKS[kind]
+    channels, (height, breadth) = spec.stack, spec.frame_shape
+    layers: OrderedDict[str, nn.Module] = OrderedDict()
+    for i, (out, kernel, stride) in enumerate(convs, start=1):
+        layers[f"conv{i}"] = nn.Conv2d(channels, out, kernel, stride)
+        layers[f"relu{i}"] = nn.ReLU()
+        channels, height, breadth = out, (height - kernel) // stride + 1, (breadth - kernel) // stride + 1
+        if min(height, breadth) < 1:
+            raise UsageError(f"network kind: {kind!r} needs larger frames than {spec.frame_shape} of {spec.env_id}")
+    layers["flatten"] = nn.Flatten()
+    layers["fc1"] = nn.Linear(channels * height * breadth, width)
+    layers[f"relu{len(convs) + 1}"] = nn.ReLU()
+    layers["out"] = nn.Linear(width, spec.num_actions)
+    return nn.Sequential(layers)
+
+
+def preprocess(obs: Tensor, spec: EnvSpec) -> Tensor:
+    """The network's input for stored observations: <frame_dtype>[batch, *obs_shape] -> float32 on the same device.
+
+    uint8 images are scaled to [0, 1] and get a channel axis where nothing is stacked; float32 vectors pass through.
+    """
+    if spec.frame_dtype == "uint8":
+        obs = obs.to(torch.float32).mul_(1 / 255)
+    if spec.stack == 1 and len(spec.frame_shape) == 2:
+        obs = obs.unsqueeze(1)
+    return obs
+
+
+def layer_functions(layers: Iterable[nn.Module]) -> list[Callable[[Tensor], Tensor]]:
+    """Each layer as a plain function, for forward passes without gradients; a module's call costs as much as a layer.
+
+    A ReLU overwrites its input where a layer with parameters has just made it. The functions hold the parameters
+    themselves, and so follow whatever is written into them.
+    """
+    functions = []
+    fresh = False
+    for layer in layers:
+        functions.append(_function(layer, fresh))
+        fresh = isinstance(layer, nn.Linear | nn.Conv2d)
+    return functions
+
+
+def _function(layer: nn.Module, fresh: bool) -> Callable[[Tensor], Tensor]:
+    match layer:
+        case nn.Linear(weight=weight, bias=bias):
+            return lambda x: F.linear(x, weight, bias)
+        case nn.Conv2d(weight=weight, bias=bias) if layer.padding_mode == "zeros":
+            return lambda x: F.conv2d(x, weight, bias, layer.stride, layer.padding, layer.dilation, layer.groups)
+        case nn.ReLU():
+            return torch.relu_ if fresh else torch.relu
+    return layer
+
+
+class FlatNetwork:
+    """A network whose parameters are views of one flat buffer.
+
+    flat: float32 [P] (or the module's dtype), what is trained, published and stored.
+    module: the network; its named parameters view `flat`.
+    dense: the network in numpy, over the same parameters; None where it does not fit (see `Dense.fits`).
+    layout: (name, shape) of each parameter in the order of the buffer.
+    """
+
+    def __init__(self, module: nn.Sequential) -> None:
+        parameters = list(module.named_parameters())
+        self.module = module
+        self.layout: list[tuple[str, tuple[int, ...]]] = [(name, tuple(p.shape)) for name, p in parameters]
+        self.flat = torch.cat([p.detach().reshape(-1) for _, p in parameters])
+        for (_, p), view in zip(parameters, self.views(self.flat).values(), strict=True):
+            p.data = view
+        self._functions = layer_functions(module)
+        self.dense = Dense(module) if Dense.fits(module) else None
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """The module's output for a preprocessed batch: float32 [batch, *input] -> [batch, num_actions]."""
+        for function in self._functions:
+            x = function(x)
+        return x
+
+    def views(self, flat: ArrayT) -> dict[str, ArrayT]:
+        """Each parameter's part of a flat array or tensor [P], by name and in the parameter's shape."""
+        sizes = [math.prod(shape) for _, shape in self.layout]
+        stops = itertools.accumulate(sizes)
+        return {
+            name: flat[stop - size : stop].reshape(shape)
+            for (name, shape), size, stop in zip(self.layout, sizes, stops, strict=True)
+        }
+
+    def load(self, flat: Tensor | NDArray[np.float32]) -> None:
+        """Overwrite all parameters in place from float32 [P]; raises ValueError for another size."""
+        # A copy, because arrays from the wire are read-only and PyTorch warns of viewing those.
+        source = flat if isinstance(flat, Tensor) else torch.tensor(flat)
+        if source.shape != self.flat.shape:
+            raise ValueError(f"flat parameters: got shape {tuple(source.shape)}, the network has {self.flat.numel()}")
+        self.flat.copy_(source)
+
+    def snapshot(self) -> NDArray[np.float32]:
+        """A copy of all parameters on the host: float32 [P]."""
+        array: NDArray[np.float32] = self.flat.to("cpu", copy=True).numpy()
+        return array
+
+    def layout_digest(self) -> str:
+        """16 hex digits that two networks share exactly if their layouts are equal (checked at join)."""
+        return hashlib.sha256(repr(self.layout).encode()).hexdigest()[:16]

@@ -1,0 +1,104 @@
+"""Child processes on this machine, a run's roles or a sweep's runs: start, watch, interrupt, end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+from common.errors import RunError
+from common.process.lifecycle import INTERRUPTED, SUPERVISED
+
+LAST_WORDS = 400  # characters of a log's last line
+
+
+class ChildProcess:
+    """A command as a child process of its own process group, its output in a log file; it ends when this one does.
+
+    Args:
+        name: for people, for example "actor 2".
+        inherit: file descriptors that it gets too.
+    """
+
+    def __init__(self, name: str, command: list[str], log: Path, inherit: tuple[int, ...] = ()) -> None:
+        self.name = name
+        self._command = command
+        self._log = log
+        self._inherit = inherit
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start it, or start it again."""
+        with self._log.open("ab") as log:
+            self._process = subprocess.Popen(
+                self._command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                pass_fds=self._inherit,
+                start_new_session=True,  # a Ctrl-C at the terminal reaches the supervisor alone
+                env={**os.environ, SUPERVISED: str(os.getpid())},
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id; 0 before the start."""
+        return self._process.pid if self._process is not None else 0
+
+    def exit_status(self) -> int | None:
+        """None while it runs."""
+        return None if self._process is None else self._process.poll()
+
+    def was_interrupted(self) -> bool:
+        """True where an interrupt ended it before it could stop cleanly, as while it starts."""
+        return self.exit_status() in (-signal.SIGINT, INTERRUPTED)
+
+    def interrupt(self) -> None:
+        """Ask it to stop cleanly."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+
+    def end(self, seconds: float) -> None:
+        """Wait for its end; kill it after `seconds`."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def why(self) -> str:
+        """How it ended, with the last line of its log."""
+        status = self.exit_status() or 0
+        how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return f"{self.name} ended ({how})" + (f": {lines[-1][-LAST_WORDS:]}" if lines else "")
+
+    def last_line(self) -> str:
+        """The last line that it printed."""
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+
+def command(name: str, *flags: str) -> list[str]:
+    """A console command of this very installation.
+
+    Raises:
+        RunError: it is not installed.
+    """
+    path = Path(sysconfig.get_path("scripts")) / name
+    if not path.exists():
+        raise RunError(f"{path}: not installed beside {sys.executable}")
+    return [str(path), *flags]
+
+
+def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
+    """An endpoint with the protocol and address of another one (TCP on loopback if that has no port), its port free."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{like.rpartition(':')[0] or 'tcp/127.0.0.1'}:{probe.getsockname()[1]}"

@@ -1,0 +1,188 @@
+"""The configuration of a run: nested dataclasses whose fields say what they may hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field
+
+from common.envs.environments import EnvSettings
+from common.errors import UsageError
+
+OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
+Method = Literal["dqn", "edql", "g-coop", "coop"]
+Positive = Annotated[int, Field(gt=0)]
+Count = Annotated[int, Field(ge=0)]
+PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+_STRICT = ConfigDict(extra="forbid")
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """The Q-network."""
+
+    __pydantic_config__ = _STRICT
+    kind: Literal["mlp", "nature", "nips2013"] = "mlp"
+    """mlp: Linear layers with ReLU; nature: 3 conv + 2 linear; nips2013: 2 conv + 2 linear."""
+    hidden: tuple[Positive, ...] = (128, 128, 128)
+    """Widths of the hidden layers of the mlp."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """bfloat16: actor processes, targets, and all passes of the gradient methods, with half the bits; parameters and
+    optimizers stay in float32."""
+
+
+@dataclass(frozen=True)
+class LearnerSettings:
+    """The update of the acting network."""
+
+    __pydantic_config__ = _STRICT
+    batch_size: Positive = 32
+    swap_every: Positive = 30
+    """C: updates (or plays) between swaps of the acting role, or between copies to the target network."""
+    swap_by: Literal["updates", "plays"] = "updates"
+    """What C counts; plays (environment steps) exist in lockstep runs only."""
+    reset_role_at_episode: bool = False
+    """Let network 1 act at the start of each episode, as Algorithm 1 writes it; lockstep runs only."""
+    gamma: Share = 0.99
+    loss: Literal["squared", "huber"] = "squared"
+    double: bool = False
+    """Take the target's value at the action that the trained network prefers, as in double Q-learning."""
+    optimizer: OptimizerName = "rmsprop"
+    """rmsprop is PyTorch's; rmsprop-mnih is centred, with the constant inside the root, beside gradients summed over
+    the batch."""
+    learning_rate: PositiveFloat = 1e-3
+    learning_rate_final: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """The learning rate falls exponentially to this share of itself over the whole run."""
+    momentum: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    squared_decay: Annotated[float, Field(ge=0, lt=1)] = 0.99
+    """Decay of the running mean of squared gradients (rmsprop, adam)."""
+    denominator: PositiveFloat = 1e-8
+    """Constant added to the optimizer's denominator."""
+    weight_decay: tuple[NonNegative, ...] = ()
+    """lambda(i) of each layer, input first; one value holds for all layers; none means 0."""
+    device: str = "cpu"
+    compile: bool = False
+    """Run the passes through torch.compile, for GPUs; on a CPU that needs a C++ compiler and gains nothing."""
+    threads: Positive = 1
+    """CPU threads of torch in the learner."""
+    prefetch: Annotated[int, Field(gt=0, le=256)] = 4
+    """Sample requests under way at once."""
+    publish_every: Positive = 10
+    """Updates between broadcasts of the acting network; every swap is broadcast too."""
+
+
+@dataclass(frozen=True)
+class EdlSettings:
+    """Error-driven learning: B = U (S + s I) V^T."""
+
+    __pydantic_config__ = _STRICT
+    rate: NonNegative = 0.1
+    """s at the first update, the paper's exploration rate; 0 gives the ordinary gradient."""
+    decay: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """s is multiplied by this every `decay_every` updates."""
+    decay_every: Positive = 1000
+    noise: Literal["constant", "normal"] = "constant"
+    """normal: s is the rate times one draw from N(0, 1) per update."""
+    feedback: Literal["transform", "weight-gradient", "random"] = "transform"
+    polar_dtype: Literal["float32", "bfloat16"] = "float32"
+    """What the s U V^T part of the transform feedback is computed in; T^T e is float32 always."""
+
+
+@dataclass(frozen=True)
+class ReplaySettings:
+    """The replay table and its limiter."""
+
+    __pydantic_config__ = _STRICT
+    capacity: Positive = 5000
+    """Exact number of transitions held."""
+    start: Positive = 500
+    """Transitions to collect before the first update; --total-steps cuts a preset's to a tenth of the run."""
+    ratio: PositiveFloat = 1.0
+    """Updates per environment step."""
+    tolerance: PositiveFloat = 64.0
+    """Environment steps that acting and learning may drift apart."""
+    eviction: Literal["fifo", "reservoir", "prioritized"] = "fifo"
+    sampling: Literal["uniform", "prioritized"] = "uniform"
+    priority_exponent: Share = 0.6
+    importance_exponent: Share = 0.4
+    journal: bool = False
+    """Write every accepted segment and every draw to disk before anybody is answered: a kill loses nothing."""
+    journal_keep: bool = False
+    """Keep journal files that an epoch covers, so that the run can be re-executed from its beginning."""
+
+    @property
+    def prioritized(self) -> bool:
+        """Whether the table wants to be told of TD errors."""
+        return "prioritized" in (self.eviction, self.sampling)
+
+
+@dataclass(frozen=True)
+class ActorSettings:
+    """Acting: exploration and segments."""
+
+    __pydantic_config__ = _STRICT
+    envs: Positive = 1
+    """Emulators in one actor process."""
+    epsilon_start: Share = 1.0
+    epsilon_final: Share = 0.05
+    epsilon_decay: Literal["exponential", "linear"] = "exponential"
+    epsilon_steps: Positive = 10_000
+    """Environment steps: time constant of the exponential, length of the linear decay."""
+    segment_steps: Positive = 16
+    """Steps of one emulator that travel together."""
+    window: Positive = 2
+    """Segments an actor may have under way unacknowledged."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that defines a run; the same fields in TOML files and as flags."""
+
+    __pydantic_config__ = _STRICT
+    run: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")] = "coop"
+    """Name of the run: roles with the same name find each other."""
+    method: Method = "coop"
+    seed: Count = 0
+    total_steps: Positive = 50_000
+    """Environment steps after which the run is complete."""
+    total_updates: Count = 0
+    """Stop after this many updates; 0: no limit."""
+    total_episodes: Count = 0
+    """Stop after this many finished episodes; 0: no limit."""
+    target_return: float | None = None
+    """Stop once the mean return of the last 100 episodes reaches this."""
+    checkpoint_every: Count = 10_000
+    """Updates between epochs, the checkpoints of the whole system; 0: only the closing one."""
+    env: EnvSettings = field(default_factory=EnvSettings)
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    learner: LearnerSettings = field(default_factory=LearnerSettings)
+    edl: EdlSettings = field(default_factory=EdlSettings)
+    replay: ReplaySettings = field(default_factory=ReplaySettings)
+    actor: ActorSettings = field(default_factory=ActorSettings)
+
+    @property
+    def planned_updates(self) -> int:
+        """Updates of a run that goes through all its steps: the ratio holds from the first `start` steps on."""
+        return round(self.replay.ratio * (self.total_steps - self.replay.start))
+
+    @property
+    def two_networks(self) -> bool:
+        """True for the cooperative methods, false where the second network is a copy of the first."""
+        return self.method in ("g-coop", "coop")
+
+    @property
+    def feedback(self) -> str:
+        """The feedback of this method: "none" for the gradient methods."""
+        return self.edl.feedback if self.method in ("edql", "coop") else "none"
+
+
+def check_distributed(config: RunConfig) -> None:
+    """Raises UsageError for what only lockstep runs can do: with many actors there is no single play or episode."""
+    if config.learner.swap_by == "plays":
+        raise UsageError("learner.swap_by = 'plays': in lockstep runs only; the roles' processes count updates")
+    if config.learner.reset_role_at_episode:
+        raise UsageError("learner.reset_role_at_episode = True: in lockstep runs only")

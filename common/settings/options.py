@@ -1,0 +1,93 @@
+"""The flags that the commands share."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TypeVar
+
+from common.errors import UsageError
+from common.process import cli
+from common.settings.config import RunConfig
+from common.settings.tables import first_difference, identity, load_tables, resolve, validated
+
+
+@dataclass(frozen=True)
+class RoleOptions:
+    """What a process needs to find its run."""
+
+    run: str = "coop"
+    """Name of the run."""
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints of the learner, for example tcp/head:7447."""
+    join_timeout: float = 30.0
+    """Seconds to look for the learner before giving up."""
+    patience: float = 60.0
+    """Seconds to wait for a learner that has gone before giving up."""
+    zenoh_config: Path | None = None
+    """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
+    shared_memory: bool = False
+    """Carry messages between processes of one machine in shared memory."""
+
+
+@dataclass(frozen=True)
+class RunOptions(RunConfig):
+    """The fields of a run's config, and where they come from and go to."""
+
+    preset: str | None = None
+    """Settings that come with the package (cartpole if neither this nor --config is given, and no run resumed)."""
+    config: Path | None = None
+    """A TOML file with the fields below, for example the config.toml of another run."""
+    run_dir: Path | None = None
+    """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
+    resume: bool = False
+    """Go on with the run in --run-dir and its config, from its newest epoch."""
+    zenoh_config: Path | None = None
+    """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
+    shared_memory: bool = False
+    """Carry messages between processes of one machine in shared memory."""
+
+    def run_config(self) -> RunConfig:
+        """The checked config of the run; raises UsageError."""
+        return validated(RunConfig(**{field.name: getattr(self, field.name) for field in fields(RunConfig)}))
+
+    def directory(self) -> Path:
+        """The run directory.
+
+        Raises:
+            UsageError: there is a run in it already; or, with --resume, none, or one with another config.
+        """
+        if self.resume:
+            return self._resumed()
+        game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
+        named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+        path = self.run_dir or Path("runs") / named
+        if (path / "episodes.csv").exists():
+            raise UsageError(f"--run-dir {path}: holds a run already; give another folder, or --resume to go on")
+        return path
+
+    def _resumed(self) -> Path:
+        path = self.run_dir
+        if path is None or not (path / "config.toml").exists():
+            raise UsageError(f"--resume: no run in --run-dir {path}")
+        saved = resolve(load_tables(None, path / "config.toml"))
+        if problem := first_difference(identity(self.run_config()), identity(saved)):
+            name, here, there = problem
+            raise UsageError(f"--resume: {name} = {here}, but {there} in {path / 'config.toml'}, which goes on")
+        return path
+
+
+OptionsT = TypeVar("OptionsT", bound=RunOptions)
+
+
+def parse_run(kind: type[OptionsT], program: str, description: str) -> OptionsT:
+    """Parse flags over the config that `--preset`, `--config` or `--resume` names.
+
+    Raises:
+        UsageError: whatever is wrong with them, in one line.
+    """
+    base = cli.base_config()
+    default = kind(**{field.name: getattr(base, field.name) for field in fields(RunConfig)})
+    return cli.parse(kind, program, description, default)

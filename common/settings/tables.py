@@ -1,0 +1,150 @@
+"""A run's config from tables and back: presets, TOML files, and the checks that they all pass through."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pydantic
+import tomli_w
+
+from common.errors import UsageError
+from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+
+_ADAPTER = pydantic.TypeAdapter(RunConfig)
+
+
+def preset_names() -> list[str]:
+    """The presets that come with the package."""
+    return sorted(entry.name.removesuffix(".toml") for entry in files("common.settings").joinpath("presets").iterdir())
+
+
+def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
+    """Read a preset or a config file as nested tables.
+
+    Raises:
+        UsageError: an unknown preset, or a file that is missing or not TOML.
+    """
+    if path is not None:
+        try:
+            return tomllib.loads(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise UsageError(f"--config {path}: {error}") from error
+    if preset not in preset_names():
+        raise UsageError(f"--preset {preset}: unknown; allowed: {', '.join(preset_names())}")
+    return tomllib.loads(files("common.settings").joinpath("presets", f"{preset}.toml").read_text(encoding="utf-8"))
+
+
+def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
+    """A preset for a run of another length.
+
+    Its `replay.start` is at most a tenth of the run, so that it learns. In a shorter run the learning rate falls as it
+    does in the preset's own: to the share that it would have reached by then.
+    """
+    replay, learner = tables.get("replay", {}), tables.get("learner", {})
+    start = min(replay.get("start", ReplaySettings.start), max(1, total_steps // 10))
+    part = min(1.0, total_steps / tables.get("total_steps", RunConfig.total_steps))
+    final = learner.get("learning_rate_final", LearnerSettings.learning_rate_final) ** part
+    return {
+        **tables,
+        "total_steps": total_steps,
+        "replay": {**replay, "start": start},
+        "learner": {**learner, "learning_rate_final": final},
+    }
+
+
+def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
+    """Turn tables into a checked config; a `[methods.NAME]` table overrides the rest for that method.
+
+    Raises:
+        UsageError: a misspelt field or a value out of range; names the field, the value and what is allowed.
+    """
+    merged = {key: value for key, value in tables.items() if key != "methods"}
+    if method is not None:
+        merged["method"] = method
+    chosen = merged.get("method", RunConfig.method)
+    for section, overrides in tables.get("methods", {}).get(chosen, {}).items():
+        merged[section] = {**merged.get(section, {}), **overrides}
+    return validated(merged)
+
+
+def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
+    """Check every field and the rules between fields.
+
+    Raises:
+        UsageError: as `resolve`.
+    """
+    try:
+        config = _ADAPTER.validate_python(asdict(tables) if isinstance(tables, RunConfig) else tables)
+    except pydantic.ValidationError as error:
+        raise UsageError(first_problem(error, RunConfig())) from error
+    replay = config.replay
+    if replay.start > replay.capacity:
+        raise UsageError(f"replay.start = {replay.start}: must not exceed replay.capacity = {replay.capacity}")
+    if replay.journal_keep and not replay.journal:
+        raise UsageError("replay.journal_keep = True: needs replay.journal = True")
+    if replay.start > config.total_steps:
+        raise UsageError(f"replay.start = {replay.start}: must not exceed total_steps = {config.total_steps}")
+    return config
+
+
+def to_toml(config: RunConfig) -> str:
+    """The resolved config as TOML; `--config` takes it back."""
+    return tomli_w.dumps(_without_none(asdict(config)))
+
+
+def to_tables(config: RunConfig) -> dict[str, Any]:
+    """The resolved config as plain nested tables, for the wire."""
+    return _without_none(asdict(config))
+
+
+def identity(config: RunConfig) -> dict[str, Any]:
+    """What makes two runs the same one, as nested tables: everything but how often it is saved."""
+    return {name: value for name, value in to_tables(config).items() if name != "checkpoint_every"}
+
+
+def first_difference(here: Mapping[str, Any], there: Mapping[str, Any], name: str = "") -> tuple[str, Any, Any] | None:
+    """(name, here, there) of the first field in which nested tables differ; None where they are equal."""
+    for key in {**here, **there}:
+        mine, theirs = here.get(key), there.get(key)
+        if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
+            if found := first_difference(mine, theirs, f"{name}{key}."):
+                return found
+        elif mine != theirs:
+            return f"{name}{key}", mine, theirs
+    return None
+
+
+def _without_none(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """TOML has no null: a field that is None is left out and comes back as its default."""
+    return {
+        key: _without_none(value) if isinstance(value, Mapping) else value
+        for key, value in tables.items()
+        if value is not None
+    }
+
+
+def first_problem(error: pydantic.ValidationError, example: Any) -> str:  # noqa: ANN401 (any nested dataclasses)
+    """What pydantic found first, in one line: the field, the value and what is allowed.
+
+    example: an instance of what was to be built, for the names of its fields.
+    """
+    first, *rest = error.errors(include_url=False)
+    name = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "unexpected_keyword_argument":
+        allowed = ", ".join(_siblings(first["loc"], example))
+        text = f"{name} = {first['input']!r}: no such field; allowed: {allowed}"
+    else:
+        text = f"{name} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
+    return f"{text} (and {len(rest)} more)" if rest else text
+
+
+def _siblings(path: tuple[int | str, ...], example: Any) -> list[str]:  # noqa: ANN401
+    """The fields that are allowed where the last name of `path` stands."""
+    for name in path[:-1]:
+        example = getattr(example, str(name))
+    return [field.name for field in fields(example)]

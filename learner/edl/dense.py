@@ -1,0 +1,60 @@
+"""Forward and backward of networks of Linear and ReLU on the host, in numpy; the counterpart of `backprop.Chain`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import torch
+
+from common.networks.dense import Dense
+from learner.edl.arrays import Array
+from learner.edl.backprop import Tape
+
+
+class DenseChain:
+    """The products that backpropagation is made of, as `Chain` has them; a step is a Linear layer, and its ReLU."""
+
+    def __init__(self, network: Dense) -> None:
+        self._network = network
+        self.names = network.names
+        self.parametrised = list(range(len(network.weights)))
+
+    @property
+    def output_weight(self) -> Array:
+        """The weight [actions, n] of the last layer."""
+        return self._network.weights[-1]
+
+    def forward(self, x: Array) -> Tape:
+        """Run the network on x, <float>[batch, *input]."""
+        *inputs, output = self._network.activations(x)
+        return Tape(output, inputs)
+
+    def walk(self, tape: Tape, cotangent: Array, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Array]]:
+        """As `Chain.walk`: (layer, cotangents [b, k, n] of its pre-activation), last first; in the network's dtype."""
+        rows = cotangent
+        for index in reversed(self.parametrised):
+            yield index, rows
+            if index:
+                weight, mask = self._network.weights[index], (tape.inputs[index] > 0)[:, None]
+                # One product for each k: small ones are the faster ones.
+                rows = np.matmul(rows.swapaxes(0, 1), weight).swapaxes(0, 1)
+                if len(rows) == len(mask):
+                    rows *= mask
+                else:
+                    rows = rows * mask
+
+    def write(self, tape: Tape, index: int, delta: Array, out: Mapping[str, Array]) -> None:
+        """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its pre-activation."""
+        np.dot(delta.T, tape.inputs[index], out=out[self.names[index] + "weight"])
+        np.add.reduce(delta, 0, out=out[self.names[index] + "bias"])
+
+    @staticmethod
+    def gram(t: Array) -> Array:
+        """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
+        return np.vecdot(t[:, :, None], t[:, None])
+
+    @staticmethod
+    def combine(weights: Array, t: Array) -> Array:
+        """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""
+        return weights @ t[0] if len(t) < len(weights) else np.matmul(weights[:, None], t)[:, 0]

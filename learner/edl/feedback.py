@@ -1,0 +1,148 @@
+"""Error-driven learning: gradients with the feedback B(i) = U (S + s I) V^T in the place of T(i) = U S V^T.
+
+For one sample, T(i) = d y / d a(i) is the [actions, n_i] Jacobian of the output with respect to layer i's
+pre-activation. Backpropagation sends delta(i) = T(i)^T e to layer i, EDL sends sigma(i) = B(i)^T e. With the
+orthogonal polar factor P(i) = U V^T,
+
+    B(i) = T(i) + s P(i),        P(i) = G(i)^(-1/2) T(i),        G(i) = T(i) T(i)^T,
+    sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e.
+
+Outside code calls `edl_gradients` and `feedback_matrices`. A learner keeps one `FeedbackRule` per network:
+
+    rule = FeedbackRule(Chain(network), feedback="transform")
+    tape = rule.chain.forward(x)                # tape.output: [batch, actions]; no autograd anywhere
+    rule.backward(tape, error, s, out)          # overwrites out[name], e.g. FlatNetwork.gradients
+
+With s = 0, or feedback "none", backward is plain backpropagation and costs one gradient.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from common.process.memory import keep_freed_memory
+from learner.edl.arrays import Array, like
+from learner.edl.backprop import Chain, Tape
+from learner.edl.dense import DenseChain
+from learner.edl.polar import polar, polar_of_product
+from learner.edl.transforms import Transforms
+
+FEEDBACKS = ("none", "transform", "weight-gradient", "random")
+
+
+class FeedbackRule:
+    """The backward pass of one network under one feedback.
+
+    chain: the network, in PyTorch or in numpy; arrays of the same library go in and come out.
+    feedback: "none" (backpropagation), "transform" (the equations above), "weight-gradient" (backpropagation, then
+        U (S + s I) V^T of each weight gradient; biases plain) or "random" (fixed B(i), direct feedback alignment).
+    seed: draws the fixed matrices of "random", and nothing else.
+    polar_dtype: dtype of the passes that only the polar part needs; T(i)^T e is exact always. None: the network's.
+        Of a `Chain` only.
+    """
+
+    def __init__(
+        self,
+        chain: Chain | DenseChain,
+        feedback: str = "transform",
+        seed: int = 0,
+        polar_dtype: torch.dtype | None = None,
+    ) -> None:
+        if feedback not in FEEDBACKS:
+            raise ValueError(f"feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
+        keep_freed_memory()
+        self.chain = chain
+        self.feedback = feedback
+        self._seed = seed
+        self._polar_dtype = polar_dtype
+        self._fixed: dict[int, Array] = {}
+
+    def backward(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
+        """Write one gradient per named parameter into `out`.
+
+        tape: of the chain's forward pass. error: [batch, actions], the output error e with the batch mean already in
+        it. s: the exploration rate. The caller keeps autograd off, and numpy from warning of what is not finite.
+        """
+        if self.feedback == "random":
+            for index in self.chain.parametrised:
+                self.chain.write(tape, index, self._aligned(tape, index, error), out)
+        elif self.feedback == "transform" and s != 0:
+            self._transform(tape, error, s, out)
+        else:
+            for index, delta in self.chain.walk(tape, error[:, None]):
+                self.chain.write(tape, index, delta[:, 0], out)
+                if self.feedback == "weight-gradient" and s != 0:
+                    gradient = out[self.chain.names[index] + "weight"]
+                    gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index])
+
+    def _transform(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
+        """sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e for every layer, then its gradients."""
+        transforms = Transforms(self.chain, tape, self._polar_dtype)
+        if self._polar_dtype is None:
+            for index, sigma in transforms.pull(error, s):
+                self.chain.write(tape, index, sigma, out)
+        else:
+            polar_parts = dict(transforms.pull(error, s, polar_only=True))
+            for index, delta in self.chain.walk(tape, error[:, None]):
+                self.chain.write(tape, index, delta[:, 0] + polar_parts[index], out)
+
+    def _aligned(self, tape: Tape, index: int, error: Array) -> Array:
+        """B(i)^T e with the fixed B(i) of layer `index`; the last layer's is the identity, as T(d) is."""
+        shape = tape.output_of(index).shape
+        if index == self.chain.parametrised[-1]:
+            return error.reshape(shape)
+        if index not in self._fixed:
+            size = math.prod(shape[1:])
+            layer = self.chain.parametrised.index(index)
+            generator = torch.Generator().manual_seed(self._seed * 1000 + layer)
+            draw = torch.randn(error.shape[1], size, generator=generator, dtype=torch.float64) / math.sqrt(size)
+            self._fixed[index] = like(draw, error)
+        return (error @ self._fixed[index]).reshape(shape)
+
+
+def _polar_of_gradient(gradient: Array, delta: Array, h: Array) -> Array:
+    """U V^T of a weight gradient [m, ...]; that of a Linear layer is delta^T h, which lacks rank in a small batch."""
+    matrix = torch.as_tensor(gradient).flatten(1)
+    if delta.ndim == 2 and len(delta) < min(matrix.shape):
+        factor = polar_of_product(torch.as_tensor(delta), torch.as_tensor(h))
+    else:
+        factor = polar(matrix)
+    return like(factor.view(gradient.shape), gradient)
+
+
+def edl_gradients(
+    network: nn.Module,
+    obs: Tensor,
+    output_error: Tensor,
+    s: float,
+    feedback: str = "transform",
+    *,
+    seed: int = 0,
+    polar_dtype: torch.dtype | None = None,
+) -> dict[str, Tensor]:
+    """One gradient per named parameter of `network`, in the parameter's shape and dtype.
+
+    obs: float [batch, *input]. output_error: [batch, actions], e with the batch mean already in it. s: the
+    exploration rate. feedback, seed, polar_dtype: see FeedbackRule. Raises UnsupportedLayerError for a network that is
+    not a sequence of Linear, Conv2d, ReLU and Flatten.
+    """
+    chain = Chain(network)
+    out = {name: torch.empty_like(p) for name, p in network.named_parameters()}
+    with torch.no_grad():
+        FeedbackRule(chain, feedback, seed, polar_dtype).backward(chain.forward(obs), output_error, s, out)
+    return out
+
+
+def feedback_matrices(network: nn.Module, obs: Tensor, s: float) -> dict[str, Tensor]:
+    """B(i) = U (S + s I) V^T of each layer, by name in forward order: [batch, actions, n_i].
+
+    n_i counts layer i's pre-activations, in the order [channels, height, width] for a convolution.
+    """
+    chain = Chain(network)
+    with torch.no_grad():
+        found = Transforms(chain, chain.forward(obs)).matrices(s)
+    return {chain.names[index].rstrip("."): b for index, b in reversed(found)}

@@ -1,0 +1,121 @@
+"""Orthogonal polar factors U V^T of matrices U S V^T, without an SVD wherever that is accurate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from learner.edl.arrays import Array, like, namespace
+
+_SMALL = 8  # the shorter side up to which an SVD is quicker than the algebra around a Gram matrix
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """Which Gram matrices can be trusted.
+
+    square: the shortest row's squared length. inflation: the largest sum of variance inflation factors (see
+    `whitened`). ratio: the smallest ratio of two eigenvalues.
+    """
+
+    square: float
+    inflation: float
+    ratio: float
+
+
+_LIMITS = {4: _Limits(1e-31, 3e2, 1e-11), 8: _Limits(1e-292, 1e6, 1e-9)}  # by the bytes of a number
+
+
+def whitened(gram: Array, e: Array) -> tuple[Array, Array | None]:
+    """G^(-1/2) e, and where that is doubtful and 0 was put: ([..., m], bool [...] or None for nowhere).
+
+    gram: float32 or float64 [..., m, m], Gram matrices of matrices in that dtype. e: [..., m], broadcast. Larger than
+    pairs, the algebra is done in float64; what limits the accuracy is the rounding of gram's entries,
+    eps |t_i| |t_j|. With C the matrix G scaled to a unit diagonal, the polar factor's relative error is about
+    eps |C^(-1)| <= eps sum_i (C^(-1))_ii: rows of very different length do no harm, rows that are nearly parallel do.
+    Those sums are the variance inflation factors of statistics.
+    """
+    limits = _LIMITS[gram.itemsize]
+    if gram.shape[-1] == 2:
+        white, doubtful = _whitened_pairs(gram, e, limits)
+    else:
+        wide, unsafe = _whitened_by_eigh(torch.as_tensor(gram).double(), torch.as_tensor(e).double(), limits)
+        white, doubtful = like(wide, gram), None if unsafe is None else namespace(gram).asarray(unsafe)
+    if doubtful is not None:
+        white[namespace(gram).broadcast_to(doubtful, white.shape[:-1])] = 0
+    return white, doubtful
+
+
+def _whitened_pairs(g: Array, e: Array, limits: _Limits) -> tuple[Array, Array | None]:
+    """The closed form for 2 x 2: G^(-1/2) = ((t + d) I - G) / (d sqrt(t + 2 d)) with d^2 = det G and t = tr G.
+
+    In g's own dtype: the determinant loses no more to rounding than the limit on inflation allows.
+    """
+    a, b, c = g[..., 0, 0], g[..., 1, 1], g[..., 0, 1]
+    first, second = e[..., 0], e[..., 1]
+    product, trace = a * b, a + b
+    determinant = product - c * c
+    # Both variance inflation factors are product / determinant; determinant / trace is below the shorter row's square.
+    margin = determinant - (2 / limits.inflation) * product - limits.square * trace
+    doubtful = None if float(margin.min()) > 0 else ~(margin > 0)
+    d = determinant**0.5
+    scale = d * (trace + 2 * d) ** 0.5
+    top = ((b + d) * first - c * second) / scale
+    white = namespace(g).empty((*top.shape, 2), dtype=top.dtype, device=top.device)
+    white[..., 0] = top
+    white[..., 1] = ((a + d) * second - c * first) / scale
+    return white, doubtful
+
+
+def _whitened_by_eigh(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Tensor | None]:
+    diagonal = g.diagonal(dim1=-2, dim2=-1)
+    safe = g.isfinite().all(-1).all(-1) & (diagonal.amin(-1) > limits.square)
+    values, vectors = torch.linalg.eigh(g if safe.all() else g.masked_fill(~safe[..., None, None], 0))
+    safe &= values[..., 0] > limits.ratio * values[..., -1]
+    inverse = values.clamp_min(limits.square).reciprocal()
+    inflation = (diagonal * (vectors.square() * inverse.unsqueeze(-2)).sum(-1)).sum(-1)
+    safe &= inflation <= limits.inflation
+    white = vectors @ (inverse.sqrt() * (vectors.mT @ e.unsqueeze(-1)).squeeze(-1)).unsqueeze(-1)
+    return white.squeeze(-1), None if safe.all() else ~safe
+
+
+def polar(matrix: Tensor) -> Tensor:
+    """U V^T of one matrix [m, n], by the Gram matrix of its shorter side, computed in float64."""
+    if min(matrix.shape) <= _SMALL:
+        return polar_by_svd(matrix.unsqueeze(0))[0]
+    if matrix.shape[0] > matrix.shape[1]:
+        return polar(matrix.t()).t()
+    wide = matrix.double()
+    units = torch.eye(len(wide), dtype=wide.dtype, device=wide.device)
+    root, doubtful = whitened((wide @ wide.t()).unsqueeze(0), units)
+    return polar_by_svd(matrix.unsqueeze(0))[0] if doubtful is not None else (root @ wide).to(matrix.dtype)
+
+
+def polar_of_product(left: Tensor, right: Tensor) -> Tensor:
+    """U V^T [m, n] of left^T right, whose rank is at most r < m, n: left [r, m], right [r, n]; nan if not finite.
+
+    With the full QR factorisations left^T = Q R and right^T = P L, left^T right = Q (R L^T) P^T. So U V^T is
+    Q K P^T, with the polar factor of the r x r matrix R L^T in the corner of K and an identity beside it, which
+    completes the null directions.
+    """
+    r, m, n = len(left), left.shape[1], right.shape[1]
+    (q, q_tau), (p, p_tau) = torch.geqrf(left.t().double()), torch.geqrf(right.t().double())
+    factor = torch.eye(m, n, dtype=left.dtype, device=left.device)
+    factor[:r, :r] = polar_by_svd((q[:r].triu() @ p[:r].triu().t()).unsqueeze(0))[0].to(left.dtype)
+    factor = torch.ormqr(q.to(left.dtype), q_tau.to(left.dtype), factor)
+    return torch.ormqr(p.to(left.dtype), p_tau.to(left.dtype), factor, left=False, transpose=True)
+
+
+def polar_by_svd(matrices: Tensor) -> Tensor:
+    """U V^T of each matrix [batch, m, n], computed in float64; nan where a matrix is not finite.
+
+    All min(m, n) singular values of the result are 1: where a matrix lacks rank, LAPACK's U and V complete it with an
+    orthonormal basis of the null directions, which depends on nothing but the matrix.
+    """
+    m = matrices.double()
+    broken = None if m.sum().isfinite() else ~m.isfinite().flatten(1).all(1)[:, None, None]
+    u, _, vh = torch.linalg.svd(m if broken is None else m.masked_fill(broken, 0), full_matrices=False)
+    factor: Tensor = (u @ vh).to(matrices.dtype)
+    return factor if broken is None else factor.masked_fill_(broken, torch.nan)

@@ -1,0 +1,115 @@
+"""The transforms T(i) of one batch and their polar factors, which error-driven learning feeds back through."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from learner.edl.arrays import Array, like, namespace
+from learner.edl.backprop import Chain, Tape
+from learner.edl.dense import DenseChain
+from learner.edl.polar import polar_by_svd, whitened
+
+_SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
+
+
+class Transforms:
+    """T(i) = d y / d a(i) of every layer with parameters, for each sample of a batch, ready to be applied.
+
+    All A cotangents of a sample go down the network as one batch. They start from the rows of an orthogonal matrix Q
+    and not from the identity, so what is held is Q T(i), which has T(i)'s singular values and V. Actions' values have
+    most of their gradient in common; Q parts that from the differences, and the Gram matrices stay accurate in the
+    network's own dtype. T of a Linear layer at the end is the identity and is not held.
+    """
+
+    def __init__(self, chain: Chain | DenseChain, tape: Tape, dtype: torch.dtype | None = None) -> None:
+        """dtype: what to compute the T(i) in, the network's if None; their algebra is done in float32 or better."""
+        self._chain = chain
+        self._batch, self._actions = tape.output.shape
+        self._basis = _basis(chain.output_weight, tape.output)
+        start = self._basis[None] if dtype is None else self._basis[None].to(dtype)
+        walk = chain.walk(tape, start, dtype)
+        self._linear_end = next(walk)[0] if chain.output_weight is not None else None
+        # The layers held, the last first: step, shape of its output, and T as [batch or 1, A, n].
+        self._layers: list[tuple[int, tuple[int, ...]]] = []
+        self._ts: list[Array] = []
+        for index, t in walk:
+            self._layers.append((index, t.shape[2:]))
+            self._ts.append(_flat(t) if dtype is None else _flat(t).to(tape.output.dtype))
+
+    def pull(self, error: Array, s: float, polar_only: bool = False) -> Iterator[tuple[int, Array]]:
+        """(step, B(i)^T e) for each layer, the last first: error [batch, A] -> [batch, *shape].
+
+        polar_only: s (U V^T)^T e instead of (T(i) + s U V^T)^T e.
+        """
+        if self._linear_end is not None:
+            yield self._linear_end, error * (s if polar_only else 1 + s)
+        if not self._ts:
+            return
+        e = error @ self._basis.T
+        white, doubtful = whitened(self._grams(), e)
+        weights = s * white if polar_only else e + s * white
+        for i, ((index, shape), t) in enumerate(zip(self._layers, self._ts, strict=True)):
+            sigma = self._chain.combine(weights[i], t)
+            if doubtful is not None and doubtful[i].any():
+                where = doubtful[i]
+                sigma[where] += s * (e[where][:, None] @ self._by_svd(t, where))[:, 0]
+            yield index, _shaped(sigma, shape)
+
+    def matrices(self, s: float) -> list[tuple[int, Array]]:
+        """(step, B(i) = T(i) + s U V^T), the last first: [batch, A, n_i], images in the order of channels first."""
+        found = []
+        units = like(torch.eye(self._actions), self._basis)
+        if self._linear_end is not None:
+            whole = (self._batch, self._actions, self._actions)
+            found.append((self._linear_end, namespace(units).broadcast_to(units * (1 + s), whole)))
+        if not self._ts:
+            return found
+        roots, doubtful = whitened(self._grams()[:, :, None], units)
+        for i, ((index, shape), t) in enumerate(zip(self._layers, self._ts, strict=True)):
+            b = t + s * (roots[i] @ t)
+            if doubtful is not None:
+                where = doubtful[i, :, 0]
+                b[where] += s * self._by_svd(t, where)
+            b = self._basis.mT @ b
+            found.append((index, _shaped(b.reshape(-1, b.shape[-1]), shape).reshape(b.shape)))
+        return found
+
+    def _grams(self) -> Array:
+        """G(i) = T(i) T(i)^T of every layer held: [layers, batch, A, A]."""
+        xp, shape = namespace(self._basis), (self._batch, self._actions, self._actions)
+        grams = [self._chain.gram(t) for t in self._ts]
+        whole = [gram if len(gram) == self._batch else xp.broadcast_to(gram, shape) for gram in grams]
+        return xp.concatenate(whole).reshape(-1, *shape)
+
+    def _by_svd(self, t: Array, where: Array) -> Array:
+        """Polar factors of the samples of T [batch or 1, A, n] that are true in `where`: [k, A, n]."""
+        chosen = namespace(t).broadcast_to(t, (self._batch, *t.shape[1:]))[where]
+        return like(polar_by_svd(torch.as_tensor(chosen)), t)
+
+
+def _basis(output_weight: Array | None, output: Array) -> Array:
+    """An orthogonal Q [A, A] such that the rows of Q W, for the output weight W [A, n], are near orthogonal."""
+    actions = output.shape[1]
+    if actions == 2:
+        return like(_SUM_AND_DIFFERENCE, output)
+    if output_weight is None:
+        return like(torch.eye(actions), output)
+    w = torch.as_tensor(output_weight).double()
+    vectors: Tensor = torch.linalg.eigh((w @ w.mT).nan_to_num_()).eigenvectors
+    return like(vectors.mT, output)
+
+
+def _flat(t: Array) -> Array:
+    """[b, A, channels, height, width] with channels last in memory, as [b, A, n] without a copy."""
+    return t.permute(0, 1, 3, 4, 2).flatten(2) if t.ndim == 5 else t
+
+
+def _shaped(rows: Array, shape: tuple[int, ...]) -> Array:
+    """[rows, n] of `_flat` back to [rows, *shape]."""
+    if len(shape) == 1:
+        return rows
+    channels, height, width = shape
+    return rows.view(-1, height, width, channels).permute(0, 3, 1, 2)

@@ -1,0 +1,81 @@
+"""Epochs: one consistent checkpoint of learner and replay service, under checkpoints/NUMBER/ of the run directory."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from common.process.files import measure, write_whole
+
+DONE = "DONE"
+LEARNER = "learner.pt"
+KEPT = 2
+
+
+def save_epoch(run_dir: Path, number: int, learner_state: dict[str, Any], snapshot: Callable[[str], None]) -> Path:
+    """Save one epoch and drop those that are too old or torn.
+
+    `DONE`, with size and checksum of learner.pt, is written last: without it an epoch is torn.
+
+    snapshot: has the replay service save itself under the folder it is given, relative to the run directory.
+
+    Raises:
+        OSError: the run directory can't be written; nothing is left of this epoch.
+    """
+    folder = f"checkpoints/{number}"
+    path = run_dir / folder
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        (path / DONE).unlink(missing_ok=True)
+        content = io.BytesIO()
+        torch.save(learner_state, content)
+        data = content.getvalue()
+        checksum = write_whole(path / LEARNER, data)
+        snapshot(folder)
+        write_whole(path / DONE, json.dumps({LEARNER: [len(data), checksum]}).encode())
+    except BaseException:
+        shutil.rmtree(path, ignore_errors=True)
+        raise
+    keep = complete_epochs(run_dir)[-KEPT:]
+    for old in (run_dir / "checkpoints").iterdir():
+        if old.name not in map(str, keep):
+            shutil.rmtree(old, ignore_errors=True)
+    return path
+
+
+def complete_epochs(run_dir: Path) -> list[int]:
+    """Numbers of the epochs that were finished, in ascending order."""
+    return sorted(int(path.parent.name) for path in (run_dir / "checkpoints").glob(f"*/{DONE}"))
+
+
+def newest_epoch(run_dir: Path) -> Path | None:
+    """The newest epoch that was finished and whose learner.pt is as it was written; None if there is none."""
+    for number in reversed(complete_epochs(run_dir)):
+        path = run_dir / "checkpoints" / str(number)
+        try:
+            if json.loads((path / DONE).read_text(encoding="utf-8")) == {LEARNER: list(measure(path / LEARNER))}:
+                return path
+        except (OSError, ValueError):
+            continue
+    return None
+
+
+def go_back(run_dir: Path) -> dict[str, Any] | None:
+    """The learner's state of the newest epoch, if there is one; what is newer is torn, and dropped."""
+    path = newest_epoch(run_dir)
+    for number in complete_epochs(run_dir):
+        if path is None or number > int(path.name):
+            shutil.rmtree(run_dir / "checkpoints" / str(number), ignore_errors=True)
+    return None if path is None else load_learner(path)
+
+
+def load_learner(path: Path) -> dict[str, Any]:
+    """Read learner.pt of an epoch's folder; executes nothing that it holds."""
+    state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
+    return state

@@ -1,0 +1,113 @@
+"""The files of a run: config, episodes, metrics, TensorBoard, summary and the learning curve."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import secrets
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from common.errors import RunError
+from common.messaging.experience import EpisodeRecord
+from common.process.files import LineFile, write_whole
+from common.settings.config import RunConfig
+from common.settings.tables import to_toml
+from learner.records.board import Board
+from learner.records.summary import Summary
+
+EPISODE_FIELDS = (
+    "episode", "env_step", "update", "actor", "stream", "return", "length",
+    "epsilon", "s", "q1_mean", "q2_mean", "param_version",
+)  # fmt: skip
+RUN_ID = "run-id"
+
+
+class RunDirectory:
+    """Writes a run's files as the run goes on; a line is complete when its call returns, if there is space for it."""
+
+    def __init__(self, path: Path, config: RunConfig, sizes: dict[str, int] | None = None) -> None:
+        """Begin a run's files, or go on with those cut back to `sizes` in bytes; RunError where that can't be."""
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            write_whole(path / "config.toml", to_toml(config).encode())
+            for name, size in (sizes or {}).items():
+                os.truncate(path / name, size)
+            self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
+            self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
+            self._board = Board(path / "tb")
+        except OSError as error:
+            raise RunError(f"run directory {path}: {error.strerror or error}") from error
+        self._csv = csv.writer(self._episodes, lineterminator="\n")
+        if sizes is None:
+            self._csv.writerow(EPISODE_FIELDS)
+        self._problem = ""
+
+    def run_id(self) -> int:
+        """The random id of this run, drawn when it began, which tells it from others of its name; raises RunError."""
+        path = self.path / RUN_ID
+        try:
+            if not path.exists():
+                write_whole(path, f"{secrets.randbits(63)}\n".encode())
+        except OSError as error:
+            raise RunError(f"{path}: {error}") from error
+        return read_run_id(self.path)
+
+    def episode(self, number: int, record: EpisodeRecord, update: int, s: float) -> None:
+        """Add a line to episodes.csv."""
+        end = record.end
+        place = (number, record.env_step, update, f"{record.actor:x}", record.stream)
+        values = (f"{value:.6g}" for value in (end.epsilon, s, end.q1_mean, end.q2_mean))
+        self._csv.writerow((*place, f"{end.episode_return:g}", end.length, *values, end.param_version))
+        self._board.add("episode/return", end.episode_return, record.env_step)
+        self._look()
+
+    def metrics(self, row: dict[str, Any]) -> None:
+        """Add a line to metrics.jsonl, and the same to TensorBoard."""
+        self._metrics.write(json.dumps(row) + "\n")
+        for name, value in row.items():
+            if name not in ("time", "env_step"):
+                self._board.add(f"train/{name}", value, row["env_step"])
+        self._look()
+
+    def summary(self, summary: Summary) -> None:
+        """Write summary.json, whole or not at all."""
+        write_whole(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
+
+    def sizes(self) -> dict[str, int]:
+        """How long the files that grow are now, in bytes."""
+        return {name: (self.path / name).stat().st_size for name in ("episodes.csv", "metrics.jsonl")}
+
+    def close(self) -> None:
+        """Close all files."""
+        self._episodes.close()
+        self._metrics.close()
+        self._board.close()
+
+    def _look(self) -> None:
+        """Say once that there is no space, and once that there is again; no line is lost between the two."""
+        problem = self._episodes.problem or self._metrics.problem
+        if problem != self._problem:
+            print(f"{self.path}: {problem or 'can be written again'}", flush=True)
+        self._problem = problem
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def read_run_id(run_dir: Path) -> int:
+    """The id of the run in a directory; raises RunError."""
+    path = run_dir / RUN_ID
+    try:
+        return int(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: {error}") from error

@@ -1,0 +1,72 @@
+"""What a run says at its end: summary.json, and one line."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from learner.agent import Agent
+from learner.records.telemetry import Telemetry
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """The fields of summary.json.
+
+    return_mean_100, return_sd_100: over the last 100 episodes; 0 where none has ended. transitions_lost,
+    duplicates_refused: None where the replay service could not be asked. exit: why the run ended.
+    """
+
+    method: str
+    env: str
+    seed: int
+    env_steps: int
+    updates: int
+    episodes: int
+    return_mean_100: float
+    return_sd_100: float
+    wall_seconds: float
+    transitions_accepted: int
+    transitions_lost: int | None
+    duplicates_refused: int | None
+    exit: str
+
+    @property
+    def title(self) -> str:
+        """The run in a few words."""
+        return f"{self.env}, {self.method}, seed {self.seed}"
+
+    def __str__(self) -> str:
+        returns = f"return of the last 100 episodes {self.return_mean_100:.1f} ({self.return_sd_100:.1f})"
+        return (
+            f"{self.exit}: {self.env_steps:,} steps, {self.updates:,} updates, "
+            f"{returns if self.episodes else 'no episode ended'}, {self.wall_seconds:.0f} s"
+        )
+
+
+def summarise(
+    agent: Agent,
+    telemetry: Telemetry,
+    started: float,
+    outcome: str,
+    env_steps: int,
+    lost: int | None = 0,
+    duplicates: int | None = 0,
+) -> Summary:
+    """The summary of a run that began at `started` of the monotonic clock and ends now."""
+    config = agent.config
+    return Summary(
+        method=config.method,
+        env=config.env.id,
+        seed=config.seed,
+        env_steps=env_steps,
+        updates=agent.updates,
+        episodes=telemetry.episodes,
+        return_mean_100=telemetry.return_mean,
+        return_sd_100=telemetry.return_sd,
+        wall_seconds=round(time.monotonic() - started, 3),
+        transitions_accepted=env_steps,
+        transitions_lost=lost,
+        duplicates_refused=duplicates,
+        exit=outcome,
+    )

@@ -1,0 +1,72 @@
+"""Carries out again, on a core, what a journal took down: after a kill -9, and to re-execute a run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from common.errors import RunError
+from common.messaging import wire
+from common.messaging.experience import DrawRequest, SegmentReader
+from replay.core import ReplayCore
+from replay.persistence.journal import (
+    DRAW,
+    LIMITER,
+    SEGMENT,
+    TornFile,
+    journal_files,
+    read_draw,
+    read_file,
+    read_limiter,
+)
+from replay.table.table import PinnedBatch
+
+
+def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[int, str]:
+    """Bring a core from the beginning of file `first` to the end of its journal; the next free number, and words.
+
+    A file that ends in a torn record, as a kill leaves it, is cut there.
+
+    Raises:
+        UsageError: the journal belongs to another run.
+        RunError: files are missing, or carrying out gives something else than was taken down.
+    """
+    before, draws = core.table.inserted, 0
+    numbers = following_files(folder, first)
+    for number in numbers:
+        try:
+            for _ in carry_out(core, folder, number, run_id):
+                draws += 1
+        except TornFile as torn:
+            if number != numbers[-1]:
+                raise
+            os.truncate(torn.path, torn.end)
+    taken = core.table.inserted - before
+    return first + len(numbers), f"{taken:,} transitions and {draws:,} batches from the journal"
+
+
+def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
+    """Carry out one file; gives every draw, to be read before the next one. Raises as `recover`."""
+    read = SegmentReader(core.table.spec)
+    for kind, payload in read_file(folder, number, run_id):
+        if kind == SEGMENT:
+            core.take(read(wire.decode(payload)))
+        elif kind == DRAW:
+            request, ids = read_draw(payload)
+            batch, _ = core.give(request)
+            if not np.array_equal(batch.columns["ids"], ids):
+                raise RunError(f"{folder}: file {number}, batch {request.sequence}: not the transitions taken down")
+            yield request, batch
+        elif kind == LIMITER:
+            core.limiter = read_limiter(payload)
+
+
+def following_files(folder: Path, first: int) -> list[int]:
+    """Numbers of a journal's files from `first` on; raises RunError where one is missing."""
+    numbers = [number for number in journal_files(folder) if number >= first]
+    if numbers != list(range(first, first + len(numbers))):
+        raise RunError(f"{folder}: has files {numbers}, should have every one from {first} on")
+    return numbers

@@ -1,0 +1,1 @@
+"""The replay table: exact capacity, each frame stored once, eviction and sampling policies."""

@@ -1,0 +1,68 @@
+"""How segments' frames come into the store: those that a segment shares with the one before it are not stored again."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.types import Segment
+from replay.table.frames import FrameStore, Slots, as_slice
+
+MAX_STREAMS = 4096
+
+
+class StreamTails:
+    """Of each stream the last segment's number and the slots of its last frames, which the next segment may carry.
+
+    A tail holds a reference on each of its frames that is stored; -1 stands for one that is not. Beyond `MAX_STREAMS`
+    the stream that has been silent longest is forgotten.
+    """
+
+    def __init__(self, frames: FrameStore, stack: int) -> None:
+        self._frames = frames
+        self._stack = stack
+        self._tails: OrderedDict[tuple[int, int], tuple[int, Slots]] = OrderedDict()
+
+    def store(self, segment: Segment, index: NDArray[np.int32]) -> tuple[Slots, Slots]:
+        """Store the frames of a segment that `index` names, each once.
+
+        Returns (slots of all its frames, -1 where not stored; slots to drop once the transitions are in place).
+        The stream keeps a reference on its last frames, as many as the next segment is likely to carry.
+        """
+        count = len(segment.frames)
+        references = np.bincount(index.reshape(-1), minlength=count)
+        slots = np.empty(count, np.intp)
+        slots.fill(-1)
+        stream = (segment.incarnation, segment.stream)
+        sequence, previous = self._tails.pop(stream, (-1, slots[:0]))
+        shared = min(segment.carried, len(previous)) if sequence == segment.sequence - 1 else 0
+        slots[segment.carried - shared : segment.carried] = previous[len(previous) - shared :]
+        known = slots >= 0
+        tail = max(0, count - max(self._stack, segment.carried))
+        references[tail:] += known[tail:] | (references[tail:] > 0)
+        wanted = references > 0
+        again = (wanted & known).nonzero()[0]
+        self._frames.hold(slots[again], references[again])
+        new = (wanted & ~known).nonzero()[0]
+        slots[new] = self._frames.add(segment.frames[as_slice(new)], references[new])
+        self._tails[stream] = segment.sequence, slots[tail:].copy()
+        if len(self._tails) > MAX_STREAMS:
+            previous = np.concatenate((previous, self._tails.popitem(last=False)[1][1]))
+        return slots, previous[previous >= 0]
+
+    def slots(self) -> Slots:
+        """Those of all tails, one stream after the other."""
+        return np.concatenate([*(tail for _, tail in self._tails.values()), np.empty(0, np.intp)])
+
+    def streams(self) -> list[list[int]]:
+        """Incarnation, stream, number of its last segment and length of its tail, in the order of `slots`."""
+        return [[*key, sequence, len(tail)] for key, (sequence, tail) in self._tails.items()]
+
+    def load_state(self, streams: list[list[int]], slots: Slots) -> None:
+        """Continue from what `streams` and `slots` gave; the references are the caller's to take."""
+        start = 0
+        for incarnation, stream, sequence, length in streams:
+            self._tails[incarnation, stream] = sequence, slots[start : start + length].copy()
+            start += length

@@ -1,0 +1,287 @@
+"""The table of transitions: exact capacity, each frame once, eviction and sampling by policy, state to the bit."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import UsageError
+from common.process.randomness import generator_state, set_generator_state
+from common.types import Array, Batch, EnvSpec, Segment
+from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
+from replay.table.frames import FrameStore, PinnedFrames, Slots
+from replay.table.selection import make_eviction, make_sampling
+from replay.table.streams import StreamTails
+
+__all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
+
+COLUMNS = ("actions", "rewards", "terminated", "param_version", "ids", "reuse", "priorities")
+
+
+class PinnedBatch(NamedTuple):
+    """A batch whose frames lie in the table, held there until they are released.
+
+    columns: the other fields of a `Batch`, by name.
+    """
+
+    frames: PinnedFrames
+    columns: dict[str, Array]
+
+    def read(self) -> Batch:
+        """The batch, with a copy of the frames."""
+        return Batch(frames=self.frames.read(), **self.columns)
+
+
+class Table:
+    """Transitions of one environment, at most `capacity` of them, over frames stored once each.
+
+    Plain and deterministic: all chance comes from `rng` (a Generator over PCG64, which the table's state includes).
+    Not safe for threads: one owner makes all calls.
+    """
+
+    def __init__(
+        self,
+        spec: EnvSpec,
+        capacity: int,
+        *,
+        eviction: str = "fifo",
+        sampling: str = "uniform",
+        rng: np.random.Generator,
+        priority_exponent: float = 0.6,
+        importance_exponent: float = 0.4,
+    ) -> None:
+        """Raises UsageError for a capacity below 1, exponents below 0 or a policy that does not exist."""
+        if capacity < 1:
+            raise UsageError(f"capacity: {capacity} transitions, must be at least 1")
+        for name, exponent in (("priority", priority_exponent), ("importance", importance_exponent)):
+            if not exponent >= 0:
+                raise UsageError(f"{name}_exponent: {exponent}, must be at least 0")
+        self.spec = spec
+        self.capacity = capacity
+        self.inserted = 0
+        self.batches = 0
+        self._settings = {
+            "spec": [spec.env_id, list(spec.frame_shape), spec.frame_dtype, spec.stack, spec.num_actions],
+            "capacity": capacity,
+            "eviction": eviction,
+            "sampling": sampling,
+            "priority_exponent": priority_exponent,
+            "importance_exponent": importance_exponent,
+        }
+        self._rng = rng
+        self._frames = FrameStore(spec.frame_shape, spec.frame_dtype)
+        self._slots = np.zeros((capacity, 2 * spec.stack), np.int32)  # of obs, then of next_obs
+        self._actions = np.zeros(capacity, np.int32)
+        self._rewards = np.zeros(capacity, np.float32)
+        self._terminated = np.zeros(capacity, np.bool_)
+        self._param_version = np.zeros(capacity, np.int64)
+        self._ids = np.zeros(capacity, np.int64)
+        self._reuse = np.zeros(capacity, np.int32)
+        self._prioritized = "prioritized" in (eviction, sampling)
+        self._priorities = np.zeros(capacity if self._prioritized else 0)
+        self._max_priority = 1.0
+        self._row_of: dict[int, int] | None = {} if self._prioritized and eviction != "fifo" else None
+        self._eviction = make_eviction(eviction, rng, self._ids, self._priorities)
+        self._sampling = make_sampling(sampling, rng, capacity, priority_exponent, importance_exponent)
+        self._tails = StreamTails(self._frames, spec.stack)
+        self._sampled = 0
+        self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
+
+    def __len__(self) -> int:
+        return min(self.inserted, self.capacity)
+
+    @property
+    def evicted(self) -> int:
+        """Transitions inserted and no longer held."""
+        return self.inserted - len(self)
+
+    @property
+    def evicted_unsampled(self) -> int:
+        """Transitions evicted, or never kept, that no batch had held."""
+        return int(self._reuse_evicted[0])
+
+    def insert(self, segment: Segment) -> None:
+        """Add a segment that has been validated and is no duplicate, evicting what the policy chooses."""
+        size = len(self)
+        first = self.inserted
+        rows, kept = self._eviction.place(first, segment.steps)
+        index = np.concatenate((segment.obs_index[kept], segment.next_index[kept]), axis=1)
+        slots, dropped = self._tails.store(segment, index)
+        replaced = rows if size == self.capacity else rows[rows < size]
+        self._reuse_evicted += reuse_histogram(self._reuse[replaced])
+        self._reuse_evicted[0] += segment.steps - len(rows)
+        old = self._slots.take(replaced, axis=0).reshape(-1)
+        if self._row_of is not None:
+            for number in self._ids[replaced].tolist():
+                del self._row_of[number]
+        self._slots[rows] = slots[index]
+        self._actions[rows] = segment.actions[kept]
+        self._rewards[rows] = segment.rewards[kept]
+        self._terminated[rows] = segment.terminated[kept]
+        self._param_version[rows] = segment.param_version[kept]
+        self._ids[rows] = np.arange(first, first + segment.steps)[kept]
+        self._reuse[rows] = 0
+        self._frames.drop(np.concatenate((old, dropped)))
+        self.inserted += segment.steps
+        if self._row_of is not None:
+            self._row_of.update(zip(self._ids[rows].tolist(), rows.tolist(), strict=True))
+        if self._prioritized:
+            self._set_priorities(rows, np.full(len(rows), self._max_priority))
+
+    def sample(self, batch_size: int) -> Batch:
+        """Draw transitions with replacement by the sampling policy. Raises ValueError while the table is empty."""
+        slots, columns = self._draw(batch_size)
+        return Batch(frames=self._frames.read(slots), **columns)
+
+    def sample_pinned(self, batch_size: int) -> PinnedBatch:
+        """`sample`, with the frames left where they lie."""
+        slots, columns = self._draw(batch_size)
+        return PinnedBatch(self._frames.pin(slots), columns)
+
+    def pin(self, batch: Batch) -> PinnedBatch:
+        """Take in the frames of a batch that was drawn before this table came back from its state."""
+        slots = self._frames.add(batch.frames, np.ones(len(batch.frames), np.intp))
+        pinned = self._frames.pin(slots)
+        self._frames.drop(slots)
+        return PinnedBatch(pinned, batch.columns())
+
+    def _draw(self, batch_size: int) -> tuple[Slots, dict[str, Array]]:
+        """Slots of the distinct frames of a batch, and its other fields."""
+        size = len(self)
+        if size == 0:
+            raise ValueError("an empty table has nothing to sample")
+        rows, weights = self._sampling.draw(batch_size, size)
+        # Transition by transition: neighbouring frames are then read one after the other.
+        distinct, index = self._frames.unique(self._slots.take(rows, axis=0).astype(np.intp))
+        np.add.at(self._reuse, rows, np.int32(1))
+        self.batches += 1
+        self._sampled += batch_size
+        ids = self._ids[rows]
+        return distinct, {
+            "obs_index": np.ascontiguousarray(index[:, : self.spec.stack]),
+            "next_index": np.ascontiguousarray(index[:, self.spec.stack :]),
+            "actions": self._actions[rows],
+            "rewards": self._rewards[rows],
+            "terminated": self._terminated[rows],
+            "weights": weights,
+            "ids": ids,
+            "param_version": self._param_version[rows],
+            "age": self.inserted - 1 - ids,
+            "reuse": self._reuse[rows],
+        }
+
+    def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.floating[Any]]) -> None:
+        """Give transitions new priorities (float [n], usually |TD error|); ids no longer held are ignored.
+
+        New transitions get the largest priority seen so far (1 at first). Where an id repeats, its last priority
+        counts. Without a prioritized policy nothing changes. Raises ValueError for a priority that is negative or
+        not finite, or lengths that differ.
+        """
+        given = np.asarray(priorities, np.float64)
+        if len(ids) != len(given) or not np.all(np.isfinite(given) & (given >= 0)):
+            raise ValueError("priorities: must be finite, at least 0, and one for each id")
+        if not self._prioritized:
+            return
+        if self._row_of is None:
+            rows = ids.astype(np.intp) % self.capacity
+        else:
+            rows = np.array([self._row_of.get(number, self.capacity) for number in ids.tolist()], np.intp)
+        held = np.flatnonzero(rows < len(self))
+        held = held[self._ids[rows[held]] == ids[held]]
+        if len(held):
+            self._max_priority = max(self._max_priority, float(given[held].max()))
+            self._set_priorities(rows[held], given[held])
+
+    def stats(self) -> TableStats:
+        """Counts and diagnostics, in time proportional to the transitions held."""
+        size = len(self)
+        reuse = self._reuse[:size]
+        row_bytes = (self._slots.nbytes + sum(self._column(name).nbytes for name in COLUMNS)) // self.capacity
+        return TableStats(
+            size=size,
+            inserted=self.inserted,
+            evicted=self.evicted,
+            evicted_unsampled=self.evicted_unsampled,
+            batches=self.batches,
+            sampled=self._sampled,
+            frames_held=self._frames.held,
+            bytes_held=self._frames.bytes_held + size * row_bytes,
+            reuse_mean=float(reuse.mean()) if size else 0.0,
+            reuse_held=tuple(reuse_histogram(reuse).tolist()),
+            reuse_evicted=tuple(self._reuse_evicted.tolist()),
+        )
+
+    def snapshot(self) -> TableSnapshot:
+        """Freeze the state as it is now while the table goes on: small arrays are copied, frames only held."""
+        size = len(self)
+        tail_slots = self._tails.slots()
+        stored = tail_slots >= 0
+        slots = self._slots[:size]
+        distinct, index = self._frames.unique(np.concatenate((slots.reshape(-1), tail_slots[stored])))
+        tail_index = np.full(len(tail_slots), -1, np.int32)
+        tail_index[stored] = index[slots.size :]
+        meta = {
+            "settings": self._settings,
+            "inserted": self.inserted,
+            "batches": self.batches,
+            "sampled": self._sampled,
+            "max_priority": self._max_priority,
+            "reuse_evicted": self._reuse_evicted.tolist(),
+            "streams": self._tails.streams(),
+            "rng": generator_state(self._rng),
+        }
+        arrays = {name: self._column(name)[:size].copy() for name in COLUMNS}
+        arrays["slots"] = index[: slots.size].reshape(slots.shape)
+        arrays["tails"] = tail_index
+        return TableSnapshot(meta, arrays, self._frames.pin(distinct))
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Everything that `load_state` needs: msgpack-able scalars, and arrays of what is held (frames included)."""
+        meta, arrays, frames = self.snapshot()
+        with frames:
+            return meta, {**arrays, "frames": frames.read(0, len(frames))}
+
+    def load_state(self, meta: dict[str, Any], arrays: dict[str, Array]) -> None:
+        """Continue, to the bit, where `state` was taken; `arrays["frames"]` may be a memory map.
+
+        Raises UsageError where the state is of a table with other settings, ValueError where this one is not new.
+        """
+        if self.inserted:
+            raise ValueError("only a new table can take over a state")
+        for name, value in self._settings.items():
+            if meta["settings"][name] != value:
+                raise UsageError(f"{name}: {value!r}, but the saved table had {meta['settings'][name]!r}")
+        tails = arrays["tails"].astype(np.intp)
+        frames = arrays["frames"]
+        references = np.bincount(np.concatenate((arrays["slots"].reshape(-1), tails[tails >= 0])))
+        parts = [slice(start, start + 1024) for start in range(0, len(frames), 1024)]
+        slots = np.concatenate(
+            [np.empty(0, np.intp), *(self._frames.add(frames[part], references[part]) for part in parts)]
+        )
+        size = len(arrays["slots"])
+        self._slots[:size] = slots[arrays["slots"]]
+        for name in COLUMNS:
+            self._column(name)[:size] = arrays[name]
+        self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
+        self.inserted = meta["inserted"]
+        self.batches = meta["batches"]
+        self._sampled = meta["sampled"]
+        self._max_priority = meta["max_priority"]
+        self._reuse_evicted[:] = meta["reuse_evicted"]
+        set_generator_state(self._rng, meta["rng"])
+        rows = np.arange(size)
+        if self._row_of is not None:
+            self._row_of.update(zip(self._ids[rows].tolist(), rows.tolist(), strict=True))
+        if self._prioritized:
+            self._set_priorities(rows, self._priorities[rows])
+
+    def _set_priorities(self, rows: Slots, priorities: NDArray[np.float64]) -> None:
+        self._priorities[rows] = priorities
+        self._eviction.prioritise(rows)
+        self._sampling.prioritise(rows, priorities)
+
+    def _column(self, name: str) -> Array:
+        column: Array = getattr(self, f"_{name}")
+        return column
