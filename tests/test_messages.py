@@ -28,6 +28,7 @@ SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]
 RECORD = [4, 7, 0, END]
 STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
+JOIN = Join("replay", 5, ["tcp/127.0.0.1:1"], epochs=[500, 1000])
 JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300)
 LIMITS = Limits(0.5, 8.0, 10, 5, 50, "a", "")
 TABLES = to_tables(RunConfig())
@@ -47,7 +48,7 @@ def _encoded_batch() -> bytearray:
 
 
 READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
-    "join": (messages.encode_join("r", Join("replay", 5, ["tcp/127.0.0.1:1"])), messages.decode_join),
+    "join": (messages.encode_join("r", JOIN), messages.decode_join),
     "joined": (messages.encode_joined(JOINED), messages.decode_joined),
     "insert": (experience.encode_segment("r", make_segment(SPEC)), SegmentReader(SPEC)),
     "ack": (messages.encode_ack("r", 9), messages.decode_ack),
@@ -74,7 +75,7 @@ def _valid(kind: str) -> Message:
 @pytest.mark.parametrize(
     ("kind", "value"),
     [
-        ("join", Join("replay", 5, ["tcp/127.0.0.1:1"])),
+        ("join", JOIN),
         ("joined", JOINED),
         ("ack", 9),
         ("retry", "later"),
@@ -124,6 +125,10 @@ FIELDS = [
     ("join", "incarnation", 2**63),
     ("join", "endpoints", ["x"] * 17),
     ("join", "endpoints", ["x" * 257]),
+    ("join", "epochs", [-1]),
+    ("join", "epochs", [0] * 17),
+    ("join", "serving", 1),
+    ("joined", "anew", 0),
     ("joined", "config", {"learning": 1}),
     ("joined", "config", {**TABLES, "replay": {"capacity": -1}}),
     ("joined", "config", []),

@@ -13,14 +13,14 @@ error                the answer to a message that is bad (names the field) or th
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from dataclasses import fields as dataclass_fields
 from typing import Any
 
 from common.errors import BadMessage, CoopError, UsageError
 from common.messaging import wire
 from common.messaging.presence import ROLES
-from common.messaging.schema import Int, ListOf, Row, Rule, Schema, Table, Text
+from common.messaging.schema import Flag, Int, ListOf, Row, Rule, Schema, Table, Text
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.settings.tables import to_tables, validated
@@ -34,13 +34,17 @@ _ENDPOINTS = ListOf(Text(256), 16)
 class Join:
     """A process asks to be part of the run.
 
-    endpoints: where others can reach it; none for actors. index: the one it was given when it joined before, or -1.
+    endpoints: where others can reach it; none for actors, and none where a replay service only asks which run this is.
+    index: the one it was given when it joined before, or -1. epochs: those that a replay service can restore, in
+    ascending order. serving: it holds its table in memory already, and goes on from any epoch of the learner's.
     """
 
     role: str
     incarnation: int
     endpoints: list[str]
     index: int = -1
+    epochs: list[int] = field(default_factory=list)
+    serving: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,8 @@ class Joined:
     index: how many processes of this role had joined before (tells actors' random streams apart).
     layout: digest of the network layout, to be compared with one's own.
     run_id: drawn at random when the run began; tells it from others of its name.
-    epoch: number of the newest epoch that is finished; 0 if there is none.
+    epoch: number of the newest epoch that is finished, which a replay service restores; 0 if there is none.
+    anew: the training begins anew: a replay service drops what it holds of it.
     """
 
     config: RunConfig
@@ -61,6 +66,7 @@ class Joined:
     replay_endpoints: list[str]
     run_id: int
     epoch: int
+    anew: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +98,19 @@ class ReplayStats:
     samples_wait_for: str
 
 
-_JOIN = Schema("join", {"role": Text(16), "incarnation": INCARNATION, "endpoints": _ENDPOINTS, "index": Int(-1)}, {})
+_EPOCHS = ListOf(Int(), 16)
+_JOIN = Schema(
+    "join",
+    {
+        "role": Text(16),
+        "incarnation": INCARNATION,
+        "endpoints": _ENDPOINTS,
+        "index": Int(-1),
+        "epochs": _EPOCHS,
+        "serving": Flag(),
+    },
+    {},
+)
 _JOINED = Schema(
     "joined",
     {
@@ -103,6 +121,7 @@ _JOINED = Schema(
         "replay_endpoints": _ENDPOINTS,
         "run_id": INCARNATION,
         "epoch": Int(),
+        "anew": Flag(),
     },
     {},
 )
@@ -115,7 +134,7 @@ _STATS = Schema(
     {field.name: Text() if field.name.endswith("_wait_for") else Int() for field in dataclass_fields(ReplayStats)},
     {},
 )
-_SNAPSHOT = Schema("snapshot", {"number": Int(), "keep": ListOf(Int(), 16)}, {})
+_SNAPSHOT = Schema("snapshot", {"number": Int(), "keep": _EPOCHS}, {})
 _WRITTEN = Schema("written", {"number": Int()}, {})
 _STOP = Schema("stop", {"reason": Text()}, {})
 

@@ -45,6 +45,15 @@ class Real:
 
 
 @dataclass(frozen=True, slots=True)
+class Flag:
+    """True or false."""
+
+    def problem(self, value: Any) -> str | None:  # noqa: ANN401
+        """See `Rule`."""
+        return None if type(value) is bool else f"{shown(value)}; true or false"
+
+
+@dataclass(frozen=True, slots=True)
 class Text:
     """A string of at most `longest` characters."""
 
