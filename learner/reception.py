@@ -9,6 +9,7 @@ from common.errors import BadMessage
 from common.messaging import messages
 from common.messaging.joining import join_key
 from common.messaging.messages import Joined
+from common.messaging.presence import Origin
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
@@ -31,6 +32,7 @@ class Reception:
         self._run_id = run_id
         self._newest_epoch = newest_epoch
         self._replay_endpoints: list[str] = []
+        self._replay: Origin | None = None
         self._indices: dict[str, dict[int, int]] = {"replay": {}, "actor": {}}
         for role in self._indices:  # each answered by a thread of its own
             node.serve(join_key(node, role), partial(self._answer, role))
@@ -40,7 +42,7 @@ class Reception:
         if request.role != role:
             raise BadMessage("fields.role", f"{request.role!r}; this key is for {role!r}")
         if role == "replay":
-            self._replay_endpoints = request.endpoints
+            self._replay_endpoints, self._replay = request.endpoints, request.origin
         indices = self._indices[role]
         if request.incarnation not in indices:
             indices[request.incarnation] = max(indices.values(), default=-1) + 1 if request.index < 0 else request.index
@@ -52,5 +54,6 @@ class Reception:
             self._replay_endpoints,
             self._run_id,
             self._newest_epoch(),
+            replay=self._replay,
         )
         return messages.encode_joined(joined)

@@ -18,6 +18,7 @@ from common.messaging import experience, limits, messages, wire
 from common.messaging.experience import BatchReader, Drawn, DrawRequest, EpisodeRecord, SegmentReader
 from common.messaging.limits import Limits
 from common.messaging.messages import Join, Joined, ReplayStats, Role
+from common.messaging.presence import Origin
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.settings.tables import to_tables
@@ -29,7 +30,7 @@ END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]
 RECORD = [4, 7, 0, END]
 STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
 JOIN = Join("replay", 5, ["tcp/127.0.0.1:1"], epochs=[500, 1000])
-JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300)
+JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300, replay=Origin("h", 7))
 LIMITS = Limits(0.5, 8.0, 10, 5, 50, "a", "")
 TABLES = to_tables(RunConfig())
 FLAT = np.arange(3, dtype=np.float32)
@@ -50,6 +51,7 @@ def _encoded_batch() -> bytearray:
 READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "join": (messages.encode_join("r", JOIN), messages.decode_join),
     "joined": (messages.encode_joined(JOINED), messages.decode_joined),
+    "leave": (messages.encode_leave("r", 5), messages.decode_leave),
     "insert": (experience.encode_segment("r", make_segment(SPEC)), SegmentReader(SPEC)),
     "ack": (messages.encode_ack("r", 9), messages.decode_ack),
     "retry": (messages.encode_retry("r", "later"), messages.decode_retry),
@@ -77,6 +79,7 @@ def _valid(kind: str) -> Message:
     [
         ("join", JOIN),
         ("joined", JOINED),
+        ("leave", 5),
         ("ack", 9),
         ("retry", "later"),
         ("error", "f: wrong"),
@@ -125,6 +128,10 @@ FIELDS = [
     ("join", "incarnation", 2**63),
     ("join", "endpoints", ["x"] * 17),
     ("join", "endpoints", ["x" * 257]),
+    ("join", "origin", ["h", -1]),
+    ("joined", "learner", None),
+    ("joined", "replay", ["h" * 257, 1]),
+    ("leave", "incarnation", -1),
     ("join", "epochs", [-1]),
     ("join", "epochs", [0] * 17),
     ("join", "serving", 1),

@@ -1,6 +1,7 @@
 """Messages that steer a run: their schemas, how they are built and how they are read back.
 
 join / joined        a role asks the learner for the run
+leave / farewell     a role that was told to stop takes leave of the learner
 insert / ack         a segment for the table, and its receipt
 sample / batch       the learner draws; also carries the episodes that ended
 retry                the limiter's answer to an insert or a sample, with the reason in words
@@ -19,8 +20,8 @@ from typing import Any
 
 from common.errors import BadMessage, CoopError, UsageError
 from common.messaging import wire
-from common.messaging.presence import ROLES
-from common.messaging.schema import Flag, Int, ListOf, Row, Rule, Schema, Table, Text
+from common.messaging.presence import ROLES, Origin
+from common.messaging.schema import Flag, Int, ListOf, Optional, Row, Rule, Schema, Table, Text
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.settings.tables import to_tables, validated
@@ -37,6 +38,7 @@ class Join:
     endpoints: where others can reach it; none for actors, and none where a replay service only asks which run this is.
     index: the one it was given when it joined before, or -1. epochs: those that a replay service can restore, in
     ascending order. serving: it holds its table in memory already, and goes on from any epoch of the learner's.
+    origin: where it runs.
     """
 
     role: str
@@ -45,6 +47,7 @@ class Join:
     index: int = -1
     epochs: list[int] = field(default_factory=list)
     serving: bool = False
+    origin: Origin = field(default_factory=Origin.here)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +55,12 @@ class Joined:
     """All that a role needs.
 
     replay_endpoints: where the replay service listens; empty while none has joined.
-    index: how many processes of this role had joined before (tells actors' random streams apart).
+    index: how many processes of this role had joined the run before (tells actors' random streams apart).
     layout: digest of the network layout, to be compared with one's own.
     run_id: drawn at random when the run began; tells it from others of its name.
     epoch: number of the newest epoch that is finished, which a replay service restores; 0 if there is none.
     anew: the training begins anew: a replay service drops what it holds of it.
+    learner, replay: where they run; None while no replay service has joined.
     """
 
     config: RunConfig
@@ -67,6 +71,8 @@ class Joined:
     run_id: int
     epoch: int
     anew: bool = False
+    learner: Origin = field(default_factory=Origin.here)
+    replay: Origin | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +105,7 @@ class ReplayStats:
 
 
 _EPOCHS = ListOf(Int(), 16)
+_ORIGIN = Row((Text(256), Int(0, 2**31)))
 _JOIN = Schema(
     "join",
     {
@@ -108,6 +115,7 @@ _JOIN = Schema(
         "index": Int(-1),
         "epochs": _EPOCHS,
         "serving": Flag(),
+        "origin": _ORIGIN,
     },
     {},
 )
@@ -122,9 +130,12 @@ _JOINED = Schema(
         "run_id": INCARNATION,
         "epoch": Int(),
         "anew": Flag(),
+        "learner": _ORIGIN,
+        "replay": Optional(_ORIGIN),
     },
     {},
 )
+_LEAVE = Schema("leave", {"incarnation": INCARNATION}, {})
 _ACK = Schema("ack", {"inserted": Int()}, {})
 _RETRY = Schema("retry", {"reason": Text()}, {})
 _ERROR = Schema("error", {"field": Text(), "problem": Text(4096)}, {})
@@ -147,7 +158,7 @@ def encode_join(run: str, join: Join) -> bytearray:
 def decode_join(message: Message) -> Join:
     """Read a join request; raises BadMessage."""
     _JOIN.check(message)
-    join = Join(**message.fields)
+    join = Join(**{**message.fields, "origin": Origin(*message.fields["origin"])})
     if join.role not in ROLES:
         raise BadMessage("fields.role", f"{join.role!r}; one of {', '.join(ROLES)}")
     return join
@@ -168,7 +179,19 @@ def decode_joined(message: Message) -> Joined:
         config = validated(fields["config"])
     except UsageError as error:
         raise BadMessage("fields.config", str(error)) from error
-    return Joined(**{**fields, "config": config, "spec": _spec(fields["spec"])})
+    learner, replay = (origin and Origin(*origin) for origin in (fields["learner"], fields["replay"]))
+    return Joined(**{**fields, "config": config, "spec": _spec(fields["spec"]), "learner": learner, "replay": replay})
+
+
+def encode_leave(run: str, incarnation: int) -> bytearray:
+    """Build the notice of a process that was told to stop; the answer is a farewell, or a retry while it is needed."""
+    return wire.encode("leave", run, {"incarnation": incarnation})
+
+
+def decode_leave(message: Message) -> int:
+    """Read the incarnation of the process that leaves; raises BadMessage."""
+    _LEAVE.check(message)
+    return int(message.fields["incarnation"])
 
 
 def _spec(table: dict[str, Any]) -> EnvSpec:

@@ -5,16 +5,35 @@ A token disappears within milliseconds of its process, and within the lease of a
 
 from __future__ import annotations
 
+import os
+import socket
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from typing import NamedTuple
 
 import zenoh
 
 ROLES = ("learner", "replay", "actor")
 LEASE_MS = 1500
 FORGOTTEN = 60.0  # seconds after which one that has gone is no longer missed
+
+
+class Origin(NamedTuple):
+    """The host and the process id of a member of a run."""
+
+    host: str
+    pid: int
+
+    @classmethod
+    def here(cls) -> Origin:
+        """This very process."""
+        return cls(socket.gethostname()[:256], os.getpid())
+
+    def __str__(self) -> str:
+        """As consoles show it."""
+        return f"{self.host} (pid {self.pid})"
 
 
 class Presence:

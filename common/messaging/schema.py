@@ -94,6 +94,17 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
+class Optional:
+    """What another rule allows, or nothing."""
+
+    rule: Rule
+
+    def problem(self, value: Any) -> str | None:  # noqa: ANN401
+        """See `Rule`."""
+        return None if value is None else self.rule.problem(value)
+
+
+@dataclass(frozen=True, slots=True)
 class Table:
     """A mapping of names to plain values whose meaning its reader checks."""
 
