@@ -9,7 +9,7 @@ import torch
 
 from actors.policy import Policy
 from actors.service import ActorService
-from common.envs.environments import make_vector_env
+from common.envs.make import make_vector_env
 from common.errors import JoinError, PeerLost
 from common.messaging.joining import Membership, join
 from common.messaging.messages import Join, Joined

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.frame_block import FrameBlock
-from common.envs.environments import Steps
+from common.envs.protocol import Steps
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from actors.policy import Policy
 from actors.segments import EpisodeTracker, SegmentAssembler
 from actors.weights import WeightsFollower
-from common.envs.environments import Steps, VectorEnv
+from common.envs.protocol import Steps, VectorEnv
 from common.messaging.clients import InsertClient
 from common.messaging.transport import Node
 from common.process.lifecycle import Stop

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from common.envs.environments import env_spec
+from common.envs.make import env_spec
 from common.networks.network import FlatNetwork, preprocess
 from common.process.threads import use_threads
 from common.settings.tables import load_tables, resolve

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from actors.policy import Policy
-from common.envs.environments import env_spec, make_vector_env
+from common.envs.make import env_spec, make_vector_env
 from common.messaging import messages
 from common.messaging.clients import replay_key
 from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session

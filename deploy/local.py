@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.envs.environments import env_spec
+from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
 from common.process.files import write_whole

@@ -10,7 +10,7 @@ import torch
 
 from actors.policy import Policy
 from actors.segments import EpisodeTracker
-from common.envs.environments import make_vector_env
+from common.envs.make import make_vector_env
 from common.errors import UsageError
 from common.settings.tables import load_tables, resolve
 from learner.agent import make_network

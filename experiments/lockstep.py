@@ -10,7 +10,8 @@ import numpy as np
 
 from actors.policy import Policy
 from actors.segments import EpisodeTracker, SegmentAssembler
-from common.envs.environments import Steps, make_vector_env
+from common.envs.make import make_vector_env
+from common.envs.protocol import Steps
 from common.errors import UsageError
 from common.messaging.experience import Drawn, EpisodeRecord
 from common.process.randomness import generator_state, set_generator_state

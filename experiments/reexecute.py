@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from common.envs.environments import env_spec
+from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.messaging.experience import DrawRequest
 from common.process.threads import use_threads

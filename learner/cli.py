@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.envs.environments import env_spec
+from common.envs.make import env_spec
 from common.messaging.clients import SampleClient
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process.lifecycle import Stop, run_main

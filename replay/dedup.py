@@ -6,8 +6,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
-MAX_STREAMS = 65_536
-MAX_GAPS = 1024
+from common.bounds import MAX_GAPS, MAX_STREAMS
 
 
 @dataclass(slots=True)

@@ -3,7 +3,9 @@
 import numpy as np
 
 from actors.segments import SegmentAssembler
-from common.envs.environments import EnvSettings, Steps, make_vector_env
+from common.envs.make import make_vector_env
+from common.envs.protocol import Steps
+from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
 
 INCARNATION = 77

@@ -11,9 +11,11 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from common.envs import catch
-from common.envs.environments import EnvSettings, Steps, env_spec, make_vector_env
+from common.envs.make import env_spec, make_vector_env
 from common.envs.pictures import Shrink
+from common.envs.protocol import Steps
 from common.errors import UsageError
+from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
 
 
@@ -64,11 +66,6 @@ def test_specification_fits_what_the_emulators_return(options: dict[str, Any], e
         ({"id": "Pendulum-v1"}, ["action space Box", "allowed is Discrete"]),
         ({"id": "Blackjack-v1"}, ["observation space Tuple", "allowed is a one-dimensional Box or a uint8 picture"]),
         ({"id": "test/Odd-v0"}, ["observation space Box", "(4, 84, 84)"]),
-        ({"stack": 0}, ["env.stack: 0", "at least 1"]),
-        ({"noop_max": -1}, ["env.noop_max: -1", "at least 0"]),
-        ({"frame_skip": 0}, ["env.frame_skip: 0"]),
-        ({"max_episode_steps": -5}, ["env.max_episode_steps: -5"]),
-        ({"repeat_action_probability": 1.0}, ["env.repeat_action_probability: 1.0", "[0, 1)"]),
     ],
 )
 def test_what_does_not_fit_is_refused_in_words(options: dict[str, Any], words: list[str]) -> None:
@@ -107,7 +104,8 @@ def test_a_seed_repeats_and_emulators_differ(env_id: str) -> None:
 
 def test_nothing_is_printed_or_warned() -> None:
     code = (
-        "import numpy as np; from common.environments import EnvSettings as S, make_vector_env as make\n"
+        "import numpy as np; from common.envs.make import make_vector_env as make\n"
+        "from common.settings.environment import EnvSettings as S\n"
         "for name in ('CartPole-v0', 'coop/Catch-v0', 'pong'):\n"
         "    env = make(S(id=name), 1, 0); env.reset(); env.step(np.zeros(1, np.int32)); env.close()"
     )
@@ -116,7 +114,7 @@ def test_nothing_is_printed_or_warned() -> None:
 
 
 def test_settings_alone_import_no_emulator() -> None:
-    code = "import sys, common.environments; print({'gymnasium', 'ale_py', 'torch'} & set(sys.modules))"
+    code = "import sys, common.envs.make; print({'gymnasium', 'ale_py', 'torch'} & set(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "set()"
 

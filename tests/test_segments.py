@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from samples import INCARNATION, cut, record
 
 from actors.segments import EpisodeTracker, FinishedEpisode, SegmentAssembler
-from common.envs.environments import EnvSettings, Steps
+from common.envs.protocol import Steps
+from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
 
 

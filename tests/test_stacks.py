@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import Seen, cut, record
 
-from common.envs.environments import EnvSettings
+from common.settings.environment import EnvSettings
 from common.types import EnvSpec
 from replay.table.table import Table
 

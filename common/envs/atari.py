@@ -9,8 +9,9 @@ from ale_py.vector_env import AtariVectorEnv
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from common.envs.environments import EnvSettings, Steps
+from common.envs.protocol import Steps
 from common.errors import UsageError
+from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
 
 FRAME_LIMIT = 108_000  # emulator frames of an episode, half an hour of play

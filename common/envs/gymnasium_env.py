@@ -12,9 +12,10 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
 from common.envs import catch as _registers_catch  # noqa: F401
-from common.envs.environments import EnvSettings, Steps
 from common.envs.pictures import SIDE, Shrink
+from common.envs.protocol import Steps
 from common.errors import UsageError
+from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
 
 

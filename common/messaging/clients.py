@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from common.bounds import MAX_AHEAD
 from common.errors import BadMessage
 from common.messaging import experience, messages
-from common.messaging.experience import MAX_AHEAD, BatchReader, Drawn, DrawRequest
+from common.messaging.experience import BatchReader, Drawn, DrawRequest
 from common.messaging.transport import NoAnswer, Node, Pending
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop

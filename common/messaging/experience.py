@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_SEGMENT_STEPS, MAX_STREAMS
 from common.errors import BadMessage
 from common.messaging import wire
 from common.messaging.messages import INCARNATION
@@ -20,10 +21,7 @@ from common.messaging.schema import Int, ListOf, Real, Row, Rule, Schema
 from common.messaging.wire import Message, Source
 from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
 
-MAX_SEGMENT_STEPS = 4096
 MAX_EPISODES = 1000  # told with one batch; later ones come with the next
-MAX_AHEAD = 1024  # draws that a learner may be ahead of its base
-MAX_BATCH = 65_536
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +98,7 @@ _DRAWN_FIELDS: dict[str, Rule] = {
 }
 _SEGMENT_FIELDS: dict[str, Rule] = {
     "incarnation": INCARNATION,
-    "stream": Int(0, 65_535),
+    "stream": Int(0, MAX_STREAMS - 1),
     "sequence": Int(),
     "carried": Int(0, 1024),
     "acked": Int(),

@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, field
 from dataclasses import fields as dataclass_fields
 from typing import Any
 
+from common.bounds import MAX_ENV_ID, MAX_STACK
 from common.errors import BadMessage, CoopError, UsageError
 from common.messaging import wire
 from common.messaging.presence import ROLES, Origin
@@ -197,9 +198,9 @@ def decode_leave(message: Message) -> int:
 def _spec(table: dict[str, Any]) -> EnvSpec:
     shape = table.get("frame_shape")
     rules: dict[str, Rule] = {
-        "env_id": Text(256),
+        "env_id": Text(MAX_ENV_ID),
         "frame_dtype": Text(16),
-        "stack": Int(1, 64),
+        "stack": Int(1, MAX_STACK),
         "num_actions": Int(1, 100_000),
     }
     if table.keys() != {*rules, "frame_shape"} or ListOf(Int(1, 65_536), 4).problem(shape):

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from common.envs.environments import EnvSettings
 from common.errors import UsageError
+from common.settings.environment import EnvSettings
 
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 Method = Literal["dqn", "edql", "g-coop", "coop"]

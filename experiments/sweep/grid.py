@@ -16,9 +16,10 @@ import pydantic
 import tomli_w
 from pydantic import ConfigDict, Field
 
-from common.envs.environments import EnvSettings, env_spec
+from common.envs.make import env_spec
 from common.errors import UsageError
 from common.settings.config import Count, Method, Positive, RunConfig, check_distributed
+from common.settings.environment import EnvSettings
 from common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")

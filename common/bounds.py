@@ -1,0 +1,21 @@
+"""Bounds that messages and settings share: a setting may ask for nothing that a message could not carry."""
+
+from __future__ import annotations
+
+MAX_SEGMENT_STEPS = 4096  # steps of one emulator that travel together
+MAX_BATCH = 65_536  # transitions of a batch
+MAX_AHEAD = 1024  # draws that a learner may be ahead of its base
+MAX_STREAMS = 65_536  # emulators of one actor process
+MAX_GAPS = 1024  # segments of a stream that may be missing while later ones have come
+MAX_STACK = 64  # frames of an observation
+MAX_ENV_ID = 256  # characters
+
+MAX_STEPS = 10**12  # environment steps of a run
+MAX_RATIO = 1e6  # updates per environment step; with MAX_STEPS, updates stay below 2^62
+MAX_TOLERANCE = 1e12  # environment steps
+MAX_INTEGER = 2**63 - 1  # of TOML, and of the counters on the wire
+
+# ALE counts frames in 32 bits, MAX_FRAME_SKIP * MAX_GAME_STEPS of them at most.
+MAX_NOOPS = 10_000
+MAX_FRAME_SKIP = 1000
+MAX_GAME_STEPS = 2_000_000

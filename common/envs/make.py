@@ -1,0 +1,66 @@
+"""Makes the environment that the settings name.
+
+Emulators are imported where they are made, so that a process that only reads the settings does not pay for them.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+
+import numpy as np
+
+from common.envs.protocol import VectorEnv
+from common.errors import UsageError
+from common.settings.environment import EnvSettings
+from common.types import EnvSpec
+
+
+def make_vector_env(settings: EnvSettings, num_envs: int, seed: int) -> VectorEnv:
+    """Make `num_envs` emulators, each with a seed of its own drawn from `seed`.
+
+    Raises:
+        UsageError: unknown id or game, or a space that does not fit.
+    """
+    if num_envs < 1:
+        raise UsageError(f"envs: {num_envs} is not allowed; at least 1")
+    seeds = np.random.SeedSequence(seed).generate_state(num_envs) & 0x7FFFFFFF  # ALE takes 31 bits
+    if (game := _atari_game(settings.id)) is not None:
+        from common.envs.atari import AtariEnv  # noqa: PLC0415
+
+        return AtariEnv(settings, game, seeds.tolist())
+    from common.envs.gymnasium_env import GymnasiumEnv  # noqa: PLC0415
+
+    return GymnasiumEnv(settings, seeds.tolist())
+
+
+def env_spec(settings: EnvSettings) -> EnvSpec:
+    """The specification of the environment, without starting emulators.
+
+    Raises:
+        UsageError: as `make_vector_env`.
+    """
+    if (game := _atari_game(settings.id)) is not None:
+        from common.envs.atari import atari_spec  # noqa: PLC0415
+
+        return atari_spec(settings, game)
+    from common.envs.gymnasium_env import gymnasium_spec  # noqa: PLC0415
+
+    return gymnasium_spec(settings)
+
+
+def _atari_game(env_id: str) -> str | None:
+    """The ROM's name if `env_id` means an ALE game; None leaves the id to gymnasium.
+
+    Ids with a slash or a version are gymnasium's, except ALE's own namespace; the rest are games.
+    """
+    if not env_id.startswith("ALE/") and ("/" in env_id or "-v" in env_id):
+        return None
+    from ale_py.roms import get_all_rom_ids  # noqa: PLC0415
+
+    games = {game.replace("_", ""): game for game in get_all_rom_ids()}
+    wanted = env_id.removeprefix("ALE/").split("-v")[0]
+    plain = wanted.replace("_", "").replace("-", "").lower()
+    if plain in games:
+        return games[plain]
+    near = ", ".join(games[name] for name in get_close_matches(plain, games, n=3)) or "breakout, pong, space_invaders"
+    raise UsageError(f"env.id: unknown game {wanted!r}; ale-py has {len(games)} games, such as {near}")

@@ -1,0 +1,54 @@
+"""What every environment gives an actor: a batch of emulators stepped together, exact about how episodes end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.types import Array, EnvSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """One step of every emulator. Receivers must not write into the arrays; none is reused by a later call.
+
+    obs: <frame_dtype>[envs, *obs_shape], what the policy acts on next (of the new episode where one began).
+    next_obs: <frame_dtype>[envs, *obs_shape], where the step led; the same object as `obs` if nothing restarted.
+    rewards: float32 [envs], for learning. raw_rewards: float64 [envs], unclipped, for reported returns.
+    terminated: bool [envs], for learning: no value follows. A truncated step is not terminal.
+    restarted: bool [envs], obs does not continue next_obs, for the emulator was reset.
+    episode_over: bool [envs], the reported (full-game) episode ended.
+    """
+
+    obs: Array
+    next_obs: Array
+    rewards: NDArray[np.float32]
+    raw_rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    restarted: NDArray[np.bool_]
+    episode_over: NDArray[np.bool_]
+
+
+class VectorEnv(Protocol):
+    """`num_envs` emulators that step together and reset themselves."""
+
+    spec: EnvSpec
+    num_envs: int
+
+    def reset(self) -> Array:
+        """Start every emulator from its seed: <frame_dtype>[envs, *obs_shape]."""
+
+    def send(self, actions: NDArray[np.int32]) -> None:
+        """Begin to play one action, int32 [envs] in 0..num_actions-1, in every emulator; `recv` must follow."""
+
+    def recv(self) -> Steps:
+        """What the actions sent last led to."""
+
+    def step(self, actions: NDArray[np.int32]) -> Steps:
+        """`send`, then `recv`."""
+
+    def close(self) -> None:
+        """Free the emulators."""
