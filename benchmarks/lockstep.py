@@ -20,8 +20,8 @@ import gymnasium
 from stable_baselines3 import DQN
 from stable_baselines3.common.logger import Logger
 
-from common.process.cli import base_config
 from common.process.threads import use_threads
+from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
 

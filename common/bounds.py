@@ -4,12 +4,15 @@ from __future__ import annotations
 
 MAX_SEGMENT_STEPS = 4096  # steps of one emulator that travel together
 MAX_BATCH = 65_536  # transitions of a batch
+MAX_PRIORITIES = 50_000  # that a request for a batch takes along: its header holds so many
 MAX_AHEAD = 1024  # draws that a learner may be ahead of its base
 MAX_STREAMS = 65_536  # emulators of one actor process
 MAX_GAPS = 1024  # segments of a stream that may be missing while later ones have come
 MAX_STACK = 64  # frames of an observation
 MAX_ENV_ID = 256  # characters
 
+MAX_PAYLOAD = 1 << 28  # bytes of a message; also what a session takes in from one peer for one message
+MAX_LAYERS = 64  # hidden layers of a network
 MAX_STEPS = 10**12  # environment steps of a run
 MAX_RATIO = 1e6  # updates per environment step; with MAX_STEPS, updates stay below 2^62
 MAX_TOLERANCE = 1e12  # environment steps

@@ -12,7 +12,7 @@ from common.messaging.transport import new_incarnation
 from common.process.files import write_whole
 from common.process.lifecycle import Stop, run_main
 from common.process.processes import ChildProcess, command, free_endpoint
-from common.settings.capacity import check_memory
+from common.settings.capacity import check_memory, check_messages
 from common.settings.config import RunConfig, check_distributed
 from common.settings.options import RunOptions, parse_run
 from common.settings.tables import to_toml
@@ -133,7 +133,9 @@ def _run() -> None:
         raise UsageError(f"--actors {options.actors}: must be at least 1")
     config = options.run_config()
     check_distributed(config)
-    check_memory(config, env_spec(config.env))  # refuses what can't be played or held before anything starts
+    spec = env_spec(config.env)  # refuses what can't be played, held or sent before anything starts
+    check_memory(config, spec)
+    check_messages(config, spec)
     directory = options.directory()
     stop = Stop()
     stop.on_signals()

@@ -9,6 +9,7 @@ from common.messaging.clients import SampleClient
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process.lifecycle import Stop, run_main
 from common.process.threads import use_threads
+from common.settings.capacity import check_messages
 from common.settings.config import check_distributed
 from common.settings.options import RunOptions, parse_run
 from learner.agent import Agent
@@ -39,6 +40,7 @@ def _run() -> None:
     config = options.run_config()
     check_distributed(config)
     spec = env_spec(config.env)
+    check_messages(config, spec)
     use_threads(config.learner.threads)
     stop = Stop()
     stop.on_signals()

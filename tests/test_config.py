@@ -1,17 +1,22 @@
 """Configs: presets resolve, TOML comes back, and what can't be right is refused by field and value."""
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from common.errors import UsageError
-from common.process.cli import base_config
+from common.messaging import wire
 from common.settings import schedules
+from common.settings.capacity import check_messages
 from common.settings.config import ActorSettings, EdlSettings, LearnerSettings
 from common.settings.options import RunOptions, parse_run
-from common.settings.tables import load_tables, preset_names, resolve, to_toml
+from common.settings.sources import base_config
+from common.settings.tables import first_difference, load_tables, preset_names, resolve, to_tables, to_toml
+from common.types import EnvSpec
 
 
 @pytest.mark.parametrize("preset", preset_names())
@@ -20,6 +25,60 @@ def test_presets_resolve_and_come_back_from_toml(preset: str, method: str) -> No
     resolved = resolve(load_tables(preset, None), method)
     assert resolved.method == method
     assert resolve(tomllib.loads(to_toml(resolved))) == resolved
+
+
+@pytest.mark.parametrize("size", ["", "-small"])
+def test_presets_of_atari_games_differ_in_nothing_but_the_game(size: str) -> None:
+    breakout, pong, invaders = (
+        to_tables(resolve(load_tables(game + size, None))) for game in ("breakout", "pong", "space-invaders")
+    )
+    assert (breakout["env"].pop("id"), pong["env"].pop("id"), invaders["env"].pop("id")) == (
+        "breakout",
+        "pong",
+        "space_invaders",
+    )
+    assert first_difference(breakout, pong) is None
+    assert first_difference(breakout, invaders) is None
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--preset", "breakout", "--learner.batch-size", "60000"], "learner.batch_size = 60000: allowed: at most 75"),
+        (["--preset", "breakout", "--actor.segment-steps", "4096"], None),
+        (["--network.hidden", "100000", "100000"], "network.hidden = [100000, 100000]: 10,000,"),
+        (["--learner.batch-size", "65536"], None),
+    ],
+)
+def test_what_no_message_could_carry_is_refused(
+    flags: list[str], words: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["coop-local", *flags])
+    config = parse_run(RunOptions, "coop-local", "").run_config()
+    pixels = config.env.id != "CartPole-v0"
+    spec = EnvSpec("any", (84, 84), "uint8", 4, 4) if pixels else EnvSpec("any", (4,), "float32", 1, 2)
+    if words is None:
+        check_messages(config, spec)
+    else:
+        with pytest.raises(UsageError) as caught:
+            check_messages(config, spec)
+        assert words in str(caught.value)
+
+
+def test_the_largest_segment_and_batch_that_are_allowed_fit_into_a_message() -> None:
+    """Of frames large enough that the payload is what bounds them, and all of them different."""
+    spec = EnvSpec("any", (1024, 1024), "uint8", 2, 4)
+    most = {}
+    for name in ("learner.batch_size", "actor.segment_steps"):
+        section, field = name.split(".")
+        config = resolve({"learner": {"batch_size": 1}, "actor": {"segment_steps": 1}, section: {field: 1000}})
+        with pytest.raises(UsageError, match=name) as caught:
+            check_messages(config, spec)
+        most[name] = int(re.search(r"at most (\d+)", str(caught.value))[1])  # type: ignore[index]
+    batch, steps = most["learner.batch_size"], most["actor.segment_steps"]
+    for frames, row_bytes in ((3 * batch, 64 * batch), (2 * steps + 2, 64 * steps)):
+        payload = wire.encode("insert", "r", {}, {"frames": np.zeros((frames, 1024, 1024), np.uint8)})
+        assert len(payload) + row_bytes <= wire.MAX_PAYLOAD < len(payload) + row_bytes + 6 * 2**20
 
 
 def test_a_method_table_overrides_the_rest() -> None:
@@ -60,6 +119,29 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
         (["--run", "a/b"], ["run", "a/b"]),
         (["--config", "/no/such.toml"], ["--config", "/no/such.toml"]),
         (["--preset", "cartpole", "--config", "x"], ["--preset", "--config"]),
+        (["--seed"], ["--seed", "needs a value"]),
+        (["--network.hidden", "3", "x"], ["--network.hidden", "x", "INT"]),
+        (["--replay.eviction", "lru"], ["--replay.eviction", "lru", "reservoir"]),
+        (["stray"], ["stray", "unknown"]),
+        (["--total-steps", "300", "--replay.start", "300"], ["total_steps", "300", "at least 301"]),
+        (["--total-steps", "1000", "--replay.ratio", "0.0001"], ["total_steps", "1000", "at least 5101"]),
+        (["--env.stack=-3"], ["env.stack", "-3", "greater than 0"]),
+        (["--env.stack", "0"], ["env.stack", "0", "greater than 0"]),
+        (["--env.stack", "65"], ["env.stack", "65", "64"]),
+        (["--env.noop-max", "-1"], ["env.noop_max", "-1"]),
+        (["--env.frame-skip", "0"], ["env.frame_skip", "0"]),
+        (["--env.max-episode-steps", "-5"], ["env.max_episode_steps", "-5"]),
+        (["--env.repeat-action-probability", "1.0"], ["env.repeat_action_probability", "1.0", "less than 1"]),
+        (["--env.id", "x" * 257], ["env.id", "256"]),
+        (["--actor.segment-steps", "100000"], ["actor.segment_steps", "100000", "4096"]),
+        (["--actor.envs", "65537"], ["actor.envs", "65536"]),
+        (["--actor.window", "1025"], ["actor.window", "1024"]),
+        (["--learner.batch-size", "100000"], ["learner.batch_size", "100000", "65536"]),
+        (["--replay.ratio", "1e7"], ["replay.ratio", "1000000"]),
+        (["--replay.tolerance", "1e13"], ["replay.tolerance", "1000000000000"]),
+        (["--total-steps", "2000000000000"], ["total_steps", "1000000000000"]),
+        (["--seed", str(2**63)], ["seed", str(2**63 - 1)]),
+        (["--replay.sampling", "prioritized", "--learner.batch-size", "26000"], ["learner.batch_size", "25000"]),
     ],
 )
 def test_refused_in_one_line(flags: list[str], words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from common.process.cli import base_config
 from common.settings.config import Method
+from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
 

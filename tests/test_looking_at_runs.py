@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from common.process.cli import base_config
+from common.settings.sources import base_config
 from experiments import evaluation_cli
 from experiments.evaluation import evaluate
 from experiments.lockstep import Lockstep, finish

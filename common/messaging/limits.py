@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
+from common.bounds import MAX_RATIO, MAX_TOLERANCE
 from common.errors import BadMessage
 from common.messaging import wire
 from common.messaging.schema import Int, Real, Schema, Text
@@ -68,8 +69,8 @@ def decode_limit(message: Message) -> tuple[float, float]:
     """Read (ratio, tolerance); raises BadMessage."""
     _LIMIT.check(message)
     ratio, tolerance = float(message.fields["ratio"]), float(message.fields["tolerance"])
-    if not 0 < ratio <= 1e6:
+    if not 0 < ratio <= MAX_RATIO:
         raise BadMessage("fields.ratio", f"{ratio:g}; above 0, at most 1,000,000")
-    if not 0 <= tolerance <= 1e12:
+    if not 0 <= tolerance <= MAX_TOLERANCE:
         raise BadMessage("fields.tolerance", f"{tolerance:g}; at least 0")
     return ratio, tolerance

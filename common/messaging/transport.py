@@ -17,6 +17,7 @@ from typing import Any, Self
 
 import zenoh
 
+from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage, CoopError, RunError, UsageError
 from common.messaging import messages, wire
 from common.messaging.links import never_linger
@@ -36,7 +37,7 @@ _QUIET = {
     "listen/exit_on_failure": True,
     "transport/link/tx/lease": LEASE_MS,
     "transport/link/rx/buffer_size": 4 << 20,
-    "transport/link/rx/max_message_size": wire.MAX_PAYLOAD + (1 << 16),
+    "transport/link/rx/max_message_size": MAX_PAYLOAD + (1 << 16),
     "transport/link/tx/queue/size/data": 16,
     "transport/shared_memory/enabled": False,
 }

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import msgpack
 import numpy as np
 
+from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage
 from common.types import Array
 
@@ -23,7 +24,6 @@ PROTOCOL = 1
 MAGIC = 0x434F4F50  # "COOP"
 ALIGNMENT = 64
 MAX_HEADER = 1 << 20
-MAX_PAYLOAD = 1 << 28  # also what a session takes in from one peer for one message
 MAX_ARRAYS = 64
 MAX_DIMENSIONS = 8
 MAX_NAME = 64

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import io
-import re
+import dataclasses
 import sys
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TypeVar
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+from typing import Any, NoReturn, TypeVar, get_type_hints
 
 import tyro
+from tyro import _errors as tyro_errors  # pyproject.toml pins the version, for tyro promises nothing of this module
 
 from common.errors import UsageError
-from common.settings.config import RunConfig
-from common.settings.tables import load_tables, resolve, shortened
 
 T = TypeVar("T")
-_FRAME = re.compile(r"[╭╮╰╯│─]+")
 
 
 def parse(
@@ -29,55 +24,47 @@ def parse(
     Raises:
         UsageError: an unknown flag or a value of the wrong type.
     """
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint):
-            if default is None:
-                return tyro.cli(kind, prog=program, description=description, args=args)
-            return tyro.cli(kind, prog=program, description=description, args=args, default=default)
-    except SystemExit as exit_:
-        if exit_.code in (0, None):
-            raise
-        raise UsageError(_one_line(complaint.getvalue())) from None
+
+    def refuse(event: tyro_errors.ParseErrorEvent) -> NoReturn:
+        raise UsageError(_problem(event, list(flags(kind))))
+
+    with tyro_errors.on_parse_error(refuse):
+        if default is None:
+            return tyro.cli(kind, prog=program, description=description, args=args)
+        return tyro.cli(kind, prog=program, description=description, args=args, default=default)
 
 
-def base_config(args: Sequence[str] | None = None) -> RunConfig:
-    """The config that `--preset`, `--config`, `--method` and `--total-steps` name; the other flags override it.
-
-    With `--resume` and neither a preset nor a file it is that of the run in `--run-dir`.
-
-    Raises:
-        UsageError: an unknown preset, a bad file, or both given.
-    """
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    early.add_argument("--preset")
-    early.add_argument("--config", type=Path)
-    early.add_argument("--method")
-    early.add_argument("--total-steps", "--total_steps", type=int)
-    early.add_argument("--run-dir", "--run_dir", type=Path)
-    early.add_argument("--resume", action="store_true")
-    try:
-        known, _ = early.parse_known_args(sys.argv[1:] if args is None else args)
-    except argparse.ArgumentError as error:
-        raise UsageError(str(error)) from error
-    if known.preset and known.config:
-        raise UsageError("--preset and --config: give one of them")
-    preset, file = known.preset, known.config
-    if known.resume and known.run_dir and not (preset or file):
-        saved = known.run_dir / "config.toml"
-        file = saved if saved.exists() else None
-    if not file:
-        preset = preset or "cartpole"
-    tables = load_tables(preset, file)
-    if preset and known.total_steps is not None:
-        tables = shortened(tables, known.total_steps)
-    return resolve(tables, known.method)
+def flags(kind: type[Any], prefix: str = "") -> Iterator[str]:
+    """The flags of a dataclass and of those nested in it, as tyro names them: "--learner.swap-every"."""
+    hints = get_type_hints(kind)
+    for field in dataclasses.fields(kind):
+        name = prefix + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(inner := hints[field.name]):
+            assert isinstance(inner, type)
+            yield from flags(inner, f"{name}.")
+        else:
+            yield f"--{name}"
 
 
-def _one_line(box: str) -> str:
-    """The statement inside the box that tyro draws around an error, and the flag that it suggests."""
-    body = box.split("\n", 1)[1] if box.startswith("╭") else box
-    statement, _, advice = body.partition("│ ─")
-    text = re.sub(r"\s+", " ", _FRAME.sub(" ", statement)).strip() or "bad command line"
-    meant = re.search(r"Perhaps you meant:[\s│]*(--\S+)", advice)
-    return f"{text}; perhaps {meant[1]}" if meant else text
+def given_flags(args: Sequence[str] | None = None) -> set[str]:
+    """The fields that a command line sets, as dotted names: "learner.swap_every"; `--learner.no-double` too."""
+    tokens = sys.argv[1:] if args is None else args
+    names = {token[2:].partition("=")[0].replace("-", "_") for token in tokens if token.startswith("--")}
+    return names | {name.replace(".no_", ".") for name in names}
+
+
+def _problem(event: tyro_errors.ParseErrorEvent, known: Sequence[str]) -> str:
+    """What is wrong, in one line."""
+    match event:
+        case tyro_errors.UnrecognizedArgs(tokens=[first, *_]):
+            near = get_close_matches(first.partition("=")[0].replace("_", "-"), known, n=1)
+            return f"{first}: unknown{f'; perhaps {near[0]}' if near else ''}; --help lists what there is"
+        case tyro_errors.InvalidChoice(argument=argument, value=value, choices=choices):
+            return f"{argument.display_name()} {value}: allowed: {', '.join(choices)}"
+        case tyro_errors.MissingArgs(missing_arguments=missing):
+            return f"missing: {', '.join(one.arg.display_name() for one in missing)}"
+        case tyro_errors.BadValue(argument=argument):
+            return f"{argument.display_name()}: needs a value"
+        case tyro_errors.InstantiationFailure(message=message, argument=argument):
+            return f"{argument.display_name()}: {message}; allowed: {argument.lowered.metavar}" if argument else message
+    return "the command line can't be read; --help lists what there is"

@@ -1,23 +1,31 @@
-"""The memory that a replay table will need, and whether this machine has it."""
+"""What a run needs of this machine and of the messages between its roles, for the environment that it plays."""
 
 from __future__ import annotations
 
+import math
 import os
+from itertools import pairwise
 
 import numpy as np
 
+from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
 from common.settings.config import RunConfig
 from common.types import EnvSpec
 
 # actions, rewards, terminated, param_version, ids, reuse; three counters of the frame's slot.
 ROW_BYTES = 4 + 4 + 1 + 8 + 8 + 4 + 3 * 4
+HEADER_BYTES = 1 << 20  # of a message, its arrays' alignment included
+
+
+def frame_bytes(spec: EnvSpec) -> int:
+    """Bytes of one stored frame."""
+    return math.prod(spec.frame_shape) * np.dtype(spec.frame_dtype).itemsize
 
 
 def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
     """Memory of a full table whose transitions add one frame each, with the frames' counters and uniform sampling."""
-    frame = int(np.prod(spec.frame_shape)) * np.dtype(spec.frame_dtype).itemsize
-    return capacity * (frame + ROW_BYTES + 2 * 4 * spec.stack)
+    return capacity * (frame_bytes(spec) + ROW_BYTES + 2 * 4 * spec.stack)
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
@@ -34,3 +42,31 @@ def check_memory(config: RunConfig, spec: EnvSpec) -> None:
             f"replay.capacity = {capacity:,}: needs up to {needed / 2**30:.1f} GiB, this machine has "
             f"{present / 2**30:.1f} GiB"
         )
+
+
+def check_messages(config: RunConfig, spec: EnvSpec) -> None:
+    """Raise UsageError for a batch, a segment or parameters that may not fit into one message.
+
+    The frames of a batch's transitions may all differ, stack + 1 for each. A step adds one frame to its segment, and
+    two where an episode ends with it.
+    """
+    row = ROW_BYTES + 2 * 4 * spec.stack
+    room = MAX_PAYLOAD - HEADER_BYTES
+    batch = room // ((spec.stack + 1) * frame_bytes(spec) + row)
+    segment = (room - spec.stack * frame_bytes(spec)) // (2 * frame_bytes(spec) + row)
+    allowed = {
+        "learner.batch_size": (config.learner.batch_size, batch),
+        "actor.segment_steps": (config.actor.segment_steps, segment),
+    }
+    for name, (value, most) in allowed.items():
+        if value > most:
+            shape = "x".join(map(str, spec.frame_shape))
+            raise UsageError(f"{name} = {value}: allowed: at most {most} with {shape} frames of {spec.env_id!r}")
+    if config.network.kind == "mlp":
+        widths = (math.prod(spec.obs_shape), *config.network.hidden, spec.num_actions)
+        parameters = sum((width + 1) * following for width, following in pairwise(widths))
+        if 4 * parameters > room:
+            raise UsageError(
+                f"network.hidden = {list(config.network.hidden)}: {parameters:,} parameters; "
+                f"allowed: at most {room // 4:,}, what a message carries"
+            )

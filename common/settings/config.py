@@ -7,16 +7,22 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
+from common.bounds import (
+    MAX_AHEAD,
+    MAX_BATCH,
+    MAX_GAPS,
+    MAX_LAYERS,
+    MAX_RATIO,
+    MAX_SEGMENT_STEPS,
+    MAX_STREAMS,
+    MAX_TOLERANCE,
+)
 from common.errors import UsageError
 from common.settings.environment import EnvSettings
+from common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
 
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 Method = Literal["dqn", "edql", "g-coop", "coop"]
-Positive = Annotated[int, Field(gt=0)]
-Count = Annotated[int, Field(ge=0)]
-PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 _STRICT = ConfigDict(extra="forbid")
 
@@ -28,7 +34,7 @@ class NetworkSettings:
     __pydantic_config__ = _STRICT
     kind: Literal["mlp", "nature", "nips2013"] = "mlp"
     """mlp: Linear layers with ReLU; nature: 3 conv + 2 linear; nips2013: 2 conv + 2 linear."""
-    hidden: tuple[Positive, ...] = (128, 128, 128)
+    hidden: Annotated[tuple[Positive, ...], Field(max_length=MAX_LAYERS)] = (128, 128, 128)
     """Widths of the hidden layers of the mlp."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """bfloat16: actor processes, targets, and all passes of the gradient methods, with half the bits; parameters and
@@ -40,7 +46,7 @@ class LearnerSettings:
     """The update of the acting network."""
 
     __pydantic_config__ = _STRICT
-    batch_size: Positive = 32
+    batch_size: Annotated[int, Field(gt=0, le=MAX_BATCH)] = 32
     swap_every: Positive = 30
     """C: updates (or plays) between swaps of the acting role, or between copies to the target network."""
     swap_by: Literal["updates", "plays"] = "updates"
@@ -55,21 +61,21 @@ class LearnerSettings:
     """rmsprop is PyTorch's; rmsprop-mnih is centred, with the constant inside the root, beside gradients summed over
     the batch."""
     learning_rate: PositiveFloat = 1e-3
-    learning_rate_final: Annotated[float, Field(gt=0, le=1)] = 1.0
+    learning_rate_final: PositiveShare = 1.0
     """The learning rate falls exponentially to this share of itself over the whole run."""
-    momentum: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    squared_decay: Annotated[float, Field(ge=0, lt=1)] = 0.99
+    momentum: Decay = 0.0
+    squared_decay: Decay = 0.99
     """Decay of the running mean of squared gradients (rmsprop, adam)."""
     denominator: PositiveFloat = 1e-8
     """Constant added to the optimizer's denominator."""
-    weight_decay: tuple[NonNegative, ...] = ()
+    weight_decay: Annotated[tuple[NonNegative, ...], Field(max_length=MAX_LAYERS + 1)] = ()
     """lambda(i) of each layer, input first; one value holds for all layers; none means 0."""
     device: str = "cpu"
     compile: bool = False
     """Run the passes through torch.compile, for GPUs; on a CPU that needs a C++ compiler and gains nothing."""
     threads: Positive = 1
     """CPU threads of torch in the learner."""
-    prefetch: Annotated[int, Field(gt=0, le=256)] = 4
+    prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 4
     """Sample requests under way at once."""
     publish_every: Positive = 10
     """Updates between broadcasts of the acting network; every swap is broadcast too."""
@@ -82,7 +88,7 @@ class EdlSettings:
     __pydantic_config__ = _STRICT
     rate: NonNegative = 0.1
     """s at the first update, the paper's exploration rate; 0 gives the ordinary gradient."""
-    decay: Annotated[float, Field(gt=0, le=1)] = 1.0
+    decay: PositiveShare = 1.0
     """s is multiplied by this every `decay_every` updates."""
     decay_every: Positive = 1000
     noise: Literal["constant", "normal"] = "constant"
@@ -97,13 +103,13 @@ class ReplaySettings:
     """The replay table and its limiter."""
 
     __pydantic_config__ = _STRICT
-    capacity: Positive = 5000
+    capacity: Steps = 5000
     """Exact number of transitions held."""
-    start: Positive = 500
+    start: Steps = 500
     """Transitions to collect before the first update; --total-steps cuts a preset's to a tenth of the run."""
-    ratio: PositiveFloat = 1.0
+    ratio: Annotated[float, Field(gt=0, le=MAX_RATIO)] = 1.0
     """Updates per environment step."""
-    tolerance: PositiveFloat = 64.0
+    tolerance: Annotated[float, Field(gt=0, le=MAX_TOLERANCE)] = 64.0
     """Environment steps that acting and learning may drift apart."""
     eviction: Literal["fifo", "reservoir", "prioritized"] = "fifo"
     sampling: Literal["uniform", "prioritized"] = "uniform"
@@ -125,16 +131,16 @@ class ActorSettings:
     """Acting: exploration and segments."""
 
     __pydantic_config__ = _STRICT
-    envs: Positive = 1
+    envs: Annotated[int, Field(gt=0, le=MAX_STREAMS)] = 1
     """Emulators in one actor process."""
     epsilon_start: Share = 1.0
     epsilon_final: Share = 0.05
     epsilon_decay: Literal["exponential", "linear"] = "exponential"
-    epsilon_steps: Positive = 10_000
+    epsilon_steps: Steps = 10_000
     """Environment steps: time constant of the exponential, length of the linear decay."""
-    segment_steps: Positive = 16
+    segment_steps: Annotated[int, Field(gt=0, le=MAX_SEGMENT_STEPS)] = 16
     """Steps of one emulator that travel together."""
-    window: Positive = 2
+    window: Annotated[int, Field(gt=0, le=MAX_GAPS)] = 2
     """Segments an actor may have under way unacknowledged."""
 
 
@@ -147,13 +153,13 @@ class RunConfig:
     """Name of the run: roles with the same name find each other."""
     method: Method = "coop"
     seed: Count = 0
-    total_steps: Positive = 50_000
+    total_steps: Steps = 50_000
     """Environment steps after which the run is complete."""
     total_updates: Count = 0
     """Stop after this many updates; 0: no limit."""
     total_episodes: Count = 0
     """Stop after this many finished episodes; 0: no limit."""
-    target_return: float | None = None
+    target_return: Annotated[float, Field(allow_inf_nan=False)] | None = None
     """Stop once the mean return of the last 100 episodes reaches this."""
     checkpoint_every: Count = 10_000
     """Updates between epochs, the checkpoints of the whole system; 0: only the closing one."""

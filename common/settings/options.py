@@ -11,6 +11,7 @@ from typing import TypeVar
 from common.errors import UsageError
 from common.process import cli
 from common.settings.config import RunConfig
+from common.settings.sources import base_config
 from common.settings.tables import first_difference, identity, load_tables, resolve, validated
 
 
@@ -88,6 +89,6 @@ def parse_run(kind: type[OptionsT], program: str, description: str) -> OptionsT:
     Raises:
         UsageError: whatever is wrong with them, in one line.
     """
-    base = cli.base_config()
+    base = base_config()
     default = kind(**{field.name: getattr(base, field.name) for field in fields(RunConfig)})
     return cli.parse(kind, program, description, default)

@@ -14,13 +14,15 @@ import tomli_w
 
 from common.errors import UsageError
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+from common.settings.rules import check_rules
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
 
 
 def preset_names() -> list[str]:
     """The presets that come with the package."""
-    return sorted(entry.name.removesuffix(".toml") for entry in files("common.settings").joinpath("presets").iterdir())
+    entries = files("common.settings").joinpath("presets").iterdir()
+    return sorted(entry.name.removesuffix(".toml") for entry in entries if entry.is_file())
 
 
 def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
@@ -36,7 +38,31 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
             raise UsageError(f"--config {path}: {error}") from error
     if preset not in preset_names():
         raise UsageError(f"--preset {preset}: unknown; allowed: {', '.join(preset_names())}")
-    return tomllib.loads(files("common.settings").joinpath("presets", f"{preset}.toml").read_text(encoding="utf-8"))
+    return _preset(f"{preset}.toml")
+
+
+def _preset(*place: str) -> dict[str, Any]:
+    """A file under presets/, laid over the one in presets/bases/ that it extends."""
+    tables = tomllib.loads(files("common.settings").joinpath("presets", *place).read_text(encoding="utf-8"))
+    base = tables.pop("extends", None)
+    return tables if base is None else merged(_preset("bases", f"{base}.toml"), tables)
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `over`, table by table.
+
+    Raises:
+        UsageError: a value stands in a table's place.
+    """
+    result = dict(base)
+    for key, value in over.items():
+        if isinstance(result.get(key), Mapping):
+            if not isinstance(value, Mapping):
+                raise UsageError(f"{key} = {value!r}: must be a table")
+            result[key] = merged(result[key], value)
+        else:
+            result[key] = value
+    return result
 
 
 def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
@@ -82,13 +108,7 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
         config = _ADAPTER.validate_python(asdict(tables) if isinstance(tables, RunConfig) else tables)
     except pydantic.ValidationError as error:
         raise UsageError(first_problem(error, RunConfig())) from error
-    replay = config.replay
-    if replay.start > replay.capacity:
-        raise UsageError(f"replay.start = {replay.start}: must not exceed replay.capacity = {replay.capacity}")
-    if replay.journal_keep and not replay.journal:
-        raise UsageError("replay.journal_keep = True: needs replay.journal = True")
-    if replay.start > config.total_steps:
-        raise UsageError(f"replay.start = {replay.start}: must not exceed total_steps = {config.total_steps}")
+    check_rules(config)
     return config
 
 

@@ -18,9 +18,10 @@ from pydantic import ConfigDict, Field
 
 from common.envs.make import env_spec
 from common.errors import UsageError
-from common.settings.config import Count, Method, Positive, RunConfig, check_distributed
+from common.settings.config import Method, RunConfig, check_distributed
 from common.settings.environment import EnvSettings
-from common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
+from common.settings.fields import Count, Positive
+from common.settings.tables import first_problem, load_tables, merged, resolve, shortened, to_tables, validated
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 
@@ -87,7 +88,7 @@ def load_grid(name: str, quick: bool = False) -> Grid:
         if quick:
             if not isinstance(small, dict):
                 raise UsageError("--quick: it has no table [quick]")
-            tables = _merged(tables, small)
+            tables = merged(tables, small)
         try:
             file = pydantic.TypeAdapter(GridFile).validate_python(tables)
         except pydantic.ValidationError as error:
@@ -105,19 +106,6 @@ def _text(name: str) -> str:
     if not name.endswith(".toml"):
         raise UsageError(f"unknown; give a .toml file or one of {', '.join(shipped_grids())}")
     return Path(name).read_text(encoding="utf-8")
-
-
-def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with the values of `over`, table by table; UsageError where a value stands in a table's place."""
-    merged = dict(base)
-    for key, value in over.items():
-        if isinstance(merged.get(key), Mapping):
-            if not isinstance(value, Mapping):
-                raise UsageError(f"{key} = {value!r}: must be a table")
-            merged[key] = _merged(merged[key], value)
-        else:
-            merged[key] = value
-    return merged
 
 
 def _leaves(tables: Mapping[str, Any], at: FieldPath = ()) -> Iterator[tuple[FieldPath, Any]]:
@@ -147,9 +135,9 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
     for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
         total_steps = dict(zip(axes, values, strict=True)).get(("total_steps",), file.fixed.get("total_steps"))
         fits = type(total_steps) is int and total_steps > 0  # what is not a number of steps is refused below
-        tables = _merged(base(method, total_steps if fits else None), file.fixed)
+        tables = merged(base(method, total_steps if fits else None), file.fixed)
         for path, value in zip(axes, values, strict=True):
-            tables = _merged(tables, _nested(path, value))
+            tables = merged(tables, _nested(path, value))
         parts = [f"{name}={_word(value)}" for name, value in zip(names, values, strict=True)]
         config = validated({**tables, "method": method, "seed": seed})
         cells.append(Cell("-".join([method, *parts, f"seed={seed}"]), config))

@@ -1,0 +1,37 @@
+"""Rules between the fields of a config; what single fields may hold is said by their types."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from common.bounds import MAX_PRIORITIES
+from common.errors import UsageError
+from common.settings.config import RunConfig
+
+
+def check_rules(config: RunConfig) -> None:
+    """Raise UsageError for the first rule that the config breaks: the field, its value and what is allowed."""
+    if problem := next(_problems(config), None):
+        raise UsageError(problem)
+
+
+def _problems(config: RunConfig) -> Iterator[str]:
+    replay, learner = config.replay, config.learner
+    for name, most in (("replay.capacity", replay.capacity), ("total_steps", config.total_steps)):
+        if replay.start > most:
+            yield f"replay.start = {replay.start}: must not exceed {name} = {most}"
+    if config.planned_updates < 1:
+        least = replay.start + math.floor(0.5 / replay.ratio) + 1
+        yield (
+            f"total_steps = {config.total_steps}: plans no update; allowed: at least {least} "
+            f"with replay.start = {replay.start} and replay.ratio = {replay.ratio:g}"
+        )
+    if replay.journal_keep and not replay.journal:
+        yield "replay.journal_keep = True: needs replay.journal = True"
+    if replay.prioritized and learner.batch_size * learner.prefetch > MAX_PRIORITIES:
+        most = MAX_PRIORITIES // learner.prefetch
+        yield (
+            f"learner.batch_size = {learner.batch_size}: allowed: at most {most} "
+            f"with learner.prefetch = {learner.prefetch} and a prioritized table"
+        )
