@@ -7,7 +7,7 @@ READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: run test check fuzz netns soak chaos
+.PHONY: run test check results fuzz netns soak chaos
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -20,6 +20,10 @@ check: $(READY)
 	@$(BIN)/ruff format --check . > $(VENV)/format.log 2>&1 || { cat $(VENV)/format.log; exit 1; }
 	@$(BIN)/mypy --no-error-summary
 	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.log || { cat $(VENV)/lint-imports.log; exit 1; }
+
+# Every figure and table of results/, from the packed studies there.
+results: $(READY)
+	@for study in results/cartpole/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
 
 # Checks that take longer; docs/robustness.md says what each shows.
 fuzz: $(READY)

@@ -1,15 +1,14 @@
-"""Do two folders of runs learn alike? `python benchmarks/agreement.py FOLDER FOLDER`.
+"""Do two studies learn alike? `python benchmarks/agreement.py STUDY STUDY`, each a folder of runs or a packed study.
 
-For every method, both folders' returns against environment steps: the mean over runs (sd over runs) of the episodes
+For every method, both studies' returns against environment steps: the mean over runs (sd over runs) of the episodes
 that ended in each tenth of the run. Then the area under each run's curve, and the share of all ways to deal the runs
 into two groups of these sizes in which the mean areas are at least as far apart (a permutation test): a small share
-says that the folders differ by more than seeds do.
+says that the studies differ by more than seeds do.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import tomllib
 from pathlib import Path
@@ -17,20 +16,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.report.packed import CONFIG, EPISODES
+from experiments.report.sources import open_source
+
 PARTS = 10
 
 Curves = NDArray[np.float64]
 
 
 def curves(folder: Path) -> dict[str, Curves]:
-    """By method, mean returns float64 [runs, PARTS] of the runs in a folder."""
+    """By method, mean returns float64 [runs, PARTS] of the runs in a folder or a packed study."""
     found: dict[str, list[list[float]]] = {}
-    for path in sorted(folder.glob("*/episodes.csv")):
-        config = tomllib.loads((path.parent / "config.toml").read_text(encoding="utf-8"))
-        with path.open(newline="", encoding="utf-8") as lines:
-            rows = [(int(row["env_step"]), float(row["return"])) for row in csv.DictReader(lines)]
-        steps, returns = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-        part = np.minimum((steps - 1) * PARTS // config["total_steps"], PARTS - 1)
+    source = open_source(folder)
+    for run in source.names:
+        config = tomllib.loads(source.text(run, CONFIG) or "")
+        steps, returns = np.array([*source.columns(run, EPISODES, ("env_step", "return")).values()], np.float64)
+        part = np.minimum((steps.astype(int) - 1) * PARTS // config["total_steps"], PARTS - 1)
         found.setdefault(config["method"], []).append([float(returns[part == i].mean()) for i in range(PARTS)])
     return {method: np.array(runs) for method, runs in found.items()}
 

@@ -14,10 +14,11 @@ import pytest
 from rliable import metrics
 
 from common.errors import RunError, UsageError
+from common.returns import running_mean
 from experiments.lockstep import Lockstep
 from experiments.report import cli
 from experiments.report.figures import figures
-from experiments.report.measures import breaking_point, improvement, iqm_by_task, running_mean
+from experiments.report.measures import breaking_point, improvement, iqm_by_task
 from experiments.report.paper import table_1
 from experiments.report.results import breaking_table
 from experiments.report.study import load_study

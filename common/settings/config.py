@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import ConfigDict, Field
 
@@ -23,6 +23,7 @@ from common.settings.fields import Count, Decay, NonNegative, Positive, Positive
 
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 Method = Literal["dqn", "edql", "g-coop", "coop"]
+METHODS: tuple[Method, ...] = get_args(Method)  # in the order of the paper's table
 
 _STRICT = ConfigDict(extra="forbid")
 

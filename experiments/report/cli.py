@@ -1,4 +1,4 @@
-"""`coop-report`: the figures, tables and page of a folder of runs."""
+"""`coop-report`: the figures, tables and page of a study; packing it into one file, and unpacking."""
 
 from __future__ import annotations
 
@@ -19,9 +19,13 @@ class ReportOptions:
     """Flags of `coop-report`."""
 
     runs: Annotated[Positional[Path], tyro.conf.arg(metavar="RUNS")]
-    """A sweep's folder, or any folder of run directories."""
+    """A sweep's folder, any folder of run directories, or a file that --pack has made."""
     out: Path | None = None
-    """Folder of the report; RUNS/report if not given."""
+    """Folder of the report; RUNS/report if not given, without the ending where RUNS is a file."""
+    pack: Path | None = None
+    """Instead of a report: write the folder's runs into this one Parquet file."""
+    unpack: Path | None = None
+    """Instead of a report: write the runs of a packed file into this new folder, as they were."""
 
 
 def main() -> None:
@@ -30,11 +34,22 @@ def main() -> None:
 
 
 def _run() -> None:
-    options = parse(ReportOptions, "coop-report", "Make one page, figures and tables of a folder of runs.")
-    if not options.runs.is_dir():
-        raise UsageError(f"{options.runs}: no such folder")
+    options = parse(ReportOptions, "coop-report", "Make one page, figures and tables of a study, or pack its runs.")
+    runs = options.runs
+    if not runs.exists():
+        raise UsageError(f"{runs}: no such folder or file")
     # Imported once the flags are known to be right: the statistics' libraries take seconds.
-    from experiments.report.writer import write_report  # noqa: PLC0415
+    if options.pack is not None:
+        from experiments.report.packed import pack  # noqa: PLC0415
 
-    index, tables = write_report(options.runs, options.out or options.runs / "report")
-    print(tables[0].markdown(), index, sep="\n")
+        print(pack(runs, options.pack))
+    elif options.unpack is not None:
+        from experiments.report.packed import unpack  # noqa: PLC0415
+
+        print(unpack(runs, options.unpack))
+    else:
+        from experiments.report.writer import write_report  # noqa: PLC0415
+
+        beside = runs if runs.is_dir() else runs.with_suffix("")
+        index, tables = write_report(runs, options.out or beside / "report")
+        print(tables[0].markdown(), index, sep="\n")

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from common.returns import running_mean
 from experiments.report.measures import (
     Interval,
     by_episodes,
@@ -17,7 +18,6 @@ from experiments.report.measures import (
     iqm_overall,
     profiles,
     q_gaps,
-    running_mean,
 )
 from experiments.report.plots import Figure, Line, Panel
 from experiments.report.slices import CAPACITY, along, counts, label, matrices, other_settings, pairs

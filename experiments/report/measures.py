@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rliable import library, metrics
 
+from common.returns import RETURN_WINDOW
 from experiments.report.study import Floats, Run
-from experiments.sweep.folder import WINDOW
 
 ENOUGH = 0.95  # of the return at the largest capacity: learning has not broken
 POINTS = 120  # of a curve
@@ -41,20 +41,12 @@ class Breaking(NamedTuple):
 
 def score(run: Run) -> float:
     """Mean return of the last 100 episodes, the paper's measure."""
-    return float(run.returns[-WINDOW:].mean())
+    return float(run.returns[-RETURN_WINDOW:].mean())
 
 
 def spread(run: Run) -> float:
     """Standard deviation of the returns of the last 100 episodes."""
-    return float(run.returns[-WINDOW:].std())
-
-
-def running_mean(returns: Floats) -> Floats:
-    """float64 [episodes]: the mean of each episode's return and up to 99 before it."""
-    total = np.concatenate(([0.0], np.cumsum(returns)))
-    ends = np.arange(1, len(returns) + 1)
-    starts = np.maximum(0, ends - WINDOW)
-    return np.asarray((total[ends] - total[starts]) / (ends - starts))
+    return float(run.returns[-RETURN_WINDOW:].std())
 
 
 def diagnostic(run: Run, name: str) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from common.settings.config import METHODS
 from experiments.report.measures import (
     DIAGNOSTICS,
     breaking_point,
@@ -18,7 +19,7 @@ from experiments.report.measures import (
 )
 from experiments.report.paper import table_1
 from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
-from experiments.report.study import METHODS, Floats, Run, Setting, Study
+from experiments.report.study import Floats, Run, Setting, Study
 from experiments.report.table import ResultTable, Value
 
 

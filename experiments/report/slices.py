@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import pandas as pd
 
 from experiments.report.measures import score
 from experiments.report.study import Floats, Run, Setting, Study
@@ -28,25 +29,21 @@ def along(
 ) -> tuple[list[int], list[Floats]]:
     """The values of one axis at which a method has runs, the other axes fixed, and a measure of the runs at each."""
     place = study.axes.index(axis)
-    found = [
-        (setting[place], np.array([measure(run) for run in study.of(method, setting)]))
-        for setting in study.settings
-        if setting[:place] + setting[place + 1 :] == others
-    ]
-    found = [(value, measured) for value, measured in found if len(measured)]
-    return [value for value, _ in found], [measured for _, measured in found]
+    settings = [s for s in study.settings if s[:place] + s[place + 1 :] == others and study.of(method, s)]
+    measured = [np.array([measure(run) for run in study.of(method, setting)]) for setting in settings]
+    return [setting[place] for setting in settings], measured
 
 
 def matrices(study: Study) -> dict[str, Floats]:
     """Scores float64 [seeds, settings] of each method: settings that all methods have, seeds that all of those have."""
-    settings = [s for s in study.settings if all(study.of(method, s) for method in study.methods)]
-    made = {}
-    for method in study.methods:
-        by_seed = [{run.config.seed: score(run) for run in study.of(method, setting)} for setting in settings]
-        seeds = sorted(set.intersection(*map(set, by_seed))) if by_seed else []
-        if seeds:
-            made[method] = np.array([[scores[seed] for scores in by_seed] for seed in seeds])
-    return made
+    scores = study.frame.assign(score=study.frame["run"].map(score))
+    tables = {
+        method: scores[scores["method"] == method].pivot_table("score", "seed", "setting", aggfunc="last")
+        for method in study.methods
+    }
+    shared = sorted(set.intersection(*(set(table.columns) for table in tables.values())))
+    whole = {method: table.reindex(columns=shared).dropna().to_numpy() for method, table in tables.items()}
+    return {method: matrix for method, matrix in whole.items() if matrix.size}
 
 
 def pairs(methods: Sequence[str]) -> list[tuple[str, str]]:
@@ -56,10 +53,8 @@ def pairs(methods: Sequence[str]) -> list[tuple[str, str]]:
 
 def counts(runs: Sequence[Run]) -> str:
     """How many runs of which seeds: "dqn: 12 runs, seeds 0,1; coop: 6 runs, seeds 0-2"."""
-    by_method: dict[str, list[Run]] = {}
-    for run in runs:
-        by_method.setdefault(run.config.method, []).append(run)
-    return "; ".join(f"{method}: {len(group)} runs, seeds {seeds_of(group)}" for method, group in by_method.items())
+    by_method = pd.Series(runs, dtype=object).groupby([run.config.method for run in runs], sort=False)
+    return "; ".join(f"{method}: {len(group)} runs, seeds {seeds_of(list(group))}" for method, group in by_method)
 
 
 def seeds_of(runs: Sequence[Run]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -12,19 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
-from common.settings.config import RunConfig
+from common.settings.config import METHODS, RunConfig
 from common.settings.tables import identity, load_tables, resolve
-from experiments.sweep.folder import CellFolder
-from experiments.sweep.grid import Grid, load_grid
+from experiments.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
+from experiments.report.sources import Source, open_source
+from experiments.sweep.grid import parse_grid
 
 Floats = NDArray[np.float64]
 Setting = tuple[Any, ...]  # a value for each axis
 
-METHODS = ("dqn", "edql", "g-coop", "coop")
-METRICS = ("env_step", "q_gap", "sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
+SERIES = ("env_step", "q_gap", "sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
 NOT_AXES = {"run", "method", "seed"}
 PRESET = "cartpole"
 
@@ -34,7 +34,7 @@ class Run:
     """One finished run with at least one episode.
 
     end_steps: float64 [episodes], environment steps when each episode ended. returns, s: float64 [episodes].
-    metrics: float64 [rows] of each name of METRICS.
+    metrics: float64 [rows] of each name of SERIES.
     """
 
     name: str
@@ -77,47 +77,52 @@ class Study:
     @cached_property
     def settings(self) -> list[Setting]:
         """Every setting that a run has, in order."""
-        return sorted({place for _, place in self._places}, key=lambda setting: [_order(value) for value in setting])
+        return sorted(set(map(self.setting, self.runs)), key=lambda setting: [_order(value) for value in setting])
+
+    @cached_property
+    def frame(self) -> pd.DataFrame:
+        """A row for each run, by seed: `run`, `method`, `seed` and `setting`, its place in `settings`."""
+        places = {setting: place for place, setting in enumerate(self.settings)}
+        rows = [(run, run.config.method, run.config.seed, places[self.setting(run)]) for run in self.runs]
+        return pd.DataFrame(rows, columns=["run", "method", "seed", "setting"]).sort_values("seed", kind="stable")
 
     def of(self, method: str, setting: Setting) -> list[Run]:
         """The runs of one method at one setting, by seed."""
-        return self._places.get((method, setting), [])
+        return self._groups.get((method, self.settings.index(setting)), []) if setting in self.settings else []
 
     @cached_property
-    def _places(self) -> dict[tuple[str, Setting], list[Run]]:
-        places: dict[tuple[str, Setting], list[Run]] = {}
-        for run in sorted(self.runs, key=lambda run: run.config.seed):
-            places.setdefault((run.config.method, self.setting(run)), []).append(run)
-        return places
+    def _groups(self) -> dict[tuple[str, int], list[Run]]:
+        return {key: list(runs) for key, runs in self.frame.groupby(["method", "setting"])["run"]}
 
     def index(self, axis: str) -> int | None:
         """The place of an axis in a setting; None if the runs do not differ by it."""
         return self.axes.index(axis) if axis in self.axes else None
 
 
-def load_study(folder: Path) -> Study:
-    """Read a sweep's folder, or any folder of run directories.
+def load_study(path: Path) -> Study:
+    """Read a sweep's folder, any folder of run directories, or a packed study.
 
     Raises:
-        UsageError: the folder holds no run.
+        UsageError: it holds no run.
         RunError: no run in it is finished, or a file is torn.
     """
-    grid = load_grid(str(folder / "sweep.toml")) if (folder / "sweep.toml").exists() else None
-    paths = _expected(folder, grid)
-    if not paths:
-        raise UsageError(f"{folder}: holds no run and no sweep.toml")
+    source = open_source(path)
+    grid = None if source.sweep is None else parse_grid(source.sweep, f"{path}/{SWEEP}")
+    names = source.names if grid is None else [cell.name for cell in grid.cells]
+    if not names:
+        raise UsageError(f"{path}: holds no run and no {SWEEP}")
     runs, missing = [], {}
-    for path in paths:
-        state = _state(path)
-        run = None if state else _read(path)
+    for name in names:
+        state = _state(source, name)
+        run = None if state else _read(source, name, path)
         if run is None:
-            missing[path.name] = state
+            missing[name] = state
         elif not len(run.returns):
-            missing[path.name] = "finished without a finished episode"
+            missing[name] = "finished without a finished episode"
         else:
             runs.append(run)
     if not runs:
-        raise RunError(f"{folder}: none of its {len(paths)} runs is finished")
+        raise RunError(f"{path}: none of its {len(names)} runs is finished")
     axes = _axes(runs)
     preset = resolve(load_tables(grid.file.preset if grid else PRESET, None))
     reference = tuple(_nearest(field_of(preset, axis), {field_of(run.config, axis) for run in runs}) for axis in axes)
@@ -132,32 +137,26 @@ def field_of(config: RunConfig, axis: str) -> Any:  # noqa: ANN401 (a value of a
     return value
 
 
-def _expected(folder: Path, grid: Grid | None) -> list[Path]:
-    if grid is not None:
-        return [CellFolder(folder, cell).path for cell in grid.cells]
-    return sorted(path.parent for path in folder.glob("*/config.toml"))
-
-
-def _state(path: Path) -> str:
+def _state(source: Source, run: str) -> str:
     """What is missing of a run; empty if it is finished."""
-    try:
-        outcome = str(json.loads((path / "summary.json").read_text(encoding="utf-8"))["exit"])
-    except FileNotFoundError:
-        return "begun, not finished" if (path / "episodes.csv").exists() else "not begun"
+    summary = source.text(run, SUMMARY)
+    if summary is None:
+        begun = any(source.text(run, file) is not None for file in (CONFIG, EPISODES))
+        return "begun, not finished" if begun else "not begun"
+    outcome = str(json.loads(summary)["exit"])
     return "" if outcome.startswith("complete") else f"begun, not finished: {outcome}"
 
 
-def _read(path: Path) -> Run:
+def _read(source: Source, run: str, path: Path) -> Run:
     try:
-        config = resolve(tomllib.loads((path / "config.toml").read_text(encoding="utf-8")))
-        with (path / "episodes.csv").open(encoding="utf-8") as file:
-            episodes = [(row["env_step"], row["return"], row["s"]) for row in csv.DictReader(file)]
-        rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
-        ends, returns, s = np.array(episodes, np.float64).reshape(-1, 3).T
-        metrics = {name: np.array([row[name] for row in rows], np.float64) for name in METRICS}
+        config = resolve(tomllib.loads(source.text(run, CONFIG) or ""))
+        episodes = source.columns(run, EPISODES, ("env_step", "return", "s"))
+        rows = source.columns(run, METRICS, SERIES)
+        ends, returns, s = (np.array(values, np.float64) for values in episodes.values())
+        metrics = {name: np.array(values, np.float64) for name, values in rows.items()}
     except (OSError, ValueError, KeyError, UsageError) as error:
-        raise RunError(f"{path}: a finished run with a file that can't be read: {error!r}") from error
-    return Run(path.name, config, ends, returns, s, metrics)
+        raise RunError(f"{path / run}: a finished run with a file that can't be read: {error!r}") from error
+    return Run(run, config, ends, returns, s, metrics)
 
 
 def _axes(runs: list[Run]) -> tuple[str, ...]:

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common.errors import UsageError
+from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, resolve, to_toml
 from experiments.sweep.grid import Cell
 
 TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
-WINDOW = 100  # episodes
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class CellFolder:
                 header = file.readline().decode()
                 file.seek(max(len(header), os.fstat(file.fileno()).st_size - TAIL))
                 # The first line of the tail may be half a one, and the last one too.
-                lines = file.read().decode().rpartition("\n")[0].splitlines()[-WINDOW:]
+                lines = file.read().decode().rpartition("\n")[0].splitlines()[-RETURN_WINDOW:]
         except FileNotFoundError:
             return Progress(0, 0.0)
         rows = list(csv.DictReader(io.StringIO("\n".join([header.strip(), *lines]))))

@@ -83,7 +83,16 @@ def load_grid(name: str, quick: bool = False) -> Grid:
         UsageError: the grid can't be right; names the file, the field and what is allowed.
     """
     try:
-        tables = tomllib.loads(_text(name))
+        text = _text(name)
+    except (OSError, UnicodeDecodeError, UsageError) as error:
+        raise UsageError(f"grid {name}: {getattr(error, 'strerror', None) or error}") from error
+    return parse_grid(text, name, quick)
+
+
+def parse_grid(text: str, name: str, quick: bool = False) -> Grid:
+    """Check and expand a grid's TOML; `name` is for errors. Raises UsageError as `load_grid`."""
+    try:
+        tables = tomllib.loads(text)
         small = tables.pop("quick", None)
         if quick:
             if not isinstance(small, dict):
@@ -94,9 +103,7 @@ def load_grid(name: str, quick: bool = False) -> Grid:
         except pydantic.ValidationError as error:
             raise UsageError(first_problem(error, GridFile())) from error
         return Grid(file, _cells(file))
-    except OSError as error:
-        raise UsageError(f"grid {name}: {error.strerror}") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, UsageError) as error:
+    except (tomllib.TOMLDecodeError, UsageError) as error:
         raise UsageError(f"grid {name}: {error}") from error
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learner.records.telemetry import RETURN_WINDOW
+from common.returns import RETURN_WINDOW, running_mean
 
 
 def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
@@ -22,13 +22,9 @@ def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
     from matplotlib import pyplot as plt  # noqa: PLC0415
 
     steps, returns = np.array(rows).T
-    total = np.concatenate(([0.0], np.cumsum(returns)))
-    ends = np.arange(1, len(returns) + 1)
-    starts = np.maximum(0, ends - RETURN_WINDOW)
-    means = (total[ends] - total[starts]) / (ends - starts)
     figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
     axes.plot(steps, returns, ".", markersize=2, alpha=0.35, label="episode")
-    axes.plot(steps, means, linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
+    axes.plot(steps, running_mean(returns), linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
     axes.set(xlabel="environment steps", ylabel="return", title=title)
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)

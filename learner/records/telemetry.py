@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from common.messaging.experience import Drawn
+from common.returns import RETURN_WINDOW
 from common.types import Array, Batch
 from learner.agent import Agent, UpdateResult
 
-RETURN_WINDOW = 100  # episodes
 FIXED_STATES = 256
 
 

@@ -1,0 +1,16 @@
+"""How returns are reported everywhere: over the last 100 episodes, the paper's measure."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+RETURN_WINDOW = 100  # episodes
+
+
+def running_mean(values: ArrayLike, window: int = RETURN_WINDOW) -> NDArray[np.float64]:
+    """float64 [episodes]: the mean of each episode's value and up to `window` - 1 before it."""
+    total = np.concatenate(([0.0], np.cumsum(np.asarray(values, np.float64))))
+    ends = np.arange(1, len(total))
+    starts = np.maximum(0, ends - window)
+    return np.asarray((total[ends] - total[starts]) / (ends - starts))

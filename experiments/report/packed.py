@@ -1,0 +1,187 @@
+"""A study in one Parquet file: a row for each run, from which every file of the run comes back byte for byte.
+
+Columns: `run`, the folder's name; `config.toml` and `summary.json`, their text; and a list for each column of
+`episodes.csv` and `metrics.jsonl`, named like `episodes.csv/return`. The schema's metadata hold `sweep.toml`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from common.errors import RunError, UsageError
+from common.process.files import write_whole
+from experiments.report.columns import (
+    Columns,
+    csv_columns,
+    csv_text,
+    csv_type,
+    decimal,
+    json_columns,
+    json_text,
+    json_type,
+)
+
+SWEEP, CONFIG, SUMMARY, EPISODES, METRICS = "sweep.toml", "config.toml", "summary.json", "episodes.csv", "metrics.jsonl"
+TEXTS = (CONFIG, SUMMARY)
+FILES = (*TEXTS, EPISODES, METRICS)
+READ: Mapping[str, Callable[[str], Columns]] = {EPISODES: csv_columns, METRICS: json_columns}
+TYPE: Mapping[str, Callable[[Sequence[Sequence[Any]]], tuple[pa.DataType, Callable[[Any], Any]]]] = {
+    EPISODES: csv_type,
+    METRICS: json_type,
+}
+JSON = {b"holds": b"json"}
+SMALLEST = 22  # zstd's level
+
+
+class PackedStudy:
+    """Reads a packed study. Raises UsageError where the file is none."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._table = pq.read_table(path)
+            self.names: list[str] = self._table["run"].to_pylist()
+        except (OSError, KeyError, pa.ArrowException) as error:
+            raise UsageError(f"{path}: not a packed study: {str(error).splitlines()[0]}") from error
+        self._rows = {name: row for row, name in enumerate(self.names)}
+        sweep = (self._table.schema.metadata or {}).get(SWEEP.encode())
+        self.sweep = None if sweep is None else sweep.decode()
+
+    def text(self, run: str, file: str) -> str | None:
+        """The content of a run's file; None where it has none."""
+        if run not in self._rows:
+            return None
+        if file in TEXTS:
+            text: str | None = self._value(run, file).as_py()
+            return text
+        columns = {name: value.as_py() for name, value in self._columns(run, file).items()}
+        if not columns:
+            return ""
+        if file == EPISODES:
+            return csv_text(columns)
+        schema = self._table.schema
+        as_json = (name for name in columns if (schema.field(f"{file}/{name}").metadata or {}).items() >= JSON.items())
+        return json_text(columns, frozenset(as_json))
+
+    def columns(self, run: str, file: str, wanted: Sequence[str]) -> Columns:
+        """Some columns of a run's episodes or metrics. Raises KeyError where it lacks one."""
+        columns = self._columns(run, file)
+        if not columns:
+            return {name: [] for name in wanted}
+        read = decimal if file == EPISODES else list
+        return {name: read(columns[name].as_py()) for name in wanted}
+
+    def _columns(self, run: str, file: str) -> dict[str, pa.Scalar]:
+        start = f"{file}/"
+        values = {name: self._value(run, name) for name in self._table.column_names if name.startswith(start)}
+        return {name.removeprefix(start): value for name, value in values.items() if value.is_valid}
+
+    def _value(self, run: str, column: str) -> pa.Scalar:
+        return self._table[column][self._rows[run]]
+
+
+def pack(folder: Path, path: Path) -> str:
+    """Write the runs of a folder, and its sweep.toml, into one file; what was done, in words.
+
+    An empty file comes back as an empty one, and so does a run's missing table. Raises:
+        RunError: a file is torn, or would not come back byte for byte.
+        UsageError: the folder holds no run, or the file can't be written.
+    """
+    runs = sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
+    if not runs:
+        raise UsageError(f"{folder}: no folder with runs to pack")
+    files = {run: {file: _file(folder / run / file) for file in FILES} for run in runs}
+    fields: list[tuple[pa.Field, pa.Array]] = [(pa.field("run", pa.string()), pa.array(runs, pa.string()))]
+    for file in TEXTS:
+        fields.append((pa.field(file, pa.string()), pa.array([files[run][file] for run in runs], pa.string())))
+    for file in READ:
+        fields += _lists(file, [_read(folder / run / file, files[run][file]) for run in runs])
+    sweep = _file(folder / SWEEP)
+    schema = pa.schema([field for field, _ in fields], None if sweep is None else {SWEEP: sweep})
+    part = path.with_name(f"{path.name}.part")
+    try:
+        _write(pa.table([array for _, array in fields], schema=schema), part)
+        _check(PackedStudy(part), folder, files)
+        part.replace(path)
+    except OSError as error:
+        raise UsageError(f"--pack {path}: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    held = sum(len(text.encode()) for run in runs for text in files[run].values() if text)
+    return f"{path}: {len(runs)} runs, {held:,} bytes in {path.stat().st_size:,}"
+
+
+def unpack(path: Path, folder: Path) -> str:
+    """Write the files of a packed study as they were; what was done, in words.
+
+    Raises UsageError where the file is none, or the folder is there already or can't be written.
+    """
+    packed = PackedStudy(path)
+    try:
+        folder.mkdir(parents=True)
+        if packed.sweep is not None:
+            write_whole(folder / SWEEP, packed.sweep.encode())
+        for run in packed.names:
+            (folder / run).mkdir()
+            for file in FILES:
+                text = packed.text(run, file)
+                if text is not None:
+                    write_whole(folder / run / file, text.encode())
+    except OSError as error:
+        raise UsageError(f"--unpack {folder}: {error.strerror}") from error
+    return f"{folder}: {len(packed.names)} runs"
+
+
+def _check(packed: PackedStudy, folder: Path, files: Mapping[str, Mapping[str, str | None]]) -> None:
+    for run, texts in files.items():
+        for file, text in texts.items():
+            if (packed.text(run, file) or "") != (text or ""):
+                raise RunError(f"{folder / run / file}: would not come back byte for byte; nothing is packed")
+
+
+def _file(path: Path) -> str | None:
+    try:
+        return path.read_bytes().decode()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{path}: can't be read: {error}") from error
+
+
+def _read(path: Path, text: str | None) -> Columns:
+    try:
+        return READ[path.name](text) if text else {}
+    except ValueError as error:
+        raise RunError(f"{path}: a torn line; does the run go on? {error}") from error
+
+
+def _lists(file: str, runs: Sequence[Columns]) -> list[tuple[pa.Field, pa.Array]]:
+    """Each column of a file, as one list a run; null where the run does not have it."""
+    made = []
+    for name in dict.fromkeys(name for run in runs for name in run):
+        kind, convert = TYPE[file]([run[name] for run in runs if name in run])
+        lists = [[None if v is None else convert(v) for v in run[name]] if name in run else None for run in runs]
+        metadata = JSON if file == METRICS and kind == pa.string() else None
+        kind = pa.list_(kind)
+        made.append((pa.field(f"{file}/{name}", kind, metadata=metadata), pa.array(lists, kind)))
+    return made
+
+
+def _write(table: pa.Table, path: Path) -> None:
+    encodings, texts = {}, []
+    for field in table.schema:
+        leaf = f"{field.name}.list.element" if pa.types.is_list(field.type) else field.name
+        kind = field.type.value_type if pa.types.is_list(field.type) else field.type
+        if pa.types.is_string(kind):
+            texts.append(leaf)
+        else:
+            encodings[leaf] = "DELTA_BINARY_PACKED" if pa.types.is_integer(kind) else "BYTE_STREAM_SPLIT"
+    with path.open("wb") as file:
+        pq.write_table(
+            table, file, compression="zstd", compression_level=SMALLEST, use_dictionary=texts,
+            column_encoding=encodings, write_statistics=False, data_page_size=1 << 30,
+        )  # fmt: skip

@@ -1,0 +1,121 @@
+"""Packed studies: every file comes back byte for byte, and a report of the file is the report of the folder."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from common.errors import RunError, UsageError
+from experiments.report import cli
+from experiments.report.packed import FILES, PackedStudy, pack, unpack
+from experiments.report.writer import write_report
+
+CONFIG = 'method = "{method}"\nseed = {seed}\ntotal_steps = 4000\n'
+HEADER = "episode,env_step,actor,return,epsilon,s\n"
+ROW = {
+    "env_step": 128, "q_gap": 0.1, "sample_age_mean": 3.25, "sample_age_p95": 1e300, "reuse_mean": 0.1,
+    "evicted_unsampled": 0.0,
+}  # fmt: skip
+
+
+def write(run: Path, files: dict[str, str]) -> None:
+    run.mkdir(parents=True)
+    for name, text in files.items():
+        (run / name).write_text(text)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Runs that differ in what they left: whole ones, one too short for metrics, one begun, one of a newer version."""
+    for seed in range(2):
+        episodes = "".join(f"{n},{20 * n + 9},{n % 3:x}a,{n * 1.5:g},0.725354,{0.1 * 0.9**n:.6g}\n" for n in range(19))
+        rows = [{**ROW, "env_step": 100 * n, "q_gap": 0.1 * n} for n in range(1, 4)]
+        lines = "".join(json.dumps(row) + "\n" for row in rows)
+        write(
+            tmp_path / "study" / f"dqn-seed={seed}",
+            {
+                "config.toml": CONFIG.format(method="dqn", seed=seed),
+                "summary.json": '{\n  "exit": "complete"\n}\n',
+                "episodes.csv": HEADER + episodes,
+                "metrics.jsonl": lines,
+            },
+        )
+    write(
+        tmp_path / "study" / "dqn-seed=2",
+        {
+            "config.toml": CONFIG.format(method="dqn", seed=2),
+            "summary.json": '{"exit": "complete"}',
+            "episodes.csv": HEADER + "0,5,0,1e+06,nan,-inf\n",
+            "metrics.jsonl": "",
+        },
+    )
+    newer = {**ROW, "q_gap": float("nan"), "reuse": [1, 2.5], "note": None, "big": 2**70}
+    write(
+        tmp_path / "study" / "dqn-seed=3",
+        {
+            "config.toml": CONFIG.format(method="dqn", seed=3),
+            "summary.json": '{"exit": "interrupted by SIGINT"}',
+            "episodes.csv": HEADER,
+            "metrics.jsonl": json.dumps({key: value for key, value in newer.items() if key != "note"}) + "\n",
+        },
+    )
+    write(tmp_path / "study" / "dqn-seed=4", {"config.toml": CONFIG.format(method="dqn", seed=4)})
+    (tmp_path / "study" / "sweep.toml").write_text('methods = ["dqn"]\nseeds = [0, 1, 2, 3, 4, 5]\n')
+    return tmp_path / "study"
+
+
+def test_every_file_comes_back(folder: Path, tmp_path: Path) -> None:
+    told = pack(folder, tmp_path / "study.parquet")
+    assert told.startswith(f"{tmp_path}/study.parquet: 5 runs, ")
+    unpack(tmp_path / "study.parquet", tmp_path / "again")
+    assert (tmp_path / "again" / "sweep.toml").read_bytes() == (folder / "sweep.toml").read_bytes()
+    for run in folder.glob("*/"):
+        for name in FILES:
+            held, back = run / name, tmp_path / "again" / run.name / name
+            assert (back.read_bytes() if back.exists() else b"") == (held.read_bytes() if held.exists() else b""), back
+    assert PackedStudy(tmp_path / "study.parquet").columns("dqn-seed=0", "episodes.csv", ("return", "actor"))[
+        "return"
+    ] == [1.5 * n for n in range(19)]
+
+
+def test_the_report_is_the_same(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_report(folder, tmp_path / "from-folder")
+    monkeypatch.setattr("sys.argv", ["coop-report", str(folder), "--pack", str(tmp_path / "study.parquet")])
+    cli.main()
+    monkeypatch.setattr("sys.argv", ["coop-report", str(tmp_path / "study.parquet")])
+    cli.main()
+    made = sorted(path.name for path in (tmp_path / "from-folder").iterdir())
+    assert made == sorted(path.name for path in (folder / "report").iterdir())
+    for name in made:
+        ours, theirs = (folder / "report" / name).read_bytes(), (tmp_path / "from-folder" / name).read_bytes()
+        assert ours.replace(b"study.parquet", b"study") == theirs, name
+    assert b"dqn-seed=4: begun, not finished" in (folder / "report" / "index.html").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("episodes.csv", HEADER + "0,5", "episodes.csv: a torn line; does the run go on?"),
+        ("metrics.jsonl", '{"env_step": 1}\n{"env', "metrics.jsonl: a torn line; does the run go on?"),
+        ("metrics.jsonl", '{"env_step":1}\n', "metrics.jsonl: would not come back byte for byte; nothing is packed"),
+        ("episodes.csv", HEADER + "0,5,0,1,1,1", "episodes.csv: would not come back byte for byte; nothing is packed"),
+    ],
+)
+def test_what_would_not_come_back_is_not_packed(name: str, text: str, words: str, folder: Path, tmp_path: Path) -> None:
+    (folder / "dqn-seed=1" / name).write_text(text)
+    with pytest.raises(RunError) as caught:
+        pack(folder, tmp_path / "study.parquet")
+    assert f"{folder}/dqn-seed=1/{words}" in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["study"]
+
+
+def test_what_cannot_be_packed_or_unpacked(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no folder with runs to pack"):
+        pack(tmp_path, tmp_path / "a.parquet")
+    with pytest.raises(UsageError, match=r"--pack .*none/a.parquet: No such file"):
+        pack(folder, tmp_path / "none" / "a.parquet")
+    with pytest.raises(UsageError, match=r"sweep.toml: not a packed study: "):
+        write_report(folder / "sweep.toml", tmp_path / "out")
+    pack(folder, tmp_path / "a.parquet")
+    with pytest.raises(UsageError, match=r"--unpack .*: File exists"):
+        unpack(tmp_path / "a.parquet", folder)
