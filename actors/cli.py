@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+import zenoh
 
 from actors.policy import Policy
 from actors.service import ActorService
@@ -13,6 +15,7 @@ from common.envs.make import make_vector_env
 from common.errors import JoinError, PeerLost
 from common.messaging.joining import Membership, join
 from common.messaging.messages import Join, Joined
+from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.networks.network import FlatNetwork, build_network
 from common.process import cli
@@ -42,34 +45,39 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     incarnation = new_incarnation()
-    request = Join("actor", incarnation, [])
-    joined = _join(options, stop, request)
-    if joined is None:
-        return
+    session = open_session((), options.connect, options.zenoh_config, options.shared_memory)
+    with Node(session, options.run, "actor", incarnation) as node:
+        node.follow_stop(stop)
+        request = Join("actor", incarnation, [])
+        joined = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
+        if joined is not None:
+            _play(node, stop, options, request, joined)
+    if stop.failed:
+        raise PeerLost(stop.reason)
+
+
+def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined) -> None:
+    """Play until the stop; raises JoinError where this process plays or computes something else than the learner."""
     config = joined.config
+    # A number is given once in a run, also across restarts of any role: no two processes play the same seeds.
     seed = np.random.SeedSequence([config.seed, 3, joined.index])
     env_seed, policy_seed = seed.spawn(2)
     env = make_vector_env(config.env, options.envs or config.actor.envs, int(env_seed.generate_state(1)[0]))
     policy = Policy(_networks(joined), joined.spec, np.random.default_rng(policy_seed))
     if env.spec != joined.spec:
         raise JoinError(f"environment here {env.spec}, the learner's {joined.spec}")
-    endpoints = (*options.connect, *joined.replay_endpoints)
-    session = open_session((), endpoints, options.zenoh_config, options.shared_memory)
-    with Node(session, options.run, "actor", incarnation) as node:
-        node.follow_stop(stop)
-        membership = Membership(node, stop, request, joined, options.connect, options.patience)
-        ActorService(node, stop, config.actor, env, policy, incarnation).run()
-        membership.close()
+
+    def open_route(endpoints: Sequence[str]) -> zenoh.Session:
+        return open_session((), (*options.connect, *endpoints), options.zenoh_config, options.shared_memory)
+
+    with ReplayRoute(options.run, request.incarnation, open_route, joined.replay_endpoints) as route:
+
+        def learned(answer: Joined, _: float) -> None:
+            route.follow(answer.replay_endpoints)
+
+        with Membership(node, stop, request, joined, options.patience, learned, urgent=lambda: not route.is_up):
+            ActorService(node, route, stop, config.actor, env, policy, request.incarnation).run()
     env.close()
-    if stop.failed:
-        raise PeerLost(stop.reason)
-
-
-def _join(options: ActorOptions, stop: Stop, request: Join) -> Joined | None:
-    """Ask over a session of its own: where the replay service is to be reached is part of the answer."""
-    session = open_session((), options.connect, options.zenoh_config)
-    with Node(session, options.run, "joining", request.incarnation) as node:
-        return join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
 
 
 def _networks(joined: Joined) -> tuple[FlatNetwork, FlatNetwork]:

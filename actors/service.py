@@ -13,6 +13,7 @@ from actors.segments import EpisodeTracker, SegmentAssembler
 from actors.weights import WeightsFollower
 from common.envs.protocol import Steps, VectorEnv
 from common.messaging.clients import InsertClient
+from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node
 from common.process.lifecycle import Stop
 from common.settings import schedules
@@ -35,7 +36,14 @@ class ActorService:
     """Plays all emulators of one process until the stop."""
 
     def __init__(
-        self, node: Node, stop: Stop, settings: ActorSettings, env: VectorEnv, policy: Policy, incarnation: int
+        self,
+        node: Node,
+        route: ReplayRoute,
+        stop: Stop,
+        settings: ActorSettings,
+        env: VectorEnv,
+        policy: Policy,
+        incarnation: int,
     ) -> None:
         self._node = node
         self._stop = stop
@@ -43,7 +51,7 @@ class ActorService:
         self._env = env
         self._policy = policy
         self._weights = WeightsFollower(node, policy)
-        self._inserts = InsertClient(node, stop, settings.window * env.num_envs, self._tell)
+        self._inserts = InsertClient(route, stop, settings.window * env.num_envs, self._tell)
         self._segments = SegmentAssembler(env.spec, env.num_envs, incarnation, settings.segment_steps)
         self._episodes = EpisodeTracker(env.num_envs)
         self._played: _Played | None = None

@@ -37,6 +37,7 @@ from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
 from learner.broadcast import Broadcaster
 from learner.reception import Reception
+from learner.roster import Roster
 
 EPSILON = 0.1
 RUN = "bench"
@@ -121,7 +122,7 @@ class Topology:
         session = open_session((head,), (replay,))
         self._node = stack.enter_context(Node(session, RUN, "learner", new_incarnation()))
         agent = Agent(config, spec)
-        Reception(self._node, config, spec, agent.networks[0].layout_digest(), 0, lambda: 0)
+        Reception(self._node, config, spec, agent.networks[0].layout_digest(), 0, lambda: 0, Roster())
         Broadcaster(self._node, agent)
         joining = ["--run", RUN, "--connect", head]
         service = command("coop-replay", *joining, "--listen", replay, "--run-dir", str(folder))

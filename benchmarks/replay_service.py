@@ -34,6 +34,7 @@ from common.process.memory import keep_freed_memory
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.tables import validated
 from learner.reception import Reception
+from learner.roster import Roster
 
 BATCH, PREFETCH, STEPS = 32, 4, 32
 CAPACITY = 50_000
@@ -166,7 +167,7 @@ class Bench:
         incarnation = new_incarnation()
         session = open_session((head,), (bare,), shared_memory=shared_memory)
         node = stack.enter_context(Node(session, RUN, "learner", incarnation))
-        Reception(node, CONFIG, ATARI, "", run_id=0, newest_epoch=lambda: 0)
+        Reception(node, CONFIG, ATARI, "", run_id=0, newest_epoch=lambda: 0, roster=Roster())
         flags = ["--run", RUN, "--connect", head, "--listen", replay, "--run-dir", str(folder)]
         service = ChildProcess(
             "replay", command("coop-replay", *flags, *["--shared-memory"] * shared_memory), folder / "log"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 from common.envs.make import env_spec
@@ -17,6 +18,7 @@ from learner.checkpoints import Checkpoints
 from learner.reception import Reception
 from learner.records.epochs import go_back
 from learner.records.run_directory import RunDirectory
+from learner.roster import Roster
 from learner.service import LearnerService
 
 
@@ -59,7 +61,8 @@ def _run() -> None:
         )
         checkpoints = Checkpoints(node, path, samples, config.checkpoint_every, agent.updates)
         run_id = directory.run_id()
-        Reception(node, config, spec, agent.networks[0].layout_digest(), run_id, lambda: checkpoints.newest)
+        roster = Roster(path, time.monotonic())
+        Reception(node, config, spec, agent.networks[0].layout_digest(), run_id, lambda: checkpoints.newest, roster)
         print(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}", flush=True)
         if state is not None:
             print(f"goes on from epoch {agent.updates}", flush=True)

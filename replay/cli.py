@@ -8,6 +8,7 @@ from pathlib import Path
 from common.errors import PeerLost, RunError, UsageError
 from common.messaging.joining import Membership, join
 from common.messaging.messages import Join, Joined
+from common.messaging.presence import LEASE
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process import cli
 from common.process.lifecycle import Stop, run_main
@@ -52,10 +53,13 @@ def _run() -> None:
         joined = join(node, stop, request, options.connect, options.join_timeout)
         if joined is not None:
             service = _service(node, joined, options)
-            service.start()
-            membership = Membership(node, stop, request, joined, options.connect, options.patience)
-            service.run(stop)
-            membership.close()
+
+            def learned(_: Joined, asked: float) -> None:
+                service.confirm(asked + LEASE)
+
+            with Membership(node, stop, request, joined, options.patience, learned):
+                service.start()
+                service.run(stop)
     if stop.failed:
         raise PeerLost(stop.reason)
 
@@ -85,4 +89,4 @@ def _service(node: Node, joined: Joined, options: ReplayOptions) -> ReplayServic
         core.recorder = journal
         epochs = ReplayEpochs(options.run_dir, joined.run_id, journal)
     print(found, flush=True)
-    return ReplayService(node, core, epochs)
+    return ReplayService(node, core, epochs, confirmed=0.0)

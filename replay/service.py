@@ -6,6 +6,7 @@ that the limiter does not admit waits for it, but never longer than `HOLD` secon
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from replay.core import ReplayCore, Wait
 from replay.persistence.epochs import ReplayEpochs
 
 HOLD = 1.0  # seconds
+UNCONFIRMED = "the learner has not confirmed this replay service lately"
 STATUS_EVERY = 0.5  # seconds
 INSERT_QUEUE = 256
 
@@ -45,12 +47,15 @@ class ReplayService:
 
     Args:
         epochs: writes the core's part of epochs; the core may have been restored from one.
+        confirmed: until when this service may acknowledge and draw, on the monotonic clock; for ever if not told.
+            Later, another one may serve: a process that was frozen or cut off does not know.
     """
 
-    def __init__(self, node: Node, core: ReplayCore, epochs: ReplayEpochs) -> None:
+    def __init__(self, node: Node, core: ReplayCore, epochs: ReplayEpochs, confirmed: float = math.inf) -> None:
         self._node = node
         self._core = core
         self._epochs = epochs
+        self._confirmed = confirmed
         self._read_segment = SegmentReader(core.table.spec)
         self._changed = threading.Condition()
         self._inserts = _Gate()
@@ -89,6 +94,12 @@ class ReplayService:
             self._closing = True
             self._changed.notify_all()
         self._epochs.close()
+
+    def confirm(self, until: float) -> None:
+        """Acknowledge and draw until then, see `confirmed`."""
+        with self._changed:
+            self._confirmed = until
+            self._changed.notify_all()
 
     def stats(self) -> ReplayStats:
         """The counters, taken at one moment."""
@@ -135,7 +146,7 @@ class ReplayService:
     def _admit(self, gate: _Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
         """Try, and try again whenever the core has changed, until the gate's deadline."""
         with self._changed:
-            while isinstance(outcome := attempt(), Wait):
+            while isinstance(outcome := self._why_not() or attempt(), Wait):
                 now = time.monotonic()
                 gate.closed_at = gate.closed_at or now
                 left = gate.closed_at + HOLD - now
@@ -145,6 +156,10 @@ class ReplayService:
             gate.closed_at = None
             self._changed.notify_all()
             return outcome
+
+    def _why_not(self) -> Wait | None:
+        """Why this service may neither acknowledge nor draw now; None while it may."""
+        return None if time.monotonic() < self._confirmed else Wait(UNCONFIRMED)
 
     def _stats(self, message: Message) -> bytearray:
         messages.decode_question("stats", message)

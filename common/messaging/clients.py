@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,19 @@ NO_ANSWER = "the replay service does not answer"
 BAD_ANSWER = "the replay service's answer is bad"
 
 
-def replay_key(node: Node, what: str) -> str:
+class Line(Protocol):
+    """What queries to the replay service are sent by: a `Node`, or an actor's `ReplayRoute`."""
+
+    run: str
+
+    def key(self, *parts: str) -> str:
+        """See `Node`."""
+
+    def begin(self, key: str, payload: bytearray, timeout: float) -> Pending:
+        """See `Node`."""
+
+
+def replay_key(node: Line, what: str) -> str:
     """Key of one of the replay service's queryables: insert, sample, stats or snapshot."""
     return node.key("replay", REPLAY_SHARD, what)
 
@@ -70,7 +83,7 @@ class InsertClient:
         waiting: why nothing moves, in words; empty while it does.
     """
 
-    def __init__(self, node: Node, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, node: Line, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
         self.acked = 0
         self.inserted = 0
         self.waiting = ""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, Self
 
 from common.errors import BadMessage, JoinError
 from common.messaging import messages
@@ -16,7 +16,9 @@ from common.process.lifecycle import Stop
 from common.settings.tables import first_difference, identity
 
 RETRY_PAUSE = 0.1  # seconds
-LOOK_EVERY = 0.5  # seconds
+OCCUPIED = 5.0  # seconds that a replay service waits for the end of another one: a dead one is given up sooner
+ASK_EVERY = 0.4  # seconds between a member's questions, where its work depends on the answer
+SELDOM = 5.0  # seconds between those of one to which nothing has happened
 
 
 def join_key(node: Node, role: str) -> str:
@@ -32,23 +34,26 @@ def join(
     need_replay: wait also until the learner knows where the replay service listens.
 
     Raises:
-        JoinError: no learner (or no replay service) within `timeout` seconds, or the learner refused this process.
+        JoinError: no learner (or no replay service) within `timeout` seconds, or the learner refused this process, or
+            another replay service serves the run.
     """
     deadline = time.monotonic() + timeout
-    payload = messages.encode_join(node.run, request)
+    vacant_by: float | None = None
     answered = False
     while not stop.is_set():
         try:
-            joined = messages.decode_joined(node.ask(join_key(node, request.role), payload, timeout=1.0))
+            answer = ask_to_join(node, request)
         except NoAnswer:
-            pass
-        except (Refused, BadMessage) as error:
-            raise JoinError(f"the learner of run {node.run!r} refused: {error}") from error
+            vacant_by = None
         else:
             answered = True
-            if joined.replay_endpoints or not need_replay:
-                return joined
-        if time.monotonic() > deadline:
+            if isinstance(answer, str):
+                vacant_by = vacant_by or time.monotonic() + OCCUPIED
+                if time.monotonic() > vacant_by:
+                    raise JoinError(f"run {node.run!r}: {answer}")
+            elif answer.replay_endpoints or not need_replay:
+                return answer
+        if time.monotonic() > deadline and vacant_by is None:
             where = ", ".join(connect) or "no endpoint (give --connect)"
             missing = "replay service" if answered else "learner"
             text = f"no {missing} of run {node.run!r} found at {where} within {timeout:g} s"
@@ -58,6 +63,20 @@ def join(
     return None
 
 
+def ask_to_join(node: Node, request: Join) -> Joined | str:
+    """Ask the learner once; a string says why it has no place for this process now.
+
+    Raises:
+        NoAnswer: the learner does not answer.
+        JoinError: it refused this process.
+    """
+    try:
+        message = node.ask(join_key(node, request.role), messages.encode_join(node.run, request), timeout=1.0)
+        return messages.decode_retry(message) if message.kind == "retry" else messages.decode_joined(message)
+    except (Refused, BadMessage) as error:
+        raise JoinError(f"the learner of run {node.run!r} refused: {error}") from error
+
+
 def other_runs(node: Node) -> list[str]:
     """Names of the runs whose learners this process is connected to."""
     tokens = node.session.liveliness().get("coop/*/alive/learner/*", timeout=1.0)
@@ -65,49 +84,70 @@ def other_runs(node: Node) -> list[str]:
 
 
 class Membership:
-    """Joins again whenever a learner comes back, in a thread of its own.
+    """Asks the learner again and again for what may have changed, in a thread of its own.
 
-    Stops the process where the learner is another run's, or has been gone for `patience` seconds.
+    Stops the process where the learner is another run's or refuses it, or has been gone for `patience` seconds.
 
     Args:
         request: as this process joined first. joined: the answer that it got then.
+        learned: called with each answer, and with the time at which it was asked for.
+        urgent: tells whether the next answer is waited for; if not, the learner is asked now and then only.
     """
 
     def __init__(
-        self, node: Node, stop: Stop, request: Join, joined: Joined, connect: Sequence[str], patience: float
+        self,
+        node: Node,
+        stop: Stop,
+        request: Join,
+        joined: Joined,
+        patience: float,
+        learned: Callable[[Joined, float], None],
+        urgent: Callable[[], bool] = lambda: True,
     ) -> None:
         self._node = node
         self._stop = stop
         self._request = replace(request, index=joined.index)
         self._joined = joined
-        self._connect = connect
         self._patience = patience
+        self._learned = learned
+        self._urgent = urgent
         self._thread = threading.Thread(target=self._run, name="membership", daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Wait for the thread; the stop must have come."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set("this process ends")  # if nothing else has stopped it
         self._thread.join()
 
     def _run(self) -> None:
-        known: set[str] = set()
-        while not self._stop.wait(LOOK_EVERY):
+        known, asked = self._node.presence.members("learner"), time.monotonic()
+        while not self._stop.wait(ASK_EVERY):
             if self._node.presence.absence("learner") > self._patience:
                 text = f"the learner of run {self._node.run!r} has been gone for {self._patience:g} s"
                 self._stop.set(text, failed=True)
+                return
             there = self._node.presence.members("learner")
-            if there - known:
-                self._join_again()
-            known = there
+            if there - known or self._urgent() or time.monotonic() - asked > SELDOM:
+                asked = time.monotonic()
+                if self._ask(asked):
+                    known = there
 
-    def _join_again(self) -> None:
+    def _ask(self, now: float) -> bool:
+        """Ask the learner once; True if it answered."""
         try:
-            again = join(self._node, self._stop, self._request, self._connect, self._patience)
+            answer = ask_to_join(self._node, self._request)
+            problem = answer if isinstance(answer, str) else difference(self._joined, answer)
+        except NoAnswer:
+            return False
         except JoinError as error:
-            self._stop.set(str(error), failed=True)
-            return
-        if again is not None and (problem := difference(self._joined, again)):
+            problem = str(error)
+        if problem:
             self._stop.set(problem, failed=True)
+        elif isinstance(answer, Joined):
+            self._learned(answer, now)
+        return True
 
 
 def difference(mine: Joined, theirs: Joined) -> str | None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import zenoh
 
 ROLES = ("learner", "replay", "actor")
-LEASE_MS = 1500
+LEASE = 1.5  # seconds of silence after which a link is given up, and the learner's word no longer holds
 FORGOTTEN = 60.0  # seconds after which one that has gone is no longer missed
 
 

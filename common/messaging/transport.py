@@ -21,7 +21,7 @@ from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage, CoopError, RunError, UsageError
 from common.messaging import messages, wire
 from common.messaging.links import never_linger
-from common.messaging.presence import LEASE_MS, Presence
+from common.messaging.presence import LEASE, Presence
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
 
@@ -35,7 +35,7 @@ _QUIET = {
     "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "listen/exit_on_failure": True,
-    "transport/link/tx/lease": LEASE_MS,
+    "transport/link/tx/lease": round(1000 * LEASE),
     "transport/link/rx/buffer_size": 4 << 20,
     "transport/link/rx/max_message_size": MAX_PAYLOAD + (1 << 16),
     "transport/link/tx/queue/size/data": 16,

@@ -1,0 +1,120 @@
+"""Who has joined a run: numbers that are given once, and the one replay service that serves.
+
+Time comes in as an argument. A roster outlives its learner: what it decides is on disk before anybody hears of it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from common.errors import BadMessage, RunError
+from common.messaging.messages import Join
+from common.messaging.presence import LEASE, Origin
+from common.process.files import write_whole
+
+ROSTER = "roster.json"
+
+
+class Occupied(RunError):
+    """Another replay service serves this run, or may still believe that it does."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Entries:
+    """What is on disk.
+
+    actors, replays: how many numbers have been given. serving: incarnation of the replay service that serves, which
+    has the last number; -1 before the first. host, pid: where it runs.
+    """
+
+    actors: int = 0
+    replays: int = 0
+    serving: int = -1
+    host: str = ""
+    pid: int = 0
+
+
+class Roster:
+    """Numbers the members of a run, and admits one replay service at a time; safe for threads.
+
+    A replay service that hears nothing from the learner for `LEASE` seconds stops acknowledging. So once the learner
+    has not confirmed it for that long, and its liveliness token is gone, another one may take over.
+
+    Args:
+        folder: where the roster is kept and found again; nowhere if not given.
+        now: seconds; for all that is known, the replay service admitted last has been confirmed just before.
+
+    Raises:
+        RunError: the file there can't be read.
+    """
+
+    def __init__(self, folder: Path | None = None, now: float = 0.0) -> None:
+        self._path = None if folder is None else folder / ROSTER
+        self._lock = threading.Lock()
+        self._entries = _Entries()
+        self._confirmed = now
+        self._actors: dict[int, int] = {}  # numbers of those that this learner has met, by incarnation
+        try:
+            if self._path is not None and self._path.exists():
+                self._entries = _Entries(**json.loads(self._path.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError) as error:
+            raise RunError(f"{self._path}: {error}") from error
+
+    def actor(self, request: Join) -> int:
+        """The number of an actor: its own one again, or a new one.
+
+        Raises:
+            BadMessage: a number that nobody has been given.
+            RunError: the roster can't be kept.
+        """
+        with self._lock:
+            if request.index >= self._entries.actors:
+                raise BadMessage("fields.index", f"{request.index}; {self._entries.actors} actors have been numbered")
+            if request.index >= 0:
+                self._actors[request.incarnation] = request.index
+            elif request.incarnation not in self._actors:
+                self._keep(replace(self._entries, actors=self._entries.actors + 1))
+                self._actors[request.incarnation] = self._entries.actors - 1
+            return self._actors[request.incarnation]
+
+    def replay(self, request: Join, now: float, there: Collection[int]) -> int:
+        """The number of a replay service, which may serve for another `LEASE` seconds from now on.
+
+        there: incarnations of the replay services whose liveliness tokens are there.
+
+        Raises:
+            Occupied: another one serves, or may still believe that it does.
+            RunError: another one has taken over from this one, or the roster can't be kept.
+        """
+        with self._lock:
+            entries = self._entries
+            if request.incarnation != entries.serving:
+                other = Origin(entries.host, entries.pid)
+                if entries.serving >= 0 and request.index >= 0:
+                    raise RunError(f"the replay service on {other} has taken over from this one")
+                if entries.serving >= 0 and (entries.serving in there or now - self._confirmed < LEASE):
+                    raise Occupied(f"the replay service on {other} serves this run")
+                host, pid = request.origin
+                self._keep(_Entries(entries.actors, entries.replays + 1, request.incarnation, host, pid))
+            self._confirmed = now
+            return self._entries.replays - 1
+
+    def dismiss(self, incarnation: int) -> None:
+        """Note that a replay service acknowledges nothing any more: another one may follow as soon as it is gone."""
+        with self._lock:
+            if incarnation == self._entries.serving:
+                self._confirmed = -math.inf
+
+    def _keep(self, entries: _Entries) -> None:
+        """Go on with these once they are on disk; raises RunError."""
+        if self._path is not None:
+            try:
+                write_whole(self._path, json.dumps(asdict(entries)).encode())
+            except OSError as error:
+                raise RunError(f"{self._path}: {error.strerror or error}") from error
+        self._entries = entries

@@ -1,0 +1,70 @@
+"""Who is given which number, and which replay service serves."""
+
+from pathlib import Path
+
+import pytest
+
+from common.errors import BadMessage, RunError
+from common.messaging.messages import Join
+from common.messaging.presence import LEASE, Origin
+from learner.roster import Occupied, Roster
+
+
+def actor(incarnation: int, index: int = -1) -> Join:
+    return Join("actor", incarnation, [], index)
+
+
+def replay(incarnation: int, index: int = -1) -> Join:
+    return Join("replay", incarnation, ["tcp/h:1"], index, origin=Origin(f"host{incarnation}", incarnation))
+
+
+def test_no_number_is_given_twice_also_after_a_restart_of_the_learner(tmp_path: Path) -> None:
+    roster = Roster(tmp_path)
+    assert [roster.actor(actor(incarnation)) for incarnation in (11, 12, 11)] == [0, 1, 0]
+    again = Roster(tmp_path)
+    assert again.actor(actor(13)) == 2, "a new one, before the old ones have come back"
+    assert again.actor(actor(12, index=1)) == 1, "its own one"
+    assert again.actor(actor(14)) == 3
+    with pytest.raises(BadMessage, match=r"fields.index: 4; 4 actors have been numbered"):
+        again.actor(actor(15, index=4))
+    with pytest.raises(BadMessage, match=r"fields.index"):
+        again.actor(actor(15, index=2**63 - 1))
+    assert again.actor(actor(15)) == 4, "and nobody is locked out"
+
+
+def test_one_replay_service_serves(tmp_path: Path) -> None:
+    roster = Roster(tmp_path, now=100.0)
+    assert roster.replay(replay(1), 100.0, {1}) == 0
+    assert roster.replay(replay(1), 101.0, {1}) == 0, "asks again"
+    with pytest.raises(Occupied, match=r"the replay service on host1 \(pid 1\) serves this run"):
+        roster.replay(replay(2), 200.0, {1, 2})
+    with pytest.raises(Occupied):
+        roster.replay(replay(2), 101.0 + LEASE / 2, {2})  # its token is gone, but it may still believe that it serves
+    assert roster.replay(replay(2), 101.0 + LEASE, {2}) == 1
+    with pytest.raises(RunError, match=r"the replay service on host2 \(pid 2\) has taken over from this one"):
+        roster.replay(replay(1, index=0), 110.0, {1, 2})
+
+
+def test_a_learner_that_comes_back_knows_who_serves(tmp_path: Path) -> None:
+    roster = Roster(tmp_path, now=0.0)
+    roster.replay(replay(1), 0.0, {1})
+    roster.replay(replay(2), 10.0, {2})
+    again = Roster(tmp_path, now=20.0)
+    with pytest.raises(RunError, match="has taken over"):
+        again.replay(replay(1, index=0), 20.1, {1})
+    with pytest.raises(Occupied, match="host2"):
+        again.replay(replay(3), 20.1, {3})
+    assert again.replay(replay(2, index=1), 20.2, {2}) == 1
+    again.dismiss(2)
+    with pytest.raises(Occupied):
+        again.replay(replay(3), 20.3, {2, 3})
+    assert again.replay(replay(3), 20.3, {3}) == 2, "nobody waits for one that has left"
+
+
+def test_a_roster_that_can_t_be_kept_or_read(tmp_path: Path) -> None:
+    roster = Roster(tmp_path / "gone")
+    with pytest.raises(RunError, match=r"roster\.json"):
+        roster.actor(actor(1))
+    (tmp_path / "roster.json").write_text("{}x")
+    with pytest.raises(RunError, match=r"roster\.json"):
+        Roster(tmp_path)

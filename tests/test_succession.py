@@ -1,0 +1,103 @@
+"""One replay service serves a run; whoever takes over from it is found by all, wherever it listens."""
+
+import re
+import signal
+import socket
+import time
+from pathlib import Path
+
+from samples import make_segment
+from test_topology import lines, running, wait_for
+
+from common.messaging import experience, messages
+from common.messaging.clients import InsertClient, replay_key
+from common.messaging.route import ReplayRoute
+from common.messaging.transport import Node, new_incarnation, open_session
+from common.process.lifecycle import Stop
+from common.settings.config import RunConfig
+from common.types import EnvSpec
+from replay.core import ReplayCore
+from replay.persistence.epochs import ReplayEpochs
+from replay.service import ReplayService
+
+
+def test_a_service_that_is_not_confirmed_neither_acknowledges_nor_draws(
+    nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path
+) -> None:
+    server, client = nodes
+    core = ReplayCore(RunConfig(run="test"), spec)
+    service = ReplayService(server, core, ReplayEpochs(tmp_path, 5), confirmed=0.0)
+    service.start()
+    segment = experience.encode_segment("test", make_segment(spec))
+    draw = experience.encode_sample("test", experience.DrawRequest(1, 0, 0, core.batch_size, 0))
+    for question, payload in (("insert", segment), ("sample", draw)):
+        answer = client.ask(replay_key(client, question), payload)
+        assert messages.decode_retry(answer) == "the learner has not confirmed this replay service lately"
+    assert core.table.inserted == 0
+    service.confirm(time.monotonic() + 60)
+    assert messages.decode_ack(client.ask(replay_key(client, "insert"), segment)) == 4
+    service.confirm(time.monotonic() - 1)  # as after a freeze
+    payload = experience.encode_segment("test", make_segment(spec, 1))
+    assert client.ask(replay_key(client, "insert"), payload).kind == "retry"
+    assert core.table.inserted == 4
+
+
+def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_path: Path) -> None:
+    core = ReplayCore(RunConfig(run="test"), spec)
+    at = [f"unixsock-stream/{tmp_path}/{number}.sock" for number in range(2)]
+
+    def serve(endpoint: str) -> Node:
+        node = Node(open_session((endpoint,)), "test", "replay", new_incarnation())
+        ReplayService(node, core, ReplayEpochs(tmp_path, 5)).start()
+        return node
+
+    first = serve(at[0])
+    with ReplayRoute("test", 7, lambda endpoints: open_session((), endpoints), at[:1]) as route:
+        wait_for("the first", lambda: route.is_up)
+        inserts = InsertClient(route, Stop(), window=1)
+        assert inserts.submit(make_segment(spec, 0))
+        assert inserts.drain()
+        first.close()
+        wait_for("the end of the first", lambda: not route.is_up)
+        assert inserts.submit(make_segment(spec, 1)), "under way to nobody"
+        with serve(at[1]):
+            route.follow([])  # as long as the learner knows of no other
+            assert not route.is_up
+            route.follow(at[1:])
+            assert inserts.drain()
+            assert route.is_up
+    assert core.table.inserted == 8
+
+
+def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    path = tmp_path / "run"
+    joining = ("--run", "hand", "--connect", endpoint)
+    learning = ("--run", "hand", "--listen", endpoint, "--total-steps", "10000000", "--run-dir", str(path))
+    metrics = path / "metrics.jsonl"
+    with (
+        running("coop-learner", *learning) as learner,
+        running("coop-replay", *joining, "--run-dir", str(tmp_path / "first")) as first,
+        running("coop-actor", *joining) as actor,
+    ):
+        wait_for("the first metrics", lambda: lines(metrics) >= 1)
+        with running("coop-replay", *joining, "--run-dir", str(tmp_path / "second")) as second:
+            out, err = second.communicate(timeout=60)
+        assert second.returncode == 1
+        host = socket.gethostname()
+        assert f"run 'hand': the replay service on {host} (pid {first.pid}) serves this run\n" in err
+        first.send_signal(signal.SIGSTOP)
+        with running("coop-replay", *joining, "--run-dir", str(tmp_path / "third")) as third:
+            before = lines(metrics)
+            wait_for("metrics with the third", lambda: lines(metrics) > before + 1)
+            first.send_signal(signal.SIGCONT)
+            out, err = first.communicate(timeout=60)
+            assert first.returncode == 1
+            assert re.search(rf"the replay service on {host} \(pid {third.pid}\) has taken over from this one\n$", err)
+            before = lines(metrics)
+            wait_for("more metrics with the third", lambda: lines(metrics) > before + 1)
+            learner.send_signal(signal.SIGINT)
+            for process in (learner, actor, third):
+                process.wait(60)
