@@ -66,7 +66,7 @@ def cut_and_mend(folder: Path, end: str, host: str, far: str, seconds: float) ->
     with (
         running(roles),
         Node(open_session((), AT), RUN, "watch", new_incarnation()) as node,
-        ActorWatch(RUN, AT[1]) as actors,
+        ActorWatch(RUN, AT[0]) as actors,
     ):
         wait_until("every actor at work", lambda: len(actors.acked()) == ACTORS and min(actors.acked().values()) > 0)
         before = replay_stats(node).inserted

@@ -94,13 +94,13 @@ def running(roles: Roles) -> Iterator[Roles]:
 class ActorWatch:
     """Transitions that each actor holds receipts for, by its own word.
 
-    Actors tell learner and replay service; the latter passes on what it is told to its Zenoh clients, like this one.
+    Actors tell the learner, which passes on what it is told to its Zenoh clients, like this one.
     """
 
-    def __init__(self, run: str, replay_at: str) -> None:
+    def __init__(self, run: str, learner_at: str) -> None:
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", json.dumps([replay_at]))
+        config.insert_json5("connect/endpoints", json.dumps([learner_at]))
         config.insert_json5("connect/timeout_ms", "-1")
         self._run = run
         self._session = zenoh.open(config)

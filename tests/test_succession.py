@@ -84,7 +84,7 @@ def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path
     ):
         wait_for("the first metrics", lambda: lines(metrics) >= 1)
         with running("coop-replay", *joining, "--run-dir", str(tmp_path / "second")) as second:
-            out, err = second.communicate(timeout=60)
+            _, err = second.communicate(timeout=60)
         assert second.returncode == 1
         host = socket.gethostname()
         assert f"run 'hand': the replay service on {host} (pid {first.pid}) serves this run\n" in err
@@ -93,7 +93,7 @@ def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path
             before = lines(metrics)
             wait_for("metrics with the third", lambda: lines(metrics) > before + 1)
             first.send_signal(signal.SIGCONT)
-            out, err = first.communicate(timeout=60)
+            _, err = first.communicate(timeout=60)
             assert first.returncode == 1
             assert re.search(rf"the replay service on {host} \(pid {third.pid}\) has taken over from this one\n$", err)
             before = lines(metrics)

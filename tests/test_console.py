@@ -1,0 +1,106 @@
+"""What consoles and displays say of the members of a run, of its progress and of a standstill."""
+
+import re
+
+import pytest
+
+from common.process.console import STANDSTILL, Console, Standstill, counted, progress_line
+from learner.attendance import FORGOTTEN, Attendance
+
+STATUS = {
+    "env_steps": 9964,
+    "total_steps": 1_000_000,
+    "updates_per_s": 247.3,
+    "acting": 2,
+    "return_mean_100": 175.12,
+    "episodes": 133,
+    "connected": {"learner": 1, "replay": 1, "actor": 2},
+    "waiting": "",
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({}, "step 9,964/1,000,000  return 175.1 (last 100 of 133 episodes)  247 updates/s  network 2 acts  "
+             "1 replay service, 2 actors"),
+        ({"episodes": 52, "connected": {"actor": 1}, "waiting": "x"},
+         "step 9,964/1,000,000  return 175.1 (52 episodes)  247 updates/s  network 2 acts  "
+         "0 replay services, 1 actor  [x]"),
+        ({"episodes": 1}, "step 9,964/1,000,000  return 175.1 (1 episode)  247 updates/s  network 2 acts  "
+         "1 replay service, 2 actors"),
+        ({"episodes": 0, "env_steps": 0}, "step 0/1,000,000  no episode has ended yet  247 updates/s  network 2 acts  "
+         "1 replay service, 2 actors"),
+    ],
+)  # fmt: skip
+def test_the_progress_line(changes: dict[str, object], line: str) -> None:
+    assert progress_line({**STATUS, **changes}) == line
+
+
+def test_numbers_with_nouns() -> None:
+    assert [counted(number, "actor") for number in (0, 1, 2, 1000)] == [
+        "0 actors",
+        "1 actor",
+        "2 actors",
+        "1,000 actors",
+    ]
+
+
+def test_members_come_and_go() -> None:
+    events: list[str] = []
+    attendance = Attendance(events.append)
+
+    def told() -> list[str]:
+        new = list(events)
+        events.clear()
+        return new
+
+    attendance.token("replay", 1, True, 0.0)
+    attendance.joined("replay", 1, "replay service on rep (pid 7)", again=False, listens="tcp/rep:1")
+    attendance.joined("replay", 1, "replay service on rep (pid 7)", again=True, listens="tcp/rep:1")  # asks each moment
+    attendance.joined("actor", 2, "actor 0 on act (pid 8)", again=False)
+    assert told() == ["replay service on rep (pid 7) joined; it listens on tcp/rep:1", "actor 0 on act (pid 8) joined"]
+    attendance.token("actor", 2, False, 1.0)
+    attendance.token("actor", 99, False, 1.0)  # one that never joined
+    assert told() == ["actor 0 on act (pid 8) does not answer"]
+    assert attendance.missing(1.0) == ["actor 0 on act (pid 8)"]
+    attendance.token("actor", 2, True, 2.0)
+    assert told() == ["actor 0 on act (pid 8) is back"]
+    assert attendance.missing(2.0) == []
+    attendance.token("actor", 2, False, 3.0)
+    attendance.token("replay", 1, False, 3.0)
+    told()
+    attendance.joined("actor", 3, "actor 1 on act (pid 9)", again=False)
+    assert attendance.missing(3.0) == ["replay service on rep (pid 7)"], "another one has taken the actor's place"
+    assert attendance.missing(3.0 + FORGOTTEN) == []
+    told()
+    attendance.token("actor", 2, True, 4.0)
+    assert told() == ["actor 0 on act (pid 8) is back"], "although another one had taken its place"
+    attendance.leaving("actor", 2)
+    attendance.token("actor", 2, False, 4.0)
+    assert told() == ["actor 0 on act (pid 8) left"]
+    attendance.joined("actor", 2, "actor 0 on act (pid 8)", again=True)
+    assert told() == ["actor 0 on act (pid 8) is back"]
+
+
+def test_a_standstill_is_told_once() -> None:
+    look = Standstill().look
+    assert look(0.0, 5, "r") == ""
+    assert look(STANDSTILL - 0.1, 5, "r") == ""
+    assert look(STANDSTILL, 5, "") == "", "nothing is known to be waited for"
+    assert look(STANDSTILL, 5, "because") == "waiting: because"
+    assert look(STANDSTILL + 9, 5, "because of another reason") == ""
+    assert look(STANDSTILL + 10, 6, "") == "goes on"
+    assert look(STANDSTILL + 10, 7, "") == ""
+    assert look(2 * STANDSTILL + 10, 7, "again") == "waiting: again"
+
+
+def test_events_have_a_time_and_a_number(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console()
+    for number in range(20):
+        console.event(f"event {number}")
+    lines = capsys.readouterr().out.splitlines()
+    assert all(re.fullmatch(r"\d\d:\d\d:\d\d event \d+", line) for line in lines)
+    recent = console.recent()
+    assert [line for _, line in recent] == lines[-len(recent) :]
+    assert [number for number, _ in recent] == sorted({number for number, _ in recent})
