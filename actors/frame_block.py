@@ -19,9 +19,10 @@ class FrameBlock:
     is the last `stack` rows pushed, so only restarts have to be remembered.
     """
 
-    def __init__(self, spec: EnvSpec, num_envs: int, max_steps: int) -> None:
-        self._spec, self._num_envs = spec, num_envs
-        self._capacity = max_steps + 4 * spec.stack  # room for some restarts; grows where that is not enough
+    def __init__(self, spec: EnvSpec, num_envs: int, max_steps: int, history: int = 0) -> None:
+        """history: steps before a round whose observations it may still need."""
+        self._spec, self._num_envs, self._history = spec, num_envs, history
+        self._capacity = history + max_steps + 4 * spec.stack  # room for some restarts; grows where that is too little
         self._allocate()
         # Row numbers, in `_free` and `_pushed`, count through all streams: stream * capacity + row.
         self._free = self._first.copy()
@@ -30,6 +31,7 @@ class FrameBlock:
         self._steps = 0
         self._most = 0  # at least the longest stream's rows, known without looking at arrays
         self._current: Rows = np.zeros((spec.stack, num_envs), np.int32)  # stacks at the start of the round
+        self._past: Rows = np.zeros((num_envs, history, spec.stack), np.int32)  # stacks of the steps before the round
         self._restarts: list[tuple[int, int, list[int]]] = []  # steps before it, stream, rows of the new stack
 
     def push(self, obs: Array) -> None:
@@ -61,27 +63,34 @@ class FrameBlock:
             self._free[stream] = row + 1
             self._restarts.append((self._steps, stream, rows))
 
-    def cut(self) -> tuple[list[Array], Rows, Rows, list[int]]:
-        """End the round and begin the next one with the frames of the current observations.
+    def cut(self, waiting: list[int]) -> tuple[list[Array], Rows, Rows, list[int]]:
+        """End the round; the next one begins with the frames of the current observations.
+
+        waiting: how many of each stream's last steps, at most `history`, will be needed again; their frames stay too.
 
         Returns:
-            frames: a stream's <frame_dtype>[n_frames, *frame_shape]; obs_index, next_index: int32 [envs, steps, stack];
-            carried: how many of each stream's last frames begin its next round.
+            frames: a stream's <frame_dtype>[n_frames, *frame_shape].
+            obs_index: int32 [envs, history + steps, stack], steps before the round included; meaningless for those
+                that did not wait. next_index: int32 [envs, steps, stack].
+            kept: how many of each stream's last frames begin its next round.
         """
-        obs_index, next_index = self._indices()
+        of_round, next_index = self._indices()
+        obs_index = np.concatenate((self._past, of_round), axis=1) if self._history else of_round
         used = self._free - self._first
         frames = [frames[:count] for frames, count in zip(self._frames, used.tolist(), strict=True)]
-        first = obs_index[:, -1, 0]
-        carried: list[int] = (used - first).tolist()
+        current = obs_index.shape[1] - 1
+        first = obs_index[np.arange(self._num_envs), current - np.array(waiting), 0]
+        kept: list[int] = (used - first).tolist()
         self._allocate()
-        for stream, count in enumerate(carried):
+        for stream, count in enumerate(kept):
             self._frames[stream, :count] = frames[stream][-count:]
         self._current = (obs_index[:, -1] - first[:, None]).T
-        self._free = self._first + carried
-        self._most = max(carried)
+        self._past = obs_index[:, current - self._history : current] - first[:, None, None]
+        self._free = self._first + kept
+        self._most = max(kept)
         self._steps = 0
         self._restarts = []
-        return frames, obs_index[:, :-1], next_index, carried
+        return frames, obs_index[:, :-1], next_index, kept
 
     def _indices(self) -> tuple[Rows, Rows]:
         """int32 [envs, steps + 1, stack], what each step starts from and the next one would; [envs, steps, stack]."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.frame_block import FrameBlock
+from actors.returns import n_step_returns
 from common.envs.protocol import Steps
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
 
@@ -16,20 +17,38 @@ from common.types import Array, EnvSpec, EpisodeEnd, Segment
 class SegmentAssembler:
     """Turns the steps of `num_envs` streams into segments; stream i is emulator i. Pure: no I/O, no clock.
 
-    All streams have had equally many steps, so their segments fill together. The arrays of a returned segment are
-    never written again, but those of one round share memory: a segment that is kept keeps the round.
+    Each step begins one transition over `n_step` steps, fewer where its episode ends before. A transition leaves with
+    the segment in which it becomes complete; one that is not waits, through flushes too, so that every transition is
+    exact wherever segments are cut. All streams have had equally many steps, so their segments are cut together. The
+    arrays of a returned segment are never written again, but those of one round share memory: a segment that is kept
+    keeps the round.
     """
 
-    def __init__(self, spec: EnvSpec, num_envs: int, incarnation: int, segment_steps: int) -> None:
+    def __init__(
+        self,
+        spec: EnvSpec,
+        num_envs: int,
+        incarnation: int,
+        segment_steps: int,
+        *,
+        n_step: int = 1,
+        gamma: float = 1.0,
+    ) -> None:
         self._num_envs, self._incarnation, self._length = num_envs, incarnation, segment_steps
-        self._frames = FrameBlock(spec, num_envs, segment_steps)
-        self._actions = np.empty((segment_steps, num_envs), np.int32)
-        self._rewards = np.empty((segment_steps, num_envs), np.float32)
-        self._terminated = np.empty((segment_steps, num_envs), np.bool_)
-        self._versions = np.empty(segment_steps, np.int64)
+        self._n_step, self._gamma = n_step, gamma
+        # Rows of a round's columns: first the steps before it whose transitions may still wait, then its own.
+        self._history = n_step - 1
+        self._frames = FrameBlock(spec, num_envs, segment_steps, self._history)
+        shape = (self._history + segment_steps, num_envs)
+        self._actions = np.zeros(shape, np.int32)
+        self._rewards = np.zeros(shape, np.float32)
+        self._terminated = np.zeros(shape, np.bool_)
+        self._ends = np.ones(shape, np.bool_)  # before the first step there is none to wait
+        self._versions = np.zeros(shape[0], np.int64)
         self._episodes: dict[int, list[EpisodeEnd]] = {}
+        self._waiting = [0] * num_envs  # each stream's steps before this round whose transitions are not complete
         self._carried = [0] * num_envs
-        self._sequence = 0
+        self._sequences = [0] * num_envs
         self._steps = 0
 
     def begin(self, obs: Array) -> None:
@@ -39,54 +58,63 @@ class SegmentAssembler:
     def add(
         self, actions: NDArray[np.int32], steps: Steps, param_version: int, episode_ends: Mapping[int, EpisodeEnd]
     ) -> list[Segment]:
-        """Add one step of every stream; the segments that it filled, one a stream, or none.
+        """Add one step of every stream; where it fills a round, the segments, one a stream with complete transitions.
 
         actions: int32 [envs]. param_version: of the parameters that chose them.
         episode_ends: by stream, the episodes that this step ended; their `step_in_segment` is set here.
         """
-        now = self._steps
+        now = self._history + self._steps
         self._frames.push(steps.next_obs)
         if np.count_nonzero(steps.restarted):
             self._frames.restart(np.flatnonzero(steps.restarted).tolist(), steps.obs)
         self._actions[now] = actions
         self._rewards[now] = steps.rewards
         self._terminated[now] = steps.terminated
+        np.logical_or(steps.terminated, steps.restarted, out=self._ends[now])
         self._versions[now] = param_version
         for stream, end in episode_ends.items():
-            self._episodes.setdefault(stream, []).append(replace(end, step_in_segment=now))
+            place = self._waiting[stream] + self._steps
+            self._episodes.setdefault(stream, []).append(replace(end, step_in_segment=place))
         self._steps += 1
         return self.flush() if self._steps == self._length else []
 
     def flush(self) -> list[Segment]:
-        """Cut every stream here: the segments begun, one a stream, or none if no step was added since the last."""
+        """Cut every stream here: the segments of its complete transitions; none of a stream that has none."""
         steps, self._steps = self._steps, 0
         if not steps:
             return []
-        frames, obs_index, next_index, carried = self._frames.cut()
-        actions, rewards, terminated = (
-            np.array(column[:steps].T, order="C") for column in (self._actions, self._rewards, self._terminated)
-        )
-        versions = self._versions[:steps].copy()
-        segments = [
-            Segment(
-                incarnation=self._incarnation,
-                stream=stream,
-                sequence=self._sequence,
-                frames=frames[stream],
-                obs_index=obs_index[stream],
-                next_index=next_index[stream],
-                actions=actions[stream],
-                rewards=rewards[stream],
-                terminated=terminated[stream],
-                param_version=versions,
-                carried=self._carried[stream],
-                episodes=tuple(self._episodes.get(stream, ())),
-            )
-            for stream in range(self._num_envs)
-        ]
-        self._carried = carried
+        history, end = self._history, self._history + steps
+        last, returns = n_step_returns(self._rewards[:end], self._ends[:end], self._n_step, self._gamma)
+        waiting: list[int] = (last >= end).sum(axis=0).tolist()
+        frames, obs_index, next_index, kept = self._frames.cut(waiting)
+        segments = []
+        for stream in range(self._num_envs):
+            first, stop = history - self._waiting[stream], end - waiting[stream]
+            if first < stop:
+                final = last[first:stop, stream]
+                segments.append(
+                    Segment(
+                        incarnation=self._incarnation,
+                        stream=stream,
+                        sequence=self._sequences[stream],
+                        frames=frames[stream],
+                        obs_index=obs_index[stream, first:stop],
+                        next_index=next_index[stream, final - history],
+                        actions=self._actions[first:stop, stream].copy(),
+                        rewards=returns[first:stop, stream].copy(),
+                        terminated=self._terminated[final, stream],
+                        param_version=self._versions[first:stop].copy(),
+                        span=(final - np.arange(first - 1, stop - 1)).astype(np.uint8),
+                        carried=self._carried[stream],
+                        episodes=tuple(self._episodes.get(stream, ())),
+                    )
+                )
+                self._sequences[stream] += 1
+                self._carried[stream] = kept[stream]
+            self._waiting[stream] = waiting[stream]
         self._episodes = {}
-        self._sequence += 1
+        for column in (self._actions, self._rewards, self._terminated, self._ends, self._versions):
+            column[:history] = column[steps:end].copy()
         return segments
 
 

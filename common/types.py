@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
+_NOT_GIVEN: NDArray[np.uint8] = np.empty(0, np.uint8)
+
 
 @dataclass(frozen=True, slots=True)
 class EnvSpec:
@@ -53,12 +55,13 @@ class EpisodeEnd:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """Consecutive steps of one emulator stream, as an actor sends them.
+    """Transitions that begin with consecutive steps of one emulator stream, as an actor sends them.
 
     frames: <frame_dtype>[n_frames, *frame_shape], each frame once.
     obs_index, next_index: int32 [steps, stack], rows of `frames` that make obs and next_obs (oldest first).
-    actions: int32 [steps]. rewards: float32 [steps]. terminated: bool [steps].
+    actions: int32 [steps]. rewards: float32 [steps], n-step returns. terminated: bool [steps].
     param_version: int64 [steps], the version of the parameters that chose each action.
+    span: uint8 [steps], environment steps from obs to next_obs; 1 each where it is not given.
     carried: how many leading frames repeat, bit for bit, the last frames of this stream's previous segment
         (sequence numbers count per stream, so that is `sequence - 1`); a table that still holds those
         frames keeps one copy. 0 at the start of a stream.
@@ -75,9 +78,14 @@ class Segment:
     rewards: NDArray[np.float32]
     terminated: NDArray[np.bool_]
     param_version: NDArray[np.int64]
+    span: NDArray[np.uint8] = _NOT_GIVEN
     carried: int = 0
     acked: int = 0
     episodes: tuple[EpisodeEnd, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        """Let each transition span one step where nothing else was said."""
+        _default_span(self)
 
     @property
     def steps(self) -> int:
@@ -91,12 +99,13 @@ class Batch:
 
     frames: <frame_dtype>[unique, *frame_shape].
     obs_index, next_index: int32 [batch, stack], rows of `frames`.
-    actions: int32 [batch]. rewards: float32 [batch]. terminated: bool [batch].
+    actions: int32 [batch]. rewards: float32 [batch], n-step returns. terminated: bool [batch].
     weights: float32 [batch], importance-sampling weights (all 1 for uniform sampling).
     ids: int64 [batch], the number of each transition in order of insertion, from 0 (a priority update names it).
     param_version: int64 [batch], version of the parameters that acted.
     age: int64 [batch], transitions inserted since this one.
     reuse: int32 [batch], how often each had been drawn, this draw included.
+    span: uint8 [batch], environment steps from obs to next_obs; 1 each where it is not given.
     """
 
     frames: Array
@@ -110,6 +119,11 @@ class Batch:
     param_version: NDArray[np.int64]
     age: NDArray[np.int64]
     reuse: NDArray[np.int32]
+    span: NDArray[np.uint8] = _NOT_GIVEN
+
+    def __post_init__(self) -> None:
+        """Let each transition span one step where nothing else was said."""
+        _default_span(self)
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -117,3 +131,9 @@ class Batch:
     def columns(self) -> dict[str, Array]:
         """Everything but the frames, by name."""
         return {column.name: getattr(self, column.name) for column in fields(self) if column.name != "frames"}
+
+
+def _default_span(transitions: Segment | Batch) -> None:
+    """What was recorded before transitions could span several steps does not say that they span one."""
+    if transitions.span is _NOT_GIVEN:
+        object.__setattr__(transitions, "span", np.ones(len(transitions.actions), np.uint8))

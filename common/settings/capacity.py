@@ -13,8 +13,8 @@ from common.errors import UsageError
 from common.settings.config import RunConfig
 from common.types import EnvSpec
 
-# actions, rewards, terminated, param_version, ids, reuse; three counters of the frame's slot.
-ROW_BYTES = 4 + 4 + 1 + 8 + 8 + 4 + 3 * 4
+# actions, rewards, terminated, span, param_version, ids, reuse; three counters of the frame's slot.
+ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4 + 3 * 4
 HEADER_BYTES = 1 << 20  # of a message, its arrays' alignment included
 
 

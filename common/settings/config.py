@@ -112,6 +112,8 @@ class ReplaySettings:
     """Updates per environment step."""
     tolerance: Annotated[float, Field(gt=0, le=MAX_TOLERANCE)] = 64.0
     """Environment steps that acting and learning may drift apart."""
+    n_step: Annotated[int, Field(gt=0, le=100)] = 1
+    """Steps of reward that a transition sums up before it bootstraps (1: the paper); fewer at an episode's end."""
     eviction: Literal["fifo", "reservoir", "prioritized"] = "fifo"
     sampling: Literal["uniform", "prioritized"] = "uniform"
     priority_exponent: Share = 0.6

@@ -17,7 +17,7 @@ from replay.table.streams import StreamTails
 
 __all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
 
-COLUMNS = ("actions", "rewards", "terminated", "param_version", "ids", "reuse", "priorities")
+COLUMNS = ("actions", "rewards", "terminated", "span", "param_version", "ids", "reuse", "priorities")
 
 
 class PinnedBatch(NamedTuple):
@@ -76,6 +76,7 @@ class Table:
         self._actions = np.zeros(capacity, np.int32)
         self._rewards = np.zeros(capacity, np.float32)
         self._terminated = np.zeros(capacity, np.bool_)
+        self._span = np.ones(capacity, np.uint8)
         self._param_version = np.zeros(capacity, np.int64)
         self._ids = np.zeros(capacity, np.int64)
         self._reuse = np.zeros(capacity, np.int32)
@@ -120,6 +121,7 @@ class Table:
         self._actions[rows] = segment.actions[kept]
         self._rewards[rows] = segment.rewards[kept]
         self._terminated[rows] = segment.terminated[kept]
+        self._span[rows] = segment.span[kept]
         self._param_version[rows] = segment.param_version[kept]
         self._ids[rows] = np.arange(first, first + segment.steps)[kept]
         self._reuse[rows] = 0
@@ -165,6 +167,7 @@ class Table:
             "actions": self._actions[rows],
             "rewards": self._rewards[rows],
             "terminated": self._terminated[rows],
+            "span": self._span[rows],
             "weights": weights,
             "ids": ids,
             "param_version": self._param_version[rows],
@@ -263,7 +266,8 @@ class Table:
         size = len(arrays["slots"])
         self._slots[:size] = slots[arrays["slots"]]
         for name in COLUMNS:
-            self._column(name)[:size] = arrays[name]
+            if name in arrays or name != "span":  # older states lack it: all their transitions span one step
+                self._column(name)[:size] = arrays[name]
         self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
         self.inserted = meta["inserted"]
         self.batches = meta["batches"]

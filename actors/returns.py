@@ -1,0 +1,36 @@
+"""n-step returns: what a transition over up to n steps earns, and with which step it ends."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.types import Array
+
+
+def n_step_returns(
+    rewards: NDArray[np.float32], ends: NDArray[np.bool_], n: int, gamma: float
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """The transitions that begin with each of these steps.
+
+    A transition that begins at step t spans the steps t to t + n - 1, or fewer where an earlier one ends the episode:
+    its return is the sum of gamma^i r(t + i) over them.
+
+    Args:
+        rewards: float32 [steps, envs].
+        ends: bool [steps, envs], no later step belongs to the same episode (it terminated, or was truncated).
+
+    Returns:
+        last: int [steps, envs], the last step that each transition spans; it never falls. A transition with `last`
+            beyond these steps is not complete, and its return means nothing yet.
+        returns: float32 [steps, envs].
+    """
+    steps = np.arange(len(rewards))[:, None]
+    if n == 1:
+        return np.broadcast_to(steps, rewards.shape), rewards
+    following = np.where(ends, steps, len(rewards) + n)[::-1]  # the episode's end, where one comes
+    last = np.minimum(steps + n - 1, np.minimum.accumulate(following)[::-1])
+    returns: Array = rewards.astype(np.float64)
+    for i in range(1, min(n, len(rewards))):
+        returns[:-i] += gamma**i * np.where(last[:-i] >= steps[i:], rewards[i:], 0)
+    return last, returns.astype(np.float32)
