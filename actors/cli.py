@@ -76,7 +76,7 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
             route.follow(answer.replay_endpoints)
 
         with Membership(node, stop, request, joined, options.patience, learned, urgent=lambda: not route.is_up):
-            ActorService(node, route, stop, config.actor, env, policy, request.incarnation).run()
+            ActorService(node, route, stop, config, env, policy, request.incarnation).run()
     env.close()
 
 

@@ -17,7 +17,7 @@ from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node
 from common.process.lifecycle import Stop
 from common.settings import schedules
-from common.settings.config import ActorSettings
+from common.settings.config import RunConfig
 from common.types import Array, EpisodeEnd
 
 STATUS_EVERY = 0.5  # seconds
@@ -40,19 +40,26 @@ class ActorService:
         node: Node,
         route: ReplayRoute,
         stop: Stop,
-        settings: ActorSettings,
+        config: RunConfig,
         env: VectorEnv,
         policy: Policy,
         incarnation: int,
     ) -> None:
         self._node = node
         self._stop = stop
-        self._settings = settings
+        self._settings = settings = config.actor
         self._env = env
         self._policy = policy
         self._weights = WeightsFollower(node, policy)
         self._inserts = InsertClient(route, stop, settings.window * env.num_envs, self._tell)
-        self._segments = SegmentAssembler(env.spec, env.num_envs, incarnation, settings.segment_steps)
+        self._segments = SegmentAssembler(
+            env.spec,
+            env.num_envs,
+            incarnation,
+            settings.segment_steps,
+            n_step=config.replay.n_step,
+            gamma=config.learner.gamma,
+        )
         self._episodes = EpisodeTracker(env.num_envs)
         self._played: _Played | None = None
         self._steps = 0

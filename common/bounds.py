@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 MAX_SEGMENT_STEPS = 4096  # steps of one emulator that travel together
+MAX_N_STEP = 100  # steps that a transition spans
 MAX_BATCH = 65_536  # transitions of a batch
 MAX_PRIORITIES = 50_000  # that a request for a batch takes along: its header holds so many
 MAX_AHEAD = 1024  # draws that a learner may be ahead of its base

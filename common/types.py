@@ -78,7 +78,7 @@ class Segment:
     rewards: NDArray[np.float32]
     terminated: NDArray[np.bool_]
     param_version: NDArray[np.int64]
-    span: NDArray[np.uint8] = _NOT_GIVEN
+    span: NDArray[np.uint8] = field(default_factory=lambda: _NOT_GIVEN)
     carried: int = 0
     acked: int = 0
     episodes: tuple[EpisodeEnd, ...] = field(default=())
@@ -119,7 +119,7 @@ class Batch:
     param_version: NDArray[np.int64]
     age: NDArray[np.int64]
     reuse: NDArray[np.int32]
-    span: NDArray[np.uint8] = _NOT_GIVEN
+    span: NDArray[np.uint8] = field(default_factory=lambda: _NOT_GIVEN)
 
     def __post_init__(self) -> None:
         """Let each transition span one step where nothing else was said."""

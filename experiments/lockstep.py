@@ -49,7 +49,9 @@ class Lockstep:
         self._policy = Policy((first, second), self.env.spec, self._policy_rng)
         self._table = make_table(config, self.env.spec)
         self._episodes = EpisodeTracker(1)
-        self._segments = SegmentAssembler(self.env.spec, 1, 0, 1)
+        self._segments = SegmentAssembler(
+            self.env.spec, 1, 0, 1, n_step=config.replay.n_step, gamma=config.learner.gamma
+        )
         self._actions: list[int] = []
         self._obs = self.env.reset()
         self._segments.begin(self._obs)
@@ -62,8 +64,8 @@ class Lockstep:
         actions = self._policy.act(self._obs, epsilon)
         steps = self.env.step(actions)
         self._actions.append(int(actions[0]))
-        (segment,) = self._segments.add(actions, steps, agent.updates, {})
-        self._table.insert(segment)
+        for segment in self._segments.add(actions, steps, agent.updates, {}):
+            self._table.insert(segment)
         self._obs = steps.obs
         self.step += 1
         for _ in range(self._due()):

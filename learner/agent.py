@@ -92,8 +92,8 @@ class Agent:
     def update(self, batch: Batch) -> UpdateResult:
         """Train the acting network on one batch, towards targets of the other one; then swap if it is time.
 
-        e[a] = y[a] - (r + gamma (1 - terminated) Q_target(x', u*)), u* the target's best action, or the acting
-        network's with `double`.
+        e[a] = y[a] - (r + gamma^k (1 - terminated) Q_target(x', u*)), k the steps that the transition spans, u* the
+        target's best action, or the acting network's with `double`.
         """
         settings, acting = self.config.learner, self.acting
         trained, source, target = self._trainables[acting], self._sources[acting], self._targets[1 - acting]
@@ -197,7 +197,7 @@ class Agent:
         settings, rows = self.config.learner, np.arange(len(batch))
         values, next_values = _on_host(output), _on_host(next_output)
         best = values[len(batch) :].argmax(1) if settings.double else next_values.argmax(1)
-        discounts = np.float32(settings.gamma) * ~batch.terminated
+        discounts = np.float32(settings.gamma) ** batch.span * ~batch.terminated
         td_errors = values[rows, batch.actions] - (batch.rewards + discounts * next_values[rows, best])
         clipped = td_errors.clip(-1, 1) if settings.loss == "huber" else td_errors
         output_error = np.zeros_like(next_values)

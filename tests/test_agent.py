@@ -31,7 +31,8 @@ def _batches(count: int) -> list[Batch]:
         frames = rng.standard_normal((9, 4)).astype(np.float32)
         terminated = rng.random(8) < 0.2
         actions = rng.integers(2, size=8).astype(np.int32)
-        table.insert(make_segment(SPEC, sequence, 8, frames=frames, terminated=terminated, actions=actions, carried=0))
+        changes = {"terminated": terminated, "actions": actions, "span": rng.integers(1, 4, 8, np.uint8), "carried": 0}
+        table.insert(make_segment(SPEC, sequence, 8, frames=frames, **changes))
     return [table.sample(32) for _ in range(count)]
 
 
@@ -90,7 +91,8 @@ def test_an_update_by_autograd(double: bool, loss: str) -> None:
     with torch.no_grad():
         best = (online if double else target)(next_obs).argmax(1, keepdim=True)
         value = target(next_obs).gather(1, best)[:, 0]
-        targets = torch.tensor(batch.rewards) + 0.9 * torch.tensor(~batch.terminated) * value
+        discounts = 0.9 ** torch.tensor(batch.span) * ~torch.tensor(batch.terminated)
+        targets = torch.tensor(batch.rewards) + discounts * value
     errors = online.module(obs).gather(1, actions)[:, 0] - targets
     costs = (
         0.5 * errors**2 if loss == "squared" else torch.nn.functional.huber_loss(errors, 0 * errors, reduction="none")

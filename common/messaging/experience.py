@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_SEGMENT_STEPS, MAX_STREAMS
+from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_N_STEP, MAX_SEGMENT_STEPS, MAX_STREAMS
 from common.errors import BadMessage
 from common.messaging import wire
 from common.messaging.messages import INCARNATION
@@ -120,7 +120,8 @@ def encode_segment(run: str, segment: Segment) -> bytearray:
     return wire.encode("insert", run, fields, arrays)
 
 
-_SEGMENT_ARRAYS = ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version")
+_SEGMENT_ARRAYS = ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version", "span")
+_OPTIONAL = frozenset({"span"})  # journals and snapshots from before n-step returns lack it
 
 
 class SegmentReader:
@@ -139,7 +140,9 @@ class SegmentReader:
                 "rewards": ("float32", ("steps",)),
                 "terminated": ("bool", ("steps",)),
                 "param_version": ("int64", ("steps",)),
+                "span": ("uint8", ("steps",)),
             },
+            _OPTIONAL,
         )
 
     def __call__(self, message: Message) -> Segment:
@@ -171,6 +174,8 @@ def _check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
         _finite("arrays.frames", frames)
     if arrays["terminated"].view(np.uint8).max() > 1:
         raise BadMessage("arrays.terminated", "not boolean")
+    if "span" in arrays:
+        _within("arrays.span", arrays["span"], 1, MAX_N_STEP)
 
 
 def _finite(field: str, array: Array) -> None:
@@ -230,7 +235,9 @@ class BatchReader:
                 "ids": ("int64", row),
                 "age": ("int64", row),
                 "reuse": ("int32", row),
+                "span": ("uint8", row),
             },
+            _OPTIONAL,
         )
         self._spec = spec
 

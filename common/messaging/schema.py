@@ -119,11 +119,13 @@ class Schema:
 
     fields: rule of each field; all are required and no other is allowed.
     arrays: name -> (dtype, shape); a word in a shape stands for any length, the same one everywhere in the message.
+    optional: names of arrays that may be missing.
     """
 
     kind: str
     fields: Mapping[str, Rule]
     arrays: Mapping[str, tuple[str, tuple[int | str, ...]]]
+    optional: frozenset[str] = frozenset()
 
     def check(self, message: Message) -> dict[str, int]:
         """Return the lengths that the shape words stand for.
@@ -138,11 +140,11 @@ class Schema:
         for name, rule in self.fields.items():
             if problem := rule.problem(message.fields[name]):
                 raise BadMessage(f"fields.{name}", problem)
-        if message.arrays.keys() != self.arrays.keys():
+        if message.arrays.keys() | self.optional != self.arrays.keys():
             raise BadMessage("arrays", f"{_difference(message.arrays, self.arrays)}")
         lengths: dict[str, int] = {}
-        for name, (dtype, shape) in self.arrays.items():
-            array = message.arrays[name]
+        for name, array in message.arrays.items():
+            dtype, shape = self.arrays[name]
             if array.dtype != dtype:
                 raise BadMessage(f"arrays.{name}", f"dtype {array.dtype.name} instead of {dtype}")
             expected = tuple(

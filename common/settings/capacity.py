@@ -48,12 +48,12 @@ def check_messages(config: RunConfig, spec: EnvSpec) -> None:
     """Raise UsageError for a batch, a segment or parameters that may not fit into one message.
 
     The frames of a batch's transitions may all differ, stack + 1 for each. A step adds one frame to its segment, and
-    two where an episode ends with it.
+    two where an episode ends with it; n_step - 1 steps may wait for the segment.
     """
     row = ROW_BYTES + 2 * 4 * spec.stack
     room = MAX_PAYLOAD - HEADER_BYTES
     batch = room // ((spec.stack + 1) * frame_bytes(spec) + row)
-    segment = (room - spec.stack * frame_bytes(spec)) // (2 * frame_bytes(spec) + row)
+    segment = (room - spec.stack * frame_bytes(spec)) // (2 * frame_bytes(spec) + row) - (config.replay.n_step - 1)
     allowed = {
         "learner.batch_size": (config.learner.batch_size, batch),
         "actor.segment_steps": (config.actor.segment_steps, segment),

@@ -12,6 +12,7 @@ from common.bounds import (
     MAX_BATCH,
     MAX_GAPS,
     MAX_LAYERS,
+    MAX_N_STEP,
     MAX_RATIO,
     MAX_SEGMENT_STEPS,
     MAX_STREAMS,
@@ -112,7 +113,7 @@ class ReplaySettings:
     """Updates per environment step."""
     tolerance: Annotated[float, Field(gt=0, le=MAX_TOLERANCE)] = 64.0
     """Environment steps that acting and learning may drift apart."""
-    n_step: Annotated[int, Field(gt=0, le=100)] = 1
+    n_step: Annotated[int, Field(gt=0, le=MAX_N_STEP)] = 1
     """Steps of reward that a transition sums up before it bootstraps (1: the paper); fewer at an episode's end."""
     eviction: Literal["fifo", "reservoir", "prioritized"] = "fifo"
     sampling: Literal["uniform", "prioritized"] = "uniform"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from common.bounds import MAX_PRIORITIES
+from common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
 from common.errors import UsageError
 from common.settings.config import RunConfig
 
@@ -21,6 +21,11 @@ def _problems(config: RunConfig) -> Iterator[str]:
     for name, most in (("replay.capacity", replay.capacity), ("total_steps", config.total_steps)):
         if replay.start > most:
             yield f"replay.start = {replay.start}: must not exceed {name} = {most}"
+    if replay.start < replay.n_step:
+        yield f"replay.start = {replay.start}: allowed: at least replay.n_step = {replay.n_step}"
+    if config.actor.segment_steps + replay.n_step - 1 > MAX_SEGMENT_STEPS:
+        most = MAX_SEGMENT_STEPS - replay.n_step + 1
+        yield f"actor.segment_steps = {config.actor.segment_steps}: allowed: at most {most} with replay.n_step = {replay.n_step}"
     if config.planned_updates < 1:
         least = replay.start + math.floor(0.5 / replay.ratio) + 1
         yield (
