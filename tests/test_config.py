@@ -113,6 +113,8 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
         (["--method", "sarsa"], ["method", "sarsa", "g-coop"]),
         (["--edl.rate", "nan"], ["edl.rate", "nan"]),
         (["--replay.start", "400", "--replay.capacity", "300"], ["replay.start", "400", "300"]),
+        (["--replay.start", "4", "--replay.n-step", "5"], ["replay.start = 4", "at least replay.n_step = 5"]),
+        (["--actor.segment-steps", "4090", "--replay.n-step", "9"], ["actor.segment_steps = 4090", "at most 4088"]),
         (["--total-steps", "100", "--replay.start", "128"], ["replay.start", "128", "100"]),
         (["--total-steps", "0"], ["total_steps", "0", "greater than 0"]),
         (["--total-steps", "many"], ["--total-steps", "many"]),

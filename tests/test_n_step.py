@@ -10,7 +10,7 @@ from samples import INCARNATION
 from table_reference import Stream, make_spec
 
 from actors.segments import SegmentAssembler
-from common.envs.environments import Steps
+from common.envs.protocol import Steps
 from common.messaging import wire
 from common.messaging.experience import SegmentReader, encode_segment
 from common.types import EnvSpec, EpisodeEnd, Segment

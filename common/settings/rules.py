@@ -25,7 +25,8 @@ def _problems(config: RunConfig) -> Iterator[str]:
         yield f"replay.start = {replay.start}: allowed: at least replay.n_step = {replay.n_step}"
     if config.actor.segment_steps + replay.n_step - 1 > MAX_SEGMENT_STEPS:
         most = MAX_SEGMENT_STEPS - replay.n_step + 1
-        yield f"actor.segment_steps = {config.actor.segment_steps}: allowed: at most {most} with replay.n_step = {replay.n_step}"
+        asked = f"actor.segment_steps = {config.actor.segment_steps}"
+        yield f"{asked}: allowed: at most {most} with replay.n_step = {replay.n_step}"
     if config.planned_updates < 1:
         least = replay.start + math.floor(0.5 / replay.ratio) + 1
         yield (
