@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,35 +116,3 @@ class SegmentAssembler:
         for column in (self._actions, self._rewards, self._terminated, self._ends, self._versions):
             column[:history] = column[steps:end].copy()
         return segments
-
-
-@dataclass(frozen=True, slots=True)
-class FinishedEpisode:
-    """An episode that ended with the last step: the stream, its unclipped return, its length in steps."""
-
-    stream: int
-    episode_return: float
-    length: int
-
-
-class EpisodeTracker:
-    """Sums up the unclipped rewards and the steps of every stream's episode."""
-
-    def __init__(self, num_envs: int) -> None:
-        self._returns = np.zeros(num_envs)
-        self._steps = 0
-        self._begun = [0] * num_envs
-
-    def add(self, steps: Steps) -> list[FinishedEpisode]:
-        """Add one step of every stream; the episodes that it ended."""
-        self._returns += steps.raw_rewards
-        self._steps += 1
-        if not np.count_nonzero(steps.episode_over):
-            return []
-        finished = []
-        for stream in np.flatnonzero(steps.episode_over).tolist():
-            length = self._steps - self._begun[stream]
-            finished.append(FinishedEpisode(stream, float(self._returns[stream]), length))
-            self._returns[stream] = 0.0
-            self._begun[stream] = self._steps
-        return finished

@@ -91,7 +91,8 @@ def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:
         return autograd(config, spec, batch)
     agent = Agent(config, spec)
     if method.endswith("svd"):
-        agent._backward = [SvdRule(trainable.chain).backward for trainable in agent._trainables]
+        for network in agent._networks:
+            network._backward = SvdRule(network._source.chain).backward
     return lambda: agent.update(batch)
 
 

@@ -62,7 +62,8 @@ def ours(method: str, path: Path) -> Callable[[int], None]:
 
     def play(steps: int) -> None:
         for _ in range(steps):
-            run.play(directory)
+            for effects in run.play():
+                directory.record(effects.episodes, effects.metrics)
 
     return play
 

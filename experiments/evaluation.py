@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from actors.player import Player
 from actors.policy import Policy
-from actors.segments import EpisodeTracker
 from common.envs.make import make_vector_env
 from common.errors import UsageError
 from common.settings.tables import load_tables, resolve
-from learner.agent import make_network
+from learner.qnetwork import make_network
 from learner.records.epochs import complete_epochs, load_learner
 
 CPU = torch.device("cpu")
@@ -50,11 +50,11 @@ def evaluate(run_dir: Path, episodes: int, seed: int) -> Evaluation:
         network.load(flat)
     policy = Policy((networks[0], networks[1]), env.spec, np.random.default_rng(seed))
     policy.acting = state["acting"]
-    obs, tracker = env.reset(), EpisodeTracker(1)
+    player = Player(env, policy, epsilon=lambda _: 0.0)
+    player.begin()
     returns: list[float] = []
     while len(returns) < episodes:
-        steps = env.step(policy.act(obs, 0.0))
-        obs = steps.obs
-        returns += [episode.episode_return for episode in tracker.add(steps)]
+        player.send(0, 0)
+        returns += [episode.episode_return for episode in player.recv().ended.values()]
     env.close()
     return Evaluation(epochs[-1], policy.acting + 1, returns)

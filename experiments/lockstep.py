@@ -3,36 +3,38 @@
 from __future__ import annotations
 
 import math
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-import msgpack
 import numpy as np
+import torch
 
+from actors.player import Player, Turn
 from actors.policy import Policy
-from actors.segments import EpisodeTracker, SegmentAssembler
+from actors.segments import SegmentAssembler
 from common.envs.make import make_vector_env
-from common.envs.protocol import Steps
 from common.errors import UsageError
-from common.messaging.experience import Drawn, EpisodeRecord
+from common.messaging.experience import EpisodeRecord
 from common.process.randomness import generator_state, set_generator_state
 from common.settings import schedules
 from common.settings.config import RunConfig
-from common.types import EpisodeEnd
+from experiments import old_checkpoints
 from learner.agent import Agent
-from learner.records.curve import draw_learning_curve
 from learner.records.epochs import load_learner, save_epoch
-from learner.records.run_directory import RunDirectory
-from learner.records.summary import Summary, summarise
-from learner.records.telemetry import Telemetry
-from replay.core import make_table
-
-METRICS_EVERY = 200  # updates
+from learner.records.run_directory import RunDirectory, read_run_id
+from learner.trainer import Effects, Trainer
+from replay.core import ReplayCore
+from replay.persistence.storage import Mark, load_snapshot, save_snapshot
 
 
 class Lockstep:
     """One run of Algorithm 1 with one emulator; deterministic to the bit for a seed.
 
-    step: environment steps done. telemetry: returns of the last 100 episodes.
+    step: environment steps done.
     """
 
     def __init__(self, config: RunConfig) -> None:
@@ -43,81 +45,71 @@ class Lockstep:
         self.step = 0
         self.env = make_vector_env(config.env, 1, int(env_seed.generate_state(1)[0]))
         self.agent = Agent(config, self.env.spec)
-        self.telemetry = Telemetry()
+        self.trainer = Trainer(self.agent, time.monotonic())
         self._policy_rng = np.random.default_rng(policy_seed)
         first, second = self.agent.networks
         self._policy = Policy((first, second), self.env.spec, self._policy_rng)
-        self._table = make_table(config, self.env.spec)
-        self._episodes = EpisodeTracker(1)
+        self._player = Player(self.env, self._policy, partial(schedules.epsilon, config.actor))
         self._segments = SegmentAssembler(
             self.env.spec, 1, 0, 1, n_step=config.replay.n_step, gamma=config.learner.gamma
         )
+        self._replay = ReplayCore(config, self.env.spec)
+        self._table = self._replay.table
         self._actions: list[int] = []
-        self._obs = self.env.reset()
-        self._segments.begin(self._obs)
+        self._segments.begin(self._player.begin())
 
-    def play(self, directory: RunDirectory) -> None:
+    def play(self) -> Iterator[Effects]:
         """One pass through Algorithm 1's inner loop."""
-        config, agent = self.config, self.agent
-        epsilon = schedules.epsilon(config.actor, self.step)
-        self._policy.acting = agent.acting
-        actions = self._policy.act(self._obs, epsilon)
-        steps = self.env.step(actions)
-        self._actions.append(int(actions[0]))
-        for segment in self._segments.add(actions, steps, agent.updates, {}):
-            self._table.insert(segment)
-        self._obs = steps.obs
+        learner = self.config.learner
+        self._policy.acting = self.agent.acting
+        self._player.send(self.step, self.agent.updates)
+        turn = self._player.recv()
+        self._actions.append(int(turn.actions[0]))
+        self._store(turn)
         self.step += 1
-        for _ in range(self._due()):
-            self._update(directory, epsilon)
-        self._book(steps, epsilon, directory)
-        if config.learner.swap_by == "plays" and self.step % config.learner.swap_every == 0:
-            agent.swap()
-        if config.learner.reset_role_at_episode and steps.episode_over[0] and agent.acting:
-            agent.swap()
+        table = self._table
+        told = replace(
+            self.trainer.drawn,
+            inserted=self.step,
+            size=len(table),
+            evicted=table.evicted,
+            evicted_unsampled=table.evicted_unsampled,
+        )
+        for _ in range(self._updates_due()):
+            batch = table.sample(learner.batch_size)
+            effects = self.trainer.train(batch, told, time.monotonic())
+            if effects.priorities is not None:
+                table.update_priorities(batch.ids, effects.priorities)
+            yield effects
+        ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in turn.ended.items())
+        yield self.trainer.note(replace(told, episodes=ended))
+        if learner.swap_by == "plays" and self.step % learner.swap_every == 0:
+            self.agent.swap()
+        if learner.reset_role_at_episode and turn.ended and self.agent.acting:
+            self.agent.swap()
 
-    def _due(self) -> int:
+    def _store(self, turn: Turn) -> None:
+        for segment in self._segments.add(turn.actions, turn.steps, turn.version, turn.ended):
+            self._table.insert(segment)
+
+    def _updates_due(self) -> int:
         """Updates that the replay ratio asks for after this step."""
-        replay = self.config.replay
-        since = self.step - replay.start
-        return 0 if since <= 0 else math.floor(replay.ratio * since) - math.floor(replay.ratio * (since - 1))
-
-    def _update(self, directory: RunDirectory, epsilon: float) -> None:
-        agent, table = self.agent, self._table
-        batch = table.sample(self.config.learner.batch_size)
-        result = agent.update(batch)
-        if self.config.replay.prioritized:
-            table.update_priorities(batch.ids, np.abs(result.td_errors))
-        self.telemetry.add(agent, batch, result)
-        if agent.updates % METRICS_EVERY == 0:
-            drawn = Drawn(0, self.step, len(table), table.evicted, table.evicted_unsampled, 0, ())
-            directory.metrics(self.telemetry.row(agent, drawn, epsilon))
-
-    def _book(self, steps: Steps, epsilon: float, directory: RunDirectory) -> None:
-        for episode in self._episodes.add(steps):
-            q1_mean, q2_mean = self._policy.mean_values(steps.next_obs[0])
-            version = self.agent.updates
-            end = EpisodeEnd(0, episode.episode_return, episode.length, epsilon, q1_mean, q2_mean, version)
-            number = self.telemetry.episode(episode.episode_return)
-            directory.episode(number, EpisodeRecord(self.step, 0, 0, end), version, self.agent.exploration_rate())
+        settings = self.config.replay
+        since = self.step - settings.start
+        return 0 if since <= 0 else math.floor(settings.ratio * since) - math.floor(settings.ratio * (since - 1))
 
     def save(self, directory: RunDirectory) -> None:
         """Save an epoch from which `restore` goes on to the bit."""
         state = {
-            "agent": self.agent.state(),
-            "telemetry": self.telemetry.state(),
-            "step": self.step,
-            "policy": generator_state(self._policy_rng),
+            **self.trainer.state(time.monotonic()),
+            "player": {"policy": generator_state(self._policy_rng), "actions": torch.tensor(self._actions)},
             "sizes": directory.sizes(),
         }
+        mark = Mark(directory.run_id(), 0)
 
         def snapshot(folder: str) -> None:
             path = directory.path / folder / "replay"
-            path.mkdir(exist_ok=True)
-            meta, arrays = self._table.state()
-            (path / "state.msgpack").write_bytes(msgpack.packb({"table": meta}))
-            for name, array in {**arrays, "played": np.array(self._actions, np.int32)}.items():
-                np.save(path / f"{name}.npy", array)
+            save_snapshot(self._replay.snapshot(self.agent.updates), threading.Condition(), path, mark)
 
         save_epoch(directory.path, self.agent.updates, state, snapshot)
 
@@ -125,32 +117,29 @@ class Lockstep:
         """Go on where `save` was called; the sizes that the run's files had.
 
         The emulator comes back by playing the same actions again: exact for every deterministic environment.
+
+        Raises:
+            UsageError: the epoch is not one of a lockstep run.
         """
         state = load_learner(epoch)
-        arrays = {path.stem: np.load(path) for path in (epoch / "replay").glob("*.npy")}
-        played = arrays.pop("played")
-        self._actions = []
-        for action in played:
-            actions = np.array([action], np.int32)
-            steps = self.env.step(actions)
-            self._segments.add(actions, steps, 0, {})
-            self._episodes.add(steps)
-            self._obs = steps.obs
-        self._actions = played.tolist()
-        meta = msgpack.unpackb((epoch / "replay" / "state.msgpack").read_bytes(), strict_map_key=False)["table"]
-        self._table.load_state(meta, arrays)
-        self.agent.load_state(state["agent"])
-        set_generator_state(self._policy_rng, state["policy"])
-        self.telemetry.load_state(state["telemetry"])
-        self.step = state["step"]
+        if old_checkpoints.is_old(epoch):
+            state = old_checkpoints.load(epoch, state, self._table, self._replay_actions)
+        elif "player" not in state:
+            raise UsageError(
+                f"{epoch}: saved by processes, whose emulators are gone; coop-local --resume goes on with it"
+            )
+        else:
+            self._replay_actions(state["player"]["actions"].tolist())
+            load_snapshot(self._replay, epoch / "replay", read_run_id(epoch.parents[1]))
+        self.trainer.load_state(state, time.monotonic())
+        set_generator_state(self._policy_rng, state["player"]["policy"])
+        self.step = self.trainer.drawn.inserted
         sizes: dict[str, int] = state["sizes"]
         return sizes
 
-
-def finish(run: Lockstep, directory: RunDirectory, started: float, outcome: str) -> Summary:
-    """Write what a run leaves at its end."""
-    run.save(directory)
-    summary = summarise(run.agent, run.telemetry, started, outcome, run.step)
-    directory.summary(summary)
-    draw_learning_curve(directory.path, f"{summary.title}, lockstep")
-    return summary
+    def _replay_actions(self, actions: Iterable[int]) -> None:
+        """Play the actions of a run once more; the table is to come from its snapshot."""
+        for action in actions:
+            turn = self._player.replay(np.array([action], np.int32))
+            self._segments.add(turn.actions, turn.steps, turn.version, turn.ended)
+            self._actions.append(action)

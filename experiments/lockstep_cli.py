@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 
+from common.errors import RunError
 from common.process.lifecycle import Stop, run_main
 from common.process.threads import use_threads
 from common.settings.options import RunOptions, parse_run
-from experiments.lockstep import Lockstep, finish
+from experiments.lockstep import Lockstep
+from learner.records.curve import draw_learning_curve
 from learner.records.epochs import newest_epoch
 from learner.records.run_directory import RunDirectory
-from learner.targets import target_reached
+from learner.records.summary import Summary, summarise
 
 PROGRESS_EVERY = 5.0  # seconds
 
@@ -29,33 +30,39 @@ def _run() -> None:
     path = options.directory()
     stop = Stop()
     stop.on_signals()
-    started = time.monotonic()
     run = Lockstep(config)
     epoch = newest_epoch(path) if options.resume else None
     sizes = None if epoch is None else run.restore(epoch)
     with RunDirectory(path, config, sizes) as directory:
-        outcome = _play(run, directory, stop)
-        summary = finish(run, directory, started, outcome)
+        summary = run_lockstep(run, directory, stop)
     run.env.close()
     print(f"{summary}; {path}")
+    if run.trainer.diverged:
+        raise RunError(run.trainer.diverged)
 
 
-def _play(run: Lockstep, directory: RunDirectory, stop: Stop) -> str:
-    """Play until the run is complete or stopped; why it ended."""
-    config, due = run.config, time.monotonic() + PROGRESS_EVERY
-    every = config.checkpoint_every or math.inf
-    save_at = run.agent.updates + every
-    while run.step < config.total_steps and not stop.is_set():
-        if reached := target_reached(config, run.agent.updates, run.telemetry):
-            return reached
-        run.play(directory)
-        if run.agent.updates >= save_at and run.step < config.total_steps:
-            save_at += every
+def run_lockstep(run: Lockstep, directory: RunDirectory, stop: Stop) -> Summary:
+    """Play until the run is over or stopped, and leave its files complete; says now and then how far it is."""
+    trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
+    while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
+        for effects in run.play():
+            directory.record(effects.episodes, effects.metrics)
+        if trainer.epoch_due() and not trainer.outcome():
+            trainer.epoch_begun()
             run.save(directory)
         if time.monotonic() >= due:
             due = time.monotonic() + PROGRESS_EVERY
-            known = run.telemetry.episodes > 0
-            returns = f"return {run.telemetry.return_mean:.1f}" if known else "no episode has ended yet"
-            text = f"step {run.step:,}/{config.total_steps:,}  {returns}"
-            print(text, end="\r" if sys.stdout.isatty() else "\n", flush=True)
-    return stop.reason or "complete"
+            print(_progress(run), end="\r" if sys.stdout.isatty() else "\n", flush=True)
+    if trainer.sound():
+        run.save(directory)
+    summary = summarise(trainer, trainer.diverged or outcome, time.monotonic(), run.step)
+    directory.summary(summary)
+    draw_learning_curve(directory.path, f"{summary.title}, lockstep")
+    return summary
+
+
+def _progress(run: Lockstep) -> str:
+    telemetry = run.trainer.telemetry
+    returns = f"return {telemetry.return_mean:.1f}" if telemetry.episodes else "no episode has ended yet"
+    warning = telemetry.warning(run.agent)
+    return f"step {run.step:,}/{run.config.total_steps:,}  {returns}" + (f"  [{warning}]" if warning else "")

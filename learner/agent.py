@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,21 +22,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.errors import UsageError
-from common.networks.network import FlatNetwork, build_network, preprocess
+from common.networks.network import FlatNetwork, preprocess
 from common.process.randomness import generator_state, set_generator_state
 from common.settings import schedules
 from common.settings.config import RunConfig
-from common.types import Batch, EnvSpec
-from learner.edl.arrays import Array, assign
-from learner.edl.feedback import FeedbackRule
-from learner.edl.trainable import Trainable
+from common.types import Array, Batch, EnvSpec
+from learner.losses import LOSSES, output_error, td_errors
 from learner.optimizers import make_optimizer
-
-T = TypeVar("T")
+from learner.qnetwork import make_q_network, on_host
 
 
 @dataclass(frozen=True, slots=True)
-class UpdateResult:
+class Update:
     """What one update measured.
 
     td_errors: float32 [batch], e of the taken actions before clipping and weighting.
@@ -57,86 +54,66 @@ class Agent:
     Attributes:
         acting: 0 or 1, index of the network that acts and is trained.
         updates: updates done.
-        networks: the two networks. versions: updates done when each was changed last.
+        networks: the parameters of both networks. versions: updates done when each was changed last.
+        loss: the cost of a TD error.
     """
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
         """Raises UsageError for a device that is not there or weight decays that do not fit the layers."""
-        settings = config.learner
         self.config = config
         self.spec = spec
-        self.device = _device(settings.device)
-        self.networks = [make_network(config, spec, number, self.device) for number in (0, 1)]
-        self._halves = self._half_networks()
+        self.device = _device(config.learner.device)
+        self.loss = LOSSES[config.learner.loss]
         self.acting = 0
         self.updates = 0
         self.versions = [0, 0]
-        polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
-        in_numpy = polar_dtype is None and not settings.compile
-        self._trainables = [Trainable(network, in_numpy) for network in self.networks]
-        halves = [Trainable(network, in_numpy) for network in self._halves]
-        self._targets = halves or self._trainables
-        # What the gradient is made of: error-driven feedback needs the accuracy of float32.
-        self._sources = self._targets if config.feedback == "none" else self._trainables
-        trained = self._trainables if config.two_networks else self._trainables[:1]
-        self.optimizers = [make_optimizer(settings, one.theta, one.gradient) for one in trained]
-        rules = [FeedbackRule(source.chain, config.feedback, config.seed, polar_dtype) for source in self._sources]
-        ready = torch.compile if settings.compile else _as_it_is
-        self._forward = [ready(source.chain.forward) for source in self._sources]
-        self._values = [ready(target.values) for target in self._targets]
-        self._backward = [ready(rule.backward) for rule in rules]
+        self._networks = [make_q_network(config, spec, number, self.device) for number in (0, 1)]
+        trained = self._networks if config.two_networks else self._networks[:1]
+        self.optimizers = [make_optimizer(config.learner, one.theta, one.gradient) for one in trained]
+        self._weight_decay = _decay_vector(config.learner.weight_decay, self.networks[0].layout)
         self._noise = np.random.default_rng([config.seed, 2])
-        decay = _decay_vector(settings.weight_decay, self.networks[0].layout)
-        self._decay = None if decay is None else self._trainables[0].take(decay)
 
-    def update(self, batch: Batch) -> UpdateResult:
-        """Train the acting network on one batch, towards targets of the other one; then swap if it is time.
+    @property
+    def networks(self) -> list[FlatNetwork]:
+        """The parameters of both networks."""
+        return [one.network for one in self._networks]
 
-        e[a] = y[a] - (r + gamma^k (1 - terminated) Q_target(x', u*)), k the steps that the transition spans, u* the
-        target's best action, or the acting network's with `double`.
-        """
-        settings, acting = self.config.learner, self.acting
-        trained, source, target = self._trainables[acting], self._sources[acting], self._targets[1 - acting]
+    def update(self, batch: Batch) -> Update:
+        """One step of Algorithm 1: train the acting network towards the other one's targets, then count the step."""
+        settings, size = self.config.learner, len(batch)
+        online, target = self._networks[self.acting], self._networks[1 - self.acting]
         s = self._draw_s()
-        # A run that diverges goes on: numpy then says no more than PyTorch.
+        # What is not finite is found by whoever reads the TD errors: numpy says no more of it than PyTorch.
         with torch.inference_mode(), np.errstate(all="ignore"):
-            states = self._states(batch)
-            obs, next_obs = states[: len(batch)], states[len(batch) :]
-            # One pass of the acting network over both where its choice of next actions is asked for.
-            tape = self._forward[acting](source.take(states if settings.double else obs))
-            next_output = self._values[1 - acting](target.take(next_obs))
-            td_errors, output_error = self._errors(batch, tape.output, next_output)
-            if settings.double:
-                tape = tape.head(len(batch))
-            self._backward[acting](tape, source.take(output_error), s, source.gradients)
-            if source is not trained:
-                assign(trained.gradient, source.gradient)
-            if self._decay is not None:
-                trained.gradient += self._decay * trained.theta
-            progress = self.updates / max(1, self.config.planned_updates)
-            self.optimizers[acting].step(schedules.learning_rate(settings, progress))
-            self._halve(acting)
-        return UpdateResult(td_errors, s, self._count())
+            inputs = online.inputs(batch, self.spec)
+            # With `double` the acting network chooses the next actions: one pass over obs and next_obs serves both.
+            tape = online.forward(inputs if settings.double else inputs[:size])
+            values, next_values = on_host(tape.output), target.values(inputs[size:])
+            best = (values[size:] if settings.double else next_values).argmax(1)
+            errors = td_errors(batch, values, next_values, best, settings.gamma)
+            slopes = output_error(batch, self.loss.slope(errors), next_values)
+            online.backward(tape.head(size), slopes, s)
+            if self._weight_decay is not None:
+                online.decay(self._weight_decay)
+            self.optimizers[self.acting].step(self._learning_rate())
+            online.changed()
+        return Update(errors, s, swapped=self._count())
 
     def swap(self) -> None:
         """Change the acting role; for the one-network methods, copy the network to its target."""
         if self.config.two_networks:
             self.acting = 1 - self.acting
         else:
-            self.networks[1].load(self.networks[0].flat)
-            self._halve(1)
+            self._networks[1].load(self.networks[0].flat)
             self.versions[1] = self.updates
 
     def exploration_rate(self) -> float:
         """The rate that s is now drawn from; 0 for the gradient methods."""
         return 0.0 if self.config.feedback == "none" else schedules.exploration_rate(self.config.edl, self.updates)
 
-    def losses(self, errors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The cost of each TD error: 1/2 e^2, or Huber's."""
-        size = np.abs(errors)
-        if self.config.learner.loss == "huber":
-            return np.where(size < 1, np.float32(0.5) * size * size, size - np.float32(0.5))
-        return np.float32(0.5) * size * size
+    def finite(self) -> bool:
+        """True while every parameter of both networks is finite."""
+        return all(bool(torch.isfinite(network.flat).all()) for network in self.networks)
 
     def q_values(self, obs: Array) -> tuple[Tensor, Tensor]:
         """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
@@ -157,54 +134,22 @@ class Agent:
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Continue where `state` was taken."""
-        for number, flat in enumerate(state["networks"]):
-            self.networks[number].load(flat)
-            self._halve(number)
+        for network, flat in zip(self._networks, state["networks"], strict=True):
+            network.load(flat)
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
             optimizer.load_state(saved)
         self.acting, self.updates, self.versions = state["acting"], state["updates"], list(state["versions"])
         set_generator_state(self._noise, state["noise"])
 
-    def _half_networks(self) -> list[FlatNetwork]:
-        """Copies of both networks in bfloat16, kept up by `_halve`; none where all is computed in float32."""
-        if self.config.network.dtype == "float32":
-            return []
-        return [make_network(self.config, self.spec, number, self.device, torch.bfloat16) for number in (0, 1)]
-
-    def _halve(self, number: int) -> None:
-        if self._halves:
-            self._halves[number].load(self.networks[number].flat)
-
     def _draw_s(self) -> float:
         s = self.exploration_rate()
         return s * float(self._noise.standard_normal()) if self.config.edl.noise == "normal" and s else s
 
-    def _states(self, batch: Batch) -> Array:
-        """Inputs of the networks [2 batch, *input]: obs, then next_obs."""
-        index = np.concatenate((batch.obs_index, batch.next_index)).reshape(-1)
-        if self._trainables[0].in_numpy:
-            return batch.frames.take(index, axis=0)
-        # Copies: arrays from the wire are read-only, and PyTorch warns of viewing those.
-        frames, places = torch.tensor(batch.frames, device=self.device), torch.tensor(index, device=self.device)
-        return preprocess(frames.index_select(0, places).view(-1, *self.spec.obs_shape), self.spec)
-
-    def _errors(self, batch: Batch, output: Array, next_output: Array) -> tuple[NDArray[np.float32], Array]:
-        """TD errors of the taken actions, float32 [batch], and e with weights and batch mean in it, [batch, actions].
-
-        output: of the acting network for obs, and for next_obs below it with `double`. next_output: of the other one.
-        In numpy on the host, whose operations on so few numbers cost a fraction of PyTorch's.
-        """
-        settings, rows = self.config.learner, np.arange(len(batch))
-        values, next_values = _on_host(output), _on_host(next_output)
-        best = values[len(batch) :].argmax(1) if settings.double else next_values.argmax(1)
-        discounts = np.float32(settings.gamma) ** batch.span * ~batch.terminated
-        td_errors = values[rows, batch.actions] - (batch.rewards + discounts * next_values[rows, best])
-        clipped = td_errors.clip(-1, 1) if settings.loss == "huber" else td_errors
-        output_error = np.zeros_like(next_values)
-        output_error[rows, batch.actions] = clipped * batch.weights / np.float32(len(batch))
-        return td_errors, output_error
+    def _learning_rate(self) -> float:
+        return schedules.learning_rate(self.config.learner, self.updates / max(1, self.config.planned_updates))
 
     def _count(self) -> bool:
+        """Count an update; True where the roles change after it."""
         self.updates += 1
         self.versions[self.acting] = self.updates
         settings = self.config.learner
@@ -212,22 +157,6 @@ class Agent:
         if due:
             self.swap()
         return due
-
-
-def make_network(
-    config: RunConfig, spec: EnvSpec, number: int, device: torch.device, dtype: torch.dtype = torch.float32
-) -> FlatNetwork:
-    """Network 0 or 1 of a run as it starts; the same one for both where the method has one and a copy."""
-    seed = int(np.random.SeedSequence([config.seed, number if config.two_networks else 0]).generate_state(1)[0])
-    return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
-
-
-def _as_it_is(function: T) -> T:
-    return function
-
-
-def _on_host(values: Array) -> NDArray[np.float32]:
-    return values.float().cpu().numpy() if isinstance(values, Tensor) else values
 
 
 def _device(name: str) -> torch.device:

@@ -20,35 +20,29 @@ PAUSE = 0.05  # seconds between questions
 
 
 class Checkpoints:
-    """Saves an epoch every so many updates.
+    """Saves epochs, one at a time.
 
     An epoch that can't be saved is given up, with one printed line, and the run goes on to the next.
-
-    Args:
-        every: updates between epochs; 0: none but those that are asked for.
-        updates: done when this begins.
 
     Attributes:
         newest: number of the newest epoch that is finished; 0 if there is none.
     """
 
-    def __init__(self, node: Node, run_dir: Path, samples: SampleClient, every: int, updates: int) -> None:
+    def __init__(self, node: Node, run_dir: Path, samples: SampleClient) -> None:
         self.newest = max(complete_epochs(run_dir), default=0)
         self._node = node
         self._run_dir = run_dir
         self._samples = samples
-        self._every = every
-        self._due = updates + every
         self._writer: threading.Thread | None = None
 
-    def begin_if_due(self, updates: int, state: Callable[[], dict[str, Any]]) -> None:
-        """Begin an epoch between two updates if it is time and the last one is finished."""
-        if not self._every or updates < self._due or self._writing():
-            return
-        self._due = updates + self._every
+    def begin(self, state: Callable[[], dict[str, Any]]) -> bool:
+        """Begin an epoch between two updates; False, and nothing done, while the last one is being written."""
+        if self._writing():
+            return False
         number, frozen = self._samples.pin(), state()
         self._writer = threading.Thread(target=self._try, args=(number, frozen), name=f"epoch {number}")
         self._writer.start()
+        return True
 
     def save(self, state: dict[str, Any]) -> None:
         """Save an epoch now and wait for it.

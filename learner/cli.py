@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 
 from common.envs.make import env_spec
+from common.errors import RunError
 from common.messaging.clients import SampleClient
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process.lifecycle import Stop, run_main
@@ -20,6 +21,7 @@ from learner.records.epochs import go_back
 from learner.records.run_directory import RunDirectory
 from learner.roster import Roster
 from learner.service import LearnerService
+from learner.trainer import Trainer
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,11 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     path = options.directory()
-    agent = Agent(config, spec)
+    trainer = Trainer(Agent(config, spec), time.monotonic())
+    agent = trainer.agent
     state = go_back(path) if options.resume else None
     if state is not None:
-        agent.load_state(state["agent"])
+        trainer.load_state(state, time.monotonic())
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory)
     sizes = None if state is None else state["sizes"]
@@ -59,12 +62,14 @@ def _run() -> None:
         samples = SampleClient(
             node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, told
         )
-        checkpoints = Checkpoints(node, path, samples, config.checkpoint_every, agent.updates)
+        checkpoints = Checkpoints(node, path, samples)
         run_id = directory.run_id()
         roster = Roster(path, time.monotonic())
         Reception(node, config, spec, agent.networks[0].layout_digest(), run_id, lambda: checkpoints.newest, roster)
         print(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}", flush=True)
         if state is not None:
             print(f"goes on from epoch {agent.updates}", flush=True)
-        summary = LearnerService(node, stop, agent, directory, samples, checkpoints, state).run()
+        summary = LearnerService(node, stop, trainer, directory, samples, checkpoints).run()
     print(summary, flush=True)
+    if trainer.diverged:
+        raise RunError(trainer.diverged)

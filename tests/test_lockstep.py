@@ -21,9 +21,14 @@ def _run(path: Path, method: Method, steps: int) -> Lockstep:
     run = Lockstep(base_config(["--method", method]))
     with RunDirectory(path, run.config) as directory:
         for _ in range(steps):
-            run.play(directory)
+            _play(run, directory)
     run.env.close()
     return run
+
+
+def _play(run: Lockstep, directory: RunDirectory) -> None:
+    for effects in run.play():
+        directory.record(effects.episodes, effects.metrics)
 
 
 @pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
@@ -76,12 +81,12 @@ def test_roles_swap_by_plays_and_start_anew_with_each_episode(tmp_path: Path) ->
     seen = []
     with RunDirectory(tmp_path / "run", run.config) as directory:
         for step in range(1, 400):
-            episodes = run.telemetry.episodes
-            run.play(directory)
+            episodes = run.trainer.telemetry.episodes
+            _play(run, directory)
             seen.append(run.agent.acting)
             if step % 7 == 0:
                 acting, swaps = 1 - acting, swaps + 1
-            if run.telemetry.episodes > episodes:
+            if run.trainer.telemetry.episodes > episodes:
                 resets += acting
                 acting = 0
             expected.append(acting)

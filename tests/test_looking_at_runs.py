@@ -14,7 +14,7 @@ import torch
 from common.settings.sources import base_config
 from experiments import evaluation_cli
 from experiments.evaluation import evaluate
-from experiments.lockstep import Lockstep, finish
+from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
@@ -25,13 +25,14 @@ def run_with(path: Path, acting: int, action: int) -> None:
     run = Lockstep(base_config(["--method", "coop"]))
     with RunDirectory(path, run.config) as directory:
         for _ in range(40):
-            run.play(directory)
+            for effects in run.play():
+                directory.record(effects.episodes, effects.metrics)
         run.agent.acting = acting
         for number, network in enumerate(run.agent.networks):
             flat = torch.zeros_like(network.flat)
             flat[-2 + (action if number == acting else 1 - action)] = 1.0  # the last two are the output's biases
             network.load(flat)
-        finish(run, directory, time.monotonic(), "complete")
+        run.save(directory)
     run.env.close()
 
 

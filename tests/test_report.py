@@ -49,8 +49,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
             run = Lockstep(cell.config)
             with RunDirectory(folder / cell.name, cell.config) as directory:
                 for _ in range(cell.config.total_steps):
-                    run.play(directory)
-                directory.summary(summarise(run.agent, run.telemetry, time.monotonic(), "complete", run.step))
+                    for effects in run.play():
+                        directory.record(effects.episodes, effects.metrics)
+                directory.summary(summarise(run.trainer, "complete", time.monotonic(), run.step))
             run.env.close()
     torn = folder / "edql-capacity=60-seed=0"
     torn.mkdir()

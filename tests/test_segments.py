@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import INCARNATION, cut, record
 
-from actors.segments import EpisodeTracker, FinishedEpisode, SegmentAssembler
+from actors.segments import SegmentAssembler
 from common.envs.protocol import Steps
 from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
@@ -162,15 +162,3 @@ def test_episode_ends_travel_in_the_segment_of_their_last_step() -> None:
     told = [(s.stream, s.sequence, [e.step_in_segment for e in s.episodes]) for s in segments]
     assert told == [(0, 0, [2]), (1, 0, [1, 2]), (0, 1, [0]), (1, 1, [])]
     assert segments[0].episodes[0].episode_return == 12.0
-
-
-def test_tracker_sums_unclipped_rewards_until_the_reported_episode_ends() -> None:
-    tracker = EpisodeTracker(2)
-    played = [([7, 0], [False, False]), ([7, 1], [True, False]), ([2, 1], [True, True]), ([0, 0], [False, True])]
-    finished = [tracker.add(steps_of(*step)) for step in played]
-    assert finished == [
-        [],
-        [FinishedEpisode(0, 14.0, 2)],
-        [FinishedEpisode(0, 2.0, 1), FinishedEpisode(1, 2.0, 3)],
-        [FinishedEpisode(1, 0.0, 1)],
-    ]

@@ -25,6 +25,6 @@ class Trainable:
         self.gradient: Array = namespace(self.theta).zeros_like(self.theta)
         self.gradients = network.views(self.gradient)
 
-    def take(self, array: Array) -> Array:
+    def cast(self, array: Array) -> Array:
         """An array of either library as this network's passes take it."""
         return like(array, self.theta)

@@ -6,18 +6,20 @@ import csv
 import json
 import os
 import secrets
+import time
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from common.errors import RunError
-from common.messaging.experience import EpisodeRecord
 from common.process.files import LineFile, write_whole
 from common.settings.config import RunConfig
 from common.settings.tables import to_toml
 from learner.records.board import Board
 from learner.records.summary import Summary
+from learner.trainer import EpisodeRow
 
 EPISODE_FIELDS = (
     "episode", "env_step", "update", "actor", "stream", "return", "length",
@@ -57,22 +59,27 @@ class RunDirectory:
             raise RunError(f"{path}: {error}") from error
         return read_run_id(self.path)
 
-    def episode(self, number: int, record: EpisodeRecord, update: int, s: float) -> None:
-        """Add a line to episodes.csv."""
-        end = record.end
-        place = (number, record.env_step, update, f"{record.actor:x}", record.stream)
-        values = (f"{value:.6g}" for value in (end.epsilon, s, end.q1_mean, end.q2_mean))
-        self._csv.writerow((*place, f"{end.episode_return:g}", end.length, *values, end.param_version))
-        self._board.add("episode/return", end.episode_return, record.env_step)
+    def record(self, episodes: Iterable[EpisodeRow], metrics: dict[str, Any] | None) -> None:
+        """Write down what one batch gave: lines of episodes.csv, and a row of metrics.jsonl where there is one."""
+        for episode in episodes:
+            self._episode(episode)
+        if metrics is not None:
+            self._metrics_row(metrics)
         self._look()
 
-    def metrics(self, row: dict[str, Any]) -> None:
+    def _episode(self, row: EpisodeRow) -> None:
+        record, end = row.record, row.record.end
+        place = (row.number, record.env_step, row.update, f"{record.actor:x}", record.stream)
+        values = (f"{value:.6g}" for value in (end.epsilon, row.s, end.q1_mean, end.q2_mean))
+        self._csv.writerow((*place, f"{end.episode_return:g}", end.length, *values, end.param_version))
+        self._board.add("episode/return", end.episode_return, record.env_step)
+
+    def _metrics_row(self, row: dict[str, Any]) -> None:
         """Add a line to metrics.jsonl, and the same to TensorBoard."""
-        self._metrics.write(json.dumps(row) + "\n")
+        self._metrics.write(json.dumps({"time": time.time(), **row}) + "\n")
         for name, value in row.items():
-            if name not in ("time", "env_step"):
+            if name != "env_step" and value is not None:
                 self._board.add(f"train/{name}", value, row["env_step"])
-        self._look()
 
     def summary(self, summary: Summary) -> None:
         """Write summary.json, whole or not at all."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
-from learner.agent import Agent
-from learner.records.telemetry import Telemetry
+from learner.trainer import Trainer
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,26 +43,20 @@ class Summary:
 
 
 def summarise(
-    agent: Agent,
-    telemetry: Telemetry,
-    started: float,
-    outcome: str,
-    env_steps: int,
-    lost: int | None = 0,
-    duplicates: int | None = 0,
+    trainer: Trainer, outcome: str, now: float, env_steps: int, lost: int | None = 0, duplicates: int | None = 0
 ) -> Summary:
-    """The summary of a run that began at `started` of the monotonic clock and ends now."""
-    config = agent.config
+    """The summary of a run that ends at `now`, in seconds of the trainer's clock."""
+    config, telemetry = trainer.config, trainer.telemetry
     return Summary(
         method=config.method,
         env=config.env.id,
         seed=config.seed,
         env_steps=env_steps,
-        updates=agent.updates,
+        updates=trainer.agent.updates,
         episodes=telemetry.episodes,
         return_mean_100=telemetry.return_mean,
         return_sd_100=telemetry.return_sd,
-        wall_seconds=round(time.monotonic() - started, 3),
+        wall_seconds=round(trainer.seconds(now), 3),
         transitions_accepted=env_steps,
         transitions_lost=lost,
         duplicates_refused=duplicates,

@@ -1,8 +1,7 @@
-"""What is measured over the updates of an interval, and the episodes' running return."""
+"""What is measured over the updates of an interval, and the episodes' running return. Pure: time comes in."""
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from typing import Any
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from common.messaging.experience import Drawn
 from common.returns import RETURN_WINDOW
 from common.types import Array, Batch
-from learner.agent import Agent, UpdateResult
+from learner.agent import Agent, Update
 
 FIXED_STATES = 256
 
@@ -21,51 +20,54 @@ FIXED_STATES = 256
 class Telemetry:
     """Collects from each update what one row of metrics.jsonl says of an interval.
 
-    returns: of the last 100 episodes. fixed: the first states drawn, on which Q1 and Q2 are compared.
+    returns: of the last 100 episodes. fixed: the first 256 states drawn, on which Q1 and Q2 are compared.
+    largest_reward: the largest |reward| of all batches. q_abs_mean: mean |Q| of both networks over `fixed` at the last
+    row. now: seconds of a monotonic clock.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, now: float) -> None:
         self.returns: deque[float] = deque(maxlen=RETURN_WINDOW)
         self.episodes = 0
         self.fixed: Array | None = None
+        self.largest_reward = 0.0
+        self.q_abs_mean = 0.0
         self._errors: list[NDArray[np.float32]] = []
         self._batches: list[tuple[Array, Array, Array]] = []
-        self._began = (time.monotonic(), 0, 0)
+        self._began = (now, 0, 0)
 
-    def add(self, agent: Agent, batch: Batch, result: UpdateResult) -> None:
+    def add(self, agent: Agent, batch: Batch, update: Update) -> None:
         """Note one update."""
-        if self.fixed is None:
-            stacks = batch.frames[batch.obs_index[:FIXED_STATES]]
-            self.fixed = stacks.reshape(-1, *agent.spec.obs_shape)
-        self._errors.append(result.td_errors)
+        if self.fixed is None or len(self.fixed) < FIXED_STATES:
+            self._fix(batch, agent)
+        self._errors.append(update.td_errors)
+        self.largest_reward = max(self.largest_reward, float(np.abs(batch.rewards).max()))
         # Copies: the arrays may be views that would keep a whole message alive.
         self._batches.append((batch.age.copy(), batch.reuse.copy(), agent.updates - batch.param_version))
 
-    def row(self, agent: Agent, drawn: Drawn, epsilon: float) -> dict[str, Any]:
-        """The metrics of the updates since the last row."""
-        errors = np.concatenate(self._errors) if self._errors else np.zeros(1, np.float32)
-        age, reuse, lag = (
-            np.concatenate([arrays[i] for arrays in self._batches]) if self._batches else np.zeros(1) for i in range(3)
-        )
-        now = time.monotonic()
+    def row(self, agent: Agent, drawn: Drawn, epsilon: float, now: float) -> dict[str, Any]:
+        """The metrics of the updates since the last row; at least one."""
+        errors = np.concatenate(self._errors)
+        age, reuse, lag = (np.concatenate([arrays[i] for arrays in self._batches]) for i in range(3))
         began, updates, steps = self._began
         seconds = max(now - began, 1e-9)
         self._errors, self._batches = [], []
         self._began = (now, agent.updates, drawn.inserted)
         assert self.fixed is not None
         q1, q2 = agent.q_values(self.fixed)
+        self.q_abs_mean = float((q1.abs().mean() + q2.abs().mean()) / 2)
         return {
-            "time": time.time(),
             "env_step": drawn.inserted,
             "update": agent.updates,
             "acting": agent.acting + 1,
             "td_error": float(np.abs(errors).mean()),
-            "loss": float(agent.losses(errors).mean()),
+            "loss": float(agent.loss.cost(errors).mean()),
             "s": agent.exploration_rate(),
             "epsilon": epsilon,
             "q_gap": float((q1 - q2).norm(dim=1).mean()),
             "q1_mean": float(q1.mean()),
             "q2_mean": float(q2.mean()),
+            "q_abs_mean": self.q_abs_mean,
+            "q_bound": self.q_bound(agent),
             "updates_per_s": (agent.updates - updates) / seconds,
             "env_steps_per_s": (drawn.inserted - steps) / seconds,
             "replay_size": drawn.size,
@@ -76,16 +78,34 @@ class Telemetry:
             "weight_lag_mean": float(lag.mean()),
         }
 
+    def q_bound(self, agent: Agent) -> float | None:
+        """The largest |Q| that the rewards seen allow, (largest |reward|) / (1 - gamma); None where gamma is 1."""
+        gamma = agent.config.learner.gamma
+        return self.largest_reward / (1 - gamma) if gamma < 1 else None
+
+    def warning(self, agent: Agent) -> str:
+        """That mean |Q| exceeds its bound, in words; empty while it does not."""
+        bound = self.q_bound(agent)
+        if bound is None or self.q_abs_mean <= bound:
+            return ""
+        return f"mean |Q| is {self.q_abs_mean:.4g}, above {bound:.4g}, the largest that the rewards seen allow"
+
     def state(self) -> dict[str, Any]:
         """What `load_state` needs; loads with weights_only."""
         fixed = None if self.fixed is None else torch.from_numpy(self.fixed.copy())
-        return {"returns": list(self.returns), "episodes": self.episodes, "fixed": fixed}
+        return {
+            "returns": list(self.returns),
+            "episodes": self.episodes,
+            "fixed": fixed,
+            "largest_reward": self.largest_reward,
+        }
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on where `state` was taken."""
         self.returns.extend(state["returns"])
         self.episodes = state["episodes"]
         self.fixed = None if state["fixed"] is None else state["fixed"].numpy()
+        self.largest_reward = state.get("largest_reward", 0.0)
 
     def episode(self, episode_return: float) -> int:
         """Note a finished episode; its number, from 0."""
@@ -102,3 +122,8 @@ class Telemetry:
     def return_sd(self) -> float:
         """Standard deviation of the returns of the last 100 episodes."""
         return float(np.std(self.returns)) if self.returns else 0.0
+
+    def _fix(self, batch: Batch, agent: Agent) -> None:
+        held = [] if self.fixed is None else list(self.fixed)
+        new = batch.frames[batch.obs_index[: FIXED_STATES - len(held)]].reshape(-1, *agent.spec.obs_shape)
+        self.fixed = np.array([*held, *new])

@@ -1,0 +1,91 @@
+"""What an actor does in a turn, without I/O of its own: choose actions, step emulators, notice episodes that end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.policy import Policy
+from common.envs.protocol import Steps, VectorEnv
+from common.types import Array, EpisodeEnd
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One step of all emulators, and what chose its actions.
+
+    actions: int32 [envs]. version: of the parameters that acted. ended: by stream, the episodes that this step ended.
+    """
+
+    actions: NDArray[np.int32]
+    steps: Steps
+    version: int
+    ended: Mapping[int, EpisodeEnd]
+
+
+class Player:
+    """Plays all emulators of one process with one policy.
+
+    Args:
+        epsilon: the probability of a random action after so many environment steps of the run.
+
+    Attributes:
+        steps: played by this process, in all its emulators.
+    """
+
+    def __init__(self, env: VectorEnv, policy: Policy, epsilon: Callable[[int], float]) -> None:
+        self.steps = 0
+        self._env = env
+        self._policy = policy
+        self._epsilon = epsilon
+        self._returns = np.zeros(env.num_envs)
+        self._lengths = np.zeros(env.num_envs, np.int64)
+        self._obs: Array
+        self._chosen: tuple[NDArray[np.int32], float, int]
+
+    def begin(self) -> Array:
+        """Start every emulator; the first observations, <frame_dtype>[envs, *obs_shape]."""
+        self._obs = self._env.reset()
+        return self._obs
+
+    def send(self, env_step: int, version: int) -> None:
+        """Choose an action for every emulator and begin to play it; `recv` must follow.
+
+        env_step: environment steps of the whole run so far, which epsilon depends on. version: of the parameters.
+        """
+        epsilon = self._epsilon(env_step)
+        self._play(self._policy.act(self._obs, epsilon), epsilon, version)
+
+    def replay(self, actions: NDArray[np.int32]) -> Turn:
+        """Play actions, int32 [envs], that were chosen before: how emulators come back to where they were."""
+        self._play(actions, 0.0, 0)
+        return self.recv()
+
+    def recv(self) -> Turn:
+        """What the actions sent last led to."""
+        actions, epsilon, version = self._chosen
+        steps = self._env.recv()
+        self._obs = steps.obs
+        self.steps += self._env.num_envs
+        self._returns += steps.raw_rewards
+        self._lengths += 1
+        ended = {}
+        if np.count_nonzero(steps.episode_over):
+            streams = np.flatnonzero(steps.episode_over).tolist()
+            ended = {stream: self._end(stream, steps, epsilon, version) for stream in streams}
+        return Turn(actions, steps, version, ended)
+
+    def _play(self, actions: NDArray[np.int32], epsilon: float, version: int) -> None:
+        self._chosen = actions, epsilon, version
+        self._env.send(actions)
+
+    def _end(self, stream: int, steps: Steps, epsilon: float, version: int) -> EpisodeEnd:
+        """Close the books of a stream's episode; the segment it goes into will say where in it the episode ends."""
+        # Networks that diverge give values that are not finite, which no segment may hold; the learner ends such a run.
+        q1_mean, q2_mean = np.nan_to_num(self._policy.mean_values(steps.next_obs[stream])).tolist()
+        episode_return, length = float(self._returns[stream]), int(self._lengths[stream])
+        self._returns[stream], self._lengths[stream] = 0.0, 0
+        return EpisodeEnd(0, episode_return, length, epsilon, q1_mean, q2_mean, version)

@@ -1,0 +1,77 @@
+"""The TD error of a batch, its cost, and what of it goes back through the network. Numpy on the host: few numbers."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.types import Batch
+
+Values = NDArray[np.float32]
+
+
+class Loss(Protocol):
+    """A cost of single TD errors."""
+
+    def cost(self, errors: Values) -> Values:
+        """The cost of each TD error, float32 [batch]."""
+
+    def slope(self, errors: Values) -> Values:
+        """The derivative of the cost of each TD error, float32 [batch]."""
+
+
+class SquaredError:
+    """1/2 e^2."""
+
+    def cost(self, errors: Values) -> Values:
+        """See `Loss`."""
+        return np.float32(0.5) * errors * errors
+
+    def slope(self, errors: Values) -> Values:
+        """See `Loss`."""
+        return errors
+
+
+class Huber:
+    """1/2 e^2 where |e| < 1, and |e| - 1/2 beyond: the squared error with its slope clipped to [-1, 1]."""
+
+    def cost(self, errors: Values) -> Values:
+        """See `Loss`."""
+        size = np.abs(errors)
+        return np.where(size < 1, np.float32(0.5) * size * size, size - np.float32(0.5))
+
+    def slope(self, errors: Values) -> Values:
+        """See `Loss`."""
+        return errors.clip(-1, 1)
+
+
+LOSSES: dict[str, Loss] = {"squared": SquaredError(), "huber": Huber()}
+
+
+def td_errors(
+    batch: Batch, values: Values, next_values: Values, best: NDArray[np.integer[Any]], gamma: float
+) -> Values:
+    """e[a] = y[a] - (r + gamma^k (1 - terminated) Q_target(x', best)) of the actions taken, float32 [batch].
+
+    k: the steps that a transition spans, 1 but for n-step returns.
+
+    values: y = Q(x), float32 [batch, actions]. next_values: Q_target(x'), likewise. best: int [batch], the next actions
+    whose values the targets take.
+    """
+    rows = np.arange(len(batch))
+    discounts = np.float32(gamma) ** batch.span * ~batch.terminated
+    errors: Values = values[rows, batch.actions] - (batch.rewards + discounts * next_values[rows, best])
+    return errors
+
+
+def output_error(batch: Batch, slopes: Values, outputs: Values) -> Values:
+    """The gradient of the batch's mean weighted cost with respect to the outputs, float32 [batch, actions].
+
+    slopes: float32 [batch], of each transition's cost; only the action taken has an entry that is not 0.
+    outputs: of the shape and the memory layout that the gradient gets.
+    """
+    error = np.zeros_like(outputs)
+    error[np.arange(len(batch)), batch.actions] = slopes * batch.weights / np.float32(len(batch))
+    return error

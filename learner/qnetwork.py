@@ -1,0 +1,112 @@
+"""A Q-network as training sees it, wherever its arrays live: PyTorch or numpy, float32 or with a copy in bfloat16."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from common.networks.network import FlatNetwork, build_network, preprocess
+from common.settings.config import RunConfig
+from common.types import Batch, EnvSpec
+from learner.edl.arrays import Array, assign
+from learner.edl.backprop import Tape
+from learner.edl.feedback import FeedbackRule
+from learner.edl.trainable import Trainable
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+
+class QNetwork:
+    """One network with the passes that an update is made of.
+
+    The parameters are float32. With network.dtype "bfloat16", target values and the passes of the gradient methods run
+    on a copy in bfloat16; error-driven feedback needs the accuracy of float32.
+
+    Args:
+        network: the parameters, also published and saved. half: a copy in bfloat16, or None.
+
+    Attributes:
+        theta, gradient: float32 [P], of PyTorch or numpy; the optimizer moves one along the other.
+    """
+
+    def __init__(self, network: FlatNetwork, half: FlatNetwork | None, config: RunConfig) -> None:
+        polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
+        in_numpy = polar_dtype is None and not config.learner.compile
+        self.network = network
+        self._half = half
+        self._trained = Trainable(network, in_numpy)
+        self._target = self._trained if half is None else Trainable(half, in_numpy)
+        self._source = self._target if config.feedback == "none" else self._trained
+        rule = FeedbackRule(self._source.chain, config.feedback, config.seed, polar_dtype)
+        ready = torch.compile if config.learner.compile else _as_it_is
+        self._forward = ready(self._source.chain.forward)
+        self._values = ready(self._target.values)
+        self._backward = ready(rule.backward)
+        self.theta, self.gradient = self._trained.theta, self._trained.gradient
+
+    def inputs(self, batch: Batch, spec: EnvSpec) -> Array:
+        """What both networks of a run take for a batch: [2 batch, *input], obs first, then next_obs."""
+        index = np.concatenate((batch.obs_index, batch.next_index)).reshape(-1)
+        if self._trained.in_numpy:
+            return batch.frames.take(index, axis=0)
+        device = self.network.flat.device
+        # Copies: arrays from the wire are read-only, and PyTorch warns of viewing those.
+        frames, places = torch.tensor(batch.frames, device=device), torch.tensor(index, device=device)
+        return preprocess(frames.index_select(0, places).view(-1, *spec.obs_shape), spec)
+
+    def forward(self, inputs: Array) -> Tape:
+        """A pass that `backward` can follow."""
+        return self._forward(self._source.cast(inputs))
+
+    def values(self, inputs: Array) -> NDArray[np.float32]:
+        """Q-values as targets take them, float32 [batch, actions] on the host."""
+        return on_host(self._values(self._target.cast(inputs)))
+
+    def backward(self, tape: Tape, output_error: NDArray[np.float32], s: float) -> None:
+        """Write the gradient that the feedback makes of an output error, float32 [batch, actions], into `gradient`."""
+        self._backward(tape, self._source.cast(output_error), s, self._source.gradients)
+        if self._source is not self._trained:
+            assign(self.gradient, self._source.gradient)
+
+    def decay(self, rates: Array) -> None:
+        """Add rates * theta, rates float32 [P], to the gradient."""
+        self.gradient += self._trained.cast(rates) * self.theta
+
+    def load(self, flat: Tensor | NDArray[np.float32]) -> None:
+        """Overwrite all parameters, float32 [P]."""
+        self.network.load(flat)
+        self.changed()
+
+    def changed(self) -> None:
+        """Bring the copy in bfloat16 up to date; call after theta was written."""
+        if self._half is not None:
+            self._half.load(self.network.flat)
+
+
+def make_network(
+    config: RunConfig, spec: EnvSpec, number: int, device: torch.device, dtype: torch.dtype = torch.float32
+) -> FlatNetwork:
+    """Network 0 or 1 of a run as it starts; the same one for both where the method has one and a copy."""
+    seed = int(np.random.SeedSequence([config.seed, number if config.two_networks else 0]).generate_state(1)[0])
+    return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
+
+
+def make_q_network(config: RunConfig, spec: EnvSpec, number: int, device: torch.device) -> QNetwork:
+    """Network 0 or 1 of a run as it starts, ready to be trained."""
+    in_half = config.network.dtype == "bfloat16"
+    half = make_network(config, spec, number, device, torch.bfloat16) if in_half else None
+    return QNetwork(make_network(config, spec, number, device), half, config)
+
+
+def on_host(values: Array) -> NDArray[np.float32]:
+    """Values of either library as numpy's, float32."""
+    return values.float().cpu().numpy() if isinstance(values, Tensor) else values
+
+
+def _as_it_is(function: FunctionT) -> FunctionT:
+    return function
