@@ -180,22 +180,103 @@ def test_a_failing_cell_does_not_stop_the_rest_and_one_that_another_process_runs
     assert list(summaries(tmp_path / "d")) == ["coop-seed=0"]
 
 
-def test_a_job_array_of_distributed_cells(tmp_path: Path) -> None:
-    """The submission is to a stand-in for sbatch; the submitted script runs in earnest, as one task would run it."""
+def test_a_cell_that_diverged_is_listed_and_not_run_again(tmp_path: Path) -> None:
+    (tmp_path / "g.toml").write_text(TINY.replace("900", "300"))
+    lost = tmp_path / "d" / "dqn-seed=0"
+    lost.mkdir(parents=True)
+    (lost / "summary.json").write_text('{"exit": "diverged: TD errors are not finite at update 2"}')
+    for _ in range(2):
+        done = sweep(str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--jobs", "1")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.count("dqn-seed=0: diverged: TD errors are not finite at update 2\n") == 1
+        assert done.stdout.endswith(f"all 2 cells are finished, 1 of them diverged; coop-report {tmp_path}/d\n")
+        assert [path.name for path in lost.iterdir()] == ["summary.json"]
+
+
+SBATCH = """#!/bin/bash
+# Prints what Slurm 22.05 printed. Of an array's script it keeps what squeue prints of its tasks.
+cd "$(dirname "$0")"
+for script; do :; done
+last=$(sed -n 's/^#SBATCH --array=0-\\([0-9]*\\).*/\\1/p' "$script")
+if ((last >= $(cat size))); then
+  echo "sbatch: error: Batch job submission failed: Invalid job array specification" >&2
+  exit 1
+fi
+job=$(($(cat job) + 1)); echo $job > job
+echo "$@" >> asked
+echo $job
+for ((task = 0; task <= last; task++)); do echo "$job $task $script" >> queue; done
+"""
+SQUEUE = '#!/bin/bash\n[ "$*" = "--array --noheader --format=%F %K %o" ] && cat "$(dirname "$0")/queue"\n'
+SCONTROL = """#!/bin/bash
+[ "$*" = "show config" ] && echo "MailProg                = /bin/mail
+MaxArraySize            = $(cat "$(dirname "$0")/size")
+MaxDBDMsgs              = 0"
+"""
+
+
+@pytest.fixture
+def slurm(tmp_path: Path) -> Path:
+    """A folder with stand-ins for the programs of Slurm; `size` holds its MaxArraySize, `queue` what squeue prints."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for name, text in (("sbatch", SBATCH), ("squeue", SQUEUE), ("scontrol", SCONTROL)):
+        (folder / name).write_text(text)
+        (folder / name).chmod(0o755)
+    for name, text in (("size", "1001"), ("job", "11"), ("queue", ""), ("asked", "")):
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_what_slurm_holds_is_not_submitted_again_and_large_grids_are_split(tmp_path: Path, slurm: Path) -> None:
+    (tmp_path / "g.toml").write_text(TINY.replace("[fixed]", "seeds = [0, 1, 2, 3]\n[fixed]"))
+    flags, path = (str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--slurm"), f"{slurm}:{os.environ['PATH']}"
+    (slurm / "size").write_text("6")
+    (slurm / "queue").write_text("7 0 /elsewhere/array-1.sh\n8 4294967294 /bin/true\n")
+    assert sweep(*flags, path=path).stdout == "job 12: 6 cells submitted\njob 13: 2 cells submitted\n"
+    assert sweep(*flags, path=path).stdout == "job 12: 6 cells queued or running\njob 13: 2 cells queued or running\n"
+    queue = (slurm / "queue").read_text()
+    (slurm / "queue").write_text("".join(line for line in queue.splitlines(True) if not line.startswith("12 5")))
+    done = sweep(*flags, "--jobs", "3", path=path)
+    assert done.stdout.splitlines()[-1] == "job 14: 1 cell submitted"
+    (submitted,) = (tmp_path / "d" / "array-3.cells").read_text().splitlines()
+    assert submitted == (tmp_path / "d" / "array-1.cells").read_text().splitlines()[5]
+    # With --jobs, one array waits for the other.
+    (slurm / "queue").write_text("")
+    assert sweep(*flags, "--jobs", "3", path=path).stdout == "job 15: 6 cells submitted\njob 16: 2 cells submitted\n"
+    assert (slurm / "asked").read_text().splitlines()[-1].startswith("--parsable --dependency=afterany:15 ")
+    (slurm / "queue").write_text("")
+    (slurm / "size").write_text("0")
+    assert sweep(*flags, path=path).stderr == ("coop-sweep: error: this Slurm takes no job arrays: MaxArraySize is 0\n")
+
+
+def test_a_job_array_of_distributed_cells(tmp_path: Path, slurm: Path) -> None:
+    """The submission is to stand-ins for Slurm; the submitted script runs in earnest, as one task would run it."""
     (tmp_path / "g.toml").write_text(f'mode = "distributed"\n{TINY.replace("900", "600")}')
     flags = (str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--slurm", "--jobs", "7")
     missing = sweep(*flags, path="/nowhere")
     assert missing.returncode == 1
-    assert missing.stderr == f"coop-sweep: error: sbatch: not found here; submit {tmp_path}/d/array.sh where it is\n"
-    sbatch = tmp_path / "bin" / "sbatch"
-    sbatch.parent.mkdir()
-    sbatch.write_text('#!/bin/sh\n[ $# = 1 ] && echo "Submitted batch job 12"\n')
-    sbatch.chmod(0o755)
-    done = sweep(*flags, path=f"{sbatch.parent}:{os.environ['PATH']}")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "Submitted batch job 12\n", "")
-    script = tmp_path / "d" / "array.sh"
+    assert missing.stderr == "coop-sweep: error: squeue: not found here; give the same command where Slurm is\n"
+    done = sweep(*flags, path=f"{slurm}:{os.environ['PATH']}")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "job 12: 2 cells submitted\n", "")
+    script = tmp_path / "d" / "array-1.sh"
     assert "#SBATCH --array=0-1%7\n#SBATCH --cpus-per-task=3\n" in script.read_text()
+    assert "\n#SBATCH --open-mode=append\n#SBATCH --requeue\n" in script.read_text()
     assert not summaries(tmp_path / "d")
     task = {**os.environ, "SLURM_ARRAY_TASK_ID": "1"}
     subprocess.run(["bash", str(script)], env=task, capture_output=True, timeout=250, check=True)
     assert [json.loads(text)["method"] for text in summaries(tmp_path / "d").values()] == ["coop"]
+
+
+def test_a_refused_array_leaves_nothing_behind(tmp_path: Path, slurm: Path) -> None:
+    (tmp_path / "g.toml").write_text(TINY)
+    (slurm / "scontrol").write_text("#!/bin/bash\necho 'MaxArraySize = 9'\n")
+    (slurm / "size").write_text("1")
+    done = sweep(
+        str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--slurm", path=f"{slurm}:{os.environ['PATH']}"
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        "coop-sweep: error: sbatch: error: Batch job submission failed: Invalid job array specification\n"
+    )
+    assert [path.name for path in (tmp_path / "d").iterdir()] == ["sweep.toml"]

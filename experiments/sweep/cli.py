@@ -60,8 +60,8 @@ def _run() -> None:
     cells = _chosen(options, grid, folder)
     _settle(grid, cells, folder)
     if options.slurm:
-        left = [cell.cell.name for cell in cells if not cell.finished()]
-        print(slurm.submit(grid.file, folder, left, options.jobs) if left else "every cell is finished")
+        left = [cell.cell.name for cell in cells if not (cell.finished() or cell.diverged())]
+        print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
         return
     # The libraries below a run start a thread for each core unless told otherwise, and runs side by side starve.
     os.environ.update(dict.fromkeys(THREADS, "1"))
@@ -108,6 +108,8 @@ def _work(runner: Runner, folder: Path) -> None:
         finally:
             runner.abort()
         line = display.line()
+    for name, how in runner.tally.diverged.items():
+        print(f"{name}: {how}")
     for name, why in runner.tally.failed.items():
         print(f"failed: {name}: {why}")
     if not runner.done:
@@ -115,4 +117,5 @@ def _work(runner: Runner, folder: Path) -> None:
     if runner.tally.failed:
         count = len(runner.tally.failed)
         raise RunError(f"{count} of {len(runner.folders)} cells failed; the same command tries them again")
-    print(f"all {len(runner.folders)} cells are finished; coop-report {folder}")
+    diverged = f", {len(runner.tally.diverged)} of them diverged" if runner.tally.diverged else ""
+    print(f"all {len(runner.folders)} cells are finished{diverged}; coop-report {folder}")

@@ -30,6 +30,8 @@ class SweepDisplay(LiveDisplay):
         if tally.skipped:
             text += f" ({tally.skipped} before)"
         text += f", {len(runner.running)} running, {len(runner.waiting)} waiting"
+        if tally.diverged:
+            text += f", {len(tally.diverged)} diverged"
         if tally.failed:
             text += f", {len(tally.failed)} FAILED"
         return f"{text}; {self._time_left()}"

@@ -52,6 +52,10 @@ class CellFolder:
         """True once its run has gone through to the end."""
         return self.outcome().startswith("complete")
 
+    def diverged(self) -> bool:
+        """True once its run has diverged, which it would do again."""
+        return self.outcome().startswith("diverged")
+
     def outcome(self) -> str:
         """How its run ended, in the words of summary.json; empty while there is none."""
         try:

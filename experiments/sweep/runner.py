@@ -28,7 +28,8 @@ class Running:
 class Tally:
     """What has become of the cells, for displays.
 
-    skipped: finished before. elsewhere: finished by another process meanwhile. failed: name and reason.
+    skipped: finished before. elsewhere: finished by another process meanwhile. failed: name and reason. diverged: name
+    and how the run ended, now or before; a cell that diverged is not run again.
     steps: environment steps done by the finished runs of this process.
     """
 
@@ -36,6 +37,7 @@ class Tally:
     finished: int = 0
     elsewhere: int = 0
     failed: dict[str, str] = field(default_factory=dict)
+    diverged: dict[str, str] = field(default_factory=dict)
     steps: int = 0
 
 
@@ -57,6 +59,8 @@ class Runner:
         for folder in folders:
             if folder.finished():
                 self.tally.skipped += 1
+            elif folder.diverged():
+                self.tally.diverged[folder.cell.name] = folder.outcome()
             else:
                 self.waiting.append(folder)
 
@@ -87,6 +91,8 @@ class Runner:
             run.process.end(max(0.0, deadline - time.monotonic()))
             if run.folder.finished():
                 self.tally.finished += 1
+            elif run.folder.diverged():
+                self.tally.diverged[run.folder.cell.name] = run.folder.outcome()
             else:
                 self.waiting.append(run.folder)
         self.running.clear()
@@ -104,6 +110,9 @@ class Runner:
                 self.tally.finished += 1
                 self.tally.steps += max(0, run.folder.cell.config.total_steps - run.began)
                 happened.append(f"{name}: return {run.progress.mean_return:.1f}")
+            elif run.folder.diverged():
+                self.tally.diverged[name] = run.folder.outcome()
+                happened.append(f"{name}: {run.folder.outcome()}")
             else:
                 why = run.process.why() if status else f"stopped early: {run.folder.outcome() or 'no summary.json'}"
                 self.tally.failed[name] = why
@@ -134,6 +143,8 @@ class Runner:
                     self.waiting.append(folder)
                 elif folder.finished():
                     self.tally.elsewhere += 1
+                elif folder.diverged():
+                    self.tally.diverged[name] = folder.outcome()
                 else:
                     began = folder.progress().step
                     folder.prepare()
