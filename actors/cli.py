@@ -14,7 +14,7 @@ from actors.service import ActorService
 from common.envs.make import make_vector_env
 from common.errors import JoinError, PeerLost
 from common.messaging.joining import Membership, join
-from common.messaging.messages import Join, Joined
+from common.messaging.messages.join import Join, Joined
 from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.networks.network import FlatNetwork, build_network

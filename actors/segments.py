@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,7 +74,7 @@ class SegmentAssembler:
         self._versions[now] = param_version
         for stream, end in episode_ends.items():
             place = self._waiting[stream] + self._steps
-            self._episodes.setdefault(stream, []).append(replace(end, step_in_segment=place))
+            self._episodes.setdefault(stream, []).append(msgspec.structs.replace(end, step_in_segment=place))
         self._steps += 1
         return self.flush() if self._steps == self._length else []
 

@@ -6,7 +6,8 @@ import time
 
 from actors.policy import Policy
 from common.errors import BadMessage
-from common.messaging import messages
+from common.messaging.keys import role_key, weights_key
+from common.messaging.messages.weights import Current, Role, Weights
 from common.messaging.transport import NoAnswer, Node
 from common.messaging.wire import Message
 
@@ -26,9 +27,9 @@ class WeightsFollower:
         self._held = [-1, -1]
         self._told = [-1, -1]
         self._overdue: float | None = None
-        self._keys = [node.key("weights", "1"), node.key("weights", "2")]
+        self._keys = [weights_key(node, 1), weights_key(node, 2)]
         self._weights = [node.latest(key) for key in self._keys]
-        self._role = node.latest(node.key("role"))
+        self._role = node.latest(role_key(node))
 
     @property
     def version(self) -> int:
@@ -60,26 +61,26 @@ class WeightsFollower:
 
     def fetch(self) -> None:
         """Ask the learner for both networks and the role; nothing changes if it does not answer."""
-        question = messages.encode_question(self._node.run, "current")
+        question = Current().encode(self._node.run)
         try:
             for key in self._keys:
                 self._load(self._node.ask(key, question, timeout=2.0))
-            self._follow(self._node.ask(self._node.key("role"), question, timeout=2.0))
+            self._follow(self._node.ask(role_key(self._node), question, timeout=2.0))
         except NoAnswer:
             return
 
     def _load(self, message: Message) -> None:
         try:
-            number, version, flat = messages.decode_weights(message, self._size)
+            weights = Weights.decode(message, self._size)
         except BadMessage:
             self._node.count_bad()
             return
-        self._policy.networks[number - 1].load(flat)
-        self._held[number - 1] = version
+        self._policy.networks[weights.network - 1].load(weights.flat)
+        self._held[weights.network - 1] = weights.version
 
     def _follow(self, message: Message) -> None:
         try:
-            role = messages.decode_role(message)
+            role = Role.decode(message)
         except BadMessage:
             self._node.count_bad()
             return

@@ -26,8 +26,8 @@ import torch
 
 from actors.policy import Policy
 from common.envs.make import env_spec, make_vector_env
-from common.messaging import messages
-from common.messaging.clients import replay_key
+from common.messaging.keys import replay_key
+from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
 from common.networks.network import FlatNetwork, build_network
 from common.process.processes import ChildProcess, command, free_endpoint
@@ -154,9 +154,9 @@ class Topology:
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def _inserted(self) -> int:
-        question = messages.encode_question(RUN, "stats")
+        question = StatsQuestion().encode(RUN)
         try:
-            return messages.decode_stats(self._node.ask(replay_key(self._node, "stats"), question)).inserted
+            return ReplayStats.decode(self._node.ask(replay_key(self._node, "stats"), question)).inserted
         except NoAnswer:  # it has not begun to answer
             return 0
 

@@ -27,11 +27,17 @@ from mutations import mutate
 from roles import Roles, replay_stats, running, wait_until
 
 from common.errors import BadMessage, CoopError, RunError
-from common.messaging import experience, limits, messages, wire
-from common.messaging.clients import replay_key
-from common.messaging.experience import DrawRequest, SegmentReader
-from common.messaging.joining import join, join_key
-from common.messaging.messages import Join, Joined
+from common.messaging import wire
+from common.messaging.joining import join
+from common.messaging.keys import join_key, replay_key
+from common.messaging.messages.epoch import Snapshot, Written
+from common.messaging.messages.insert import SegmentReader, encode_segment
+from common.messaging.messages.join import Join, Joined
+from common.messaging.messages.limits import Limit, LimitsQuestion
+from common.messaging.messages.sample import DrawRequest
+from common.messaging.messages.stats import StatsQuestion
+from common.messaging.messages.stop import EndOfRun
+from common.messaging.messages.weights import Current
 from common.messaging.transport import Node, Pending, Refused, new_incarnation, open_session
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
@@ -131,45 +137,41 @@ def targets(node: Node, joined: Joined) -> list[Target]:
     )
 
     def sample(message: Message) -> None:
-        if experience.decode_sample(message).batch_size != batch_size:
+        if DrawRequest.decode(message).batch_size != batch_size:
             raise BadMessage("fields.batch_size", "not this run's")
 
     def snapshot(message: Message) -> None:
-        (messages.decode_snapshot if message.kind == "snapshot" else messages.decode_written)(message)
+        (Snapshot.decode if message.kind == "snapshot" else Written.decode)(message)
 
     def limiting(message: Message) -> None:
         if message.kind == "limit":
-            limits.decode_limit(message)
+            Limit.decode(message)
         else:
-            messages.decode_question("limits", message)
+            LimitsQuestion.decode(message)
 
     def joining(role: str, message: Message) -> None:
-        if messages.decode_join(message).role != role:
+        if Join.decode(message).role != role:
             raise BadMessage("fields.role", "not this key's")
 
     draw = DrawRequest(1, 0, 0, batch_size, 0)
-    question = partial(messages.encode_question, RUN)
-    current = partial(messages.decode_question, "current")
     made: list[tuple[str, bytearray, str, Callable[[Message], Any]]] = [
-        (replay_key(node, "insert"), experience.encode_segment(RUN, segment), "replay", SegmentReader(spec)),
-        (replay_key(node, "sample"), experience.encode_sample(RUN, draw), "replay", sample),
-        (replay_key(node, "limits"), limits.encode_limit(RUN, 1.0, 64.0), "replay", limiting),
-        (replay_key(node, "limits"), question("limits"), "replay", limiting),
-        (replay_key(node, "stats"), question("stats"), "replay", partial(messages.decode_question, "stats")),
-        (replay_key(node, "snapshot"), messages.encode_snapshot(RUN, 7, [3]), "replay", snapshot),
-        (replay_key(node, "snapshot"), messages.encode_written(RUN, 7), "replay", snapshot),
+        (replay_key(node, "insert"), encode_segment(RUN, segment), "replay", SegmentReader(spec)),
+        (replay_key(node, "sample"), draw.encode(RUN), "replay", sample),
+        (replay_key(node, "limits"), Limit(1.0, 64.0).encode(RUN), "replay", limiting),
+        (replay_key(node, "limits"), LimitsQuestion().encode(RUN), "replay", limiting),
+        (replay_key(node, "stats"), StatsQuestion().encode(RUN), "replay", StatsQuestion.decode),
+        (replay_key(node, "snapshot"), Snapshot(7, [3]).encode(RUN), "replay", snapshot),
+        (replay_key(node, "snapshot"), Written(7).encode(RUN), "replay", snapshot),
         *(
-            (join_key(node, role), messages.encode_join(RUN, Join(role, 5, [])), "learner", partial(joining, role))
+            (join_key(node, role), Join(role, 5, []).encode(RUN), "learner", partial(joining, role))
             for role in ("actor", "replay")
         ),
-        (node.key("weights", "1"), question("current"), "learner", current),
-        (node.key("weights", "2"), question("current"), "learner", current),
-        (node.key("role"), question("current"), "learner", current),
+        (node.key("weights", "1"), Current().encode(RUN), "learner", Current.decode),
+        (node.key("weights", "2"), Current().encode(RUN), "learner", Current.decode),
+        (node.key("role"), Current().encode(RUN), "learner", Current.decode),
     ]
     queried = [Target(key, bytes(payload), owner, read) for key, payload, owner, read in made]
-    stop = Target(
-        node.key("stop"), bytes(messages.encode_stop(RUN, "x")), "replay", messages.decode_stop, answers=False
-    )
+    stop = Target(node.key("stop"), bytes(EndOfRun.because("x").encode(RUN)), "replay", EndOfRun.decode, answers=False)
     return [*queried, stop]
 
 
@@ -206,12 +208,12 @@ class Watch:
     def everything(self, number: int) -> dict[str, bytes]:
         """The state of both roles, in bytes."""
         key = replay_key(self._node, "snapshot")
-        self._node.ask(key, messages.encode_snapshot(RUN, number, []), 60.0)
-        while self._node.ask(key, messages.encode_written(RUN, number), 60.0).kind == "retry":
+        self._node.ask(key, Snapshot(number, []).encode(RUN), 60.0)
+        while self._node.ask(key, Written(number).encode(RUN), 60.0).kind == "retry":
             pass
         saved = self._folder / "checkpoints" / str(number) / "replay"
         state = {path.name: path.read_bytes() for path in saved.iterdir()}
-        question = messages.encode_question(RUN, "current")
+        question = Current().encode(RUN)
         for key in (("weights", "1"), ("weights", "2"), ("role",)):
             answer = self._node.ask(self._node.key(*key), question)
             arrays = {name: array.tobytes() for name, array in answer.arrays.items()}

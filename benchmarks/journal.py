@@ -14,13 +14,14 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 from table import ATARI, segments
 
-from common.messaging import messages
-from common.messaging.clients import InsertClient, replay_key
+from common.messaging.clients import InsertClient
+from common.messaging.keys import replay_key
+from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
@@ -57,7 +58,7 @@ class Service:
         incarnation = new_incarnation()
         self._node = stack.enter_context(Node(open_session((), (at,)), run, "actor", incarnation))
         self._client = InsertClient(self._node, Stop(), WINDOW)
-        self._stream = (replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
+        self._stream = (msgspec.structs.replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
         self._epoch = 0
         self.insert(1.0)
 
@@ -78,8 +79,8 @@ class Service:
 
     def _save(self) -> None:
         self._epoch += 1
-        self._ask(messages.encode_snapshot(self._node.run, self._epoch, []))
-        while self._ask(messages.encode_written(self._node.run, self._epoch)) == "retry":
+        self._ask(Snapshot(self._epoch, []).encode(self._node.run))
+        while self._ask(Written(self._epoch).encode(self._node.run)) == "retry":
             pass
 
     def _ask(self, question: bytearray) -> str:

@@ -17,17 +17,17 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import zenoh
 from table import ATARI, segments
 
-from common.messaging import experience
 from common.messaging.clients import InsertClient, SampleClient
+from common.messaging.messages.insert import encode_segment
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
@@ -92,8 +92,8 @@ def bare_server(endpoint: str, shared_memory: bool, end: Connection) -> None:
 def inserter(endpoints: tuple[str, ...], shared_memory: bool, end: Connection) -> None:
     """Insert on demand; answers each `Work` with the transitions that were acknowledged."""
     incarnation = new_incarnation()
-    stream = (replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
-    bare = experience.encode_segment(RUN, next(segments(ATARI, STEPS)))
+    stream = (msgspec.structs.replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
+    bare = encode_segment(RUN, next(segments(ATARI, STEPS)))
     waiting: deque[Any] = deque()
     with Node(open_session((), endpoints, shared_memory=shared_memory), RUN, "actor", incarnation) as node:
         client = InsertClient(node, Stop(), window=WINDOW)

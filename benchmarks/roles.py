@@ -12,9 +12,9 @@ from typing import Any, Self
 import zenoh
 
 from common.errors import RunError
-from common.messaging import messages, wire
-from common.messaging.clients import replay_key
-from common.messaging.messages import ReplayStats
+from common.messaging import wire
+from common.messaging.keys import replay_key
+from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.transport import Node
 from common.process.processes import ChildProcess, command
 
@@ -122,8 +122,8 @@ class ActorWatch:
 
 def replay_stats(node: Node, timeout: float = 5.0) -> ReplayStats:
     """The replay service's counters; raises as `Node.ask`."""
-    question = messages.encode_question(node.run, "stats")
-    return messages.decode_stats(node.ask(replay_key(node, "stats"), question, timeout))
+    question = StatsQuestion().encode(node.run)
+    return ReplayStats.decode(node.ask(replay_key(node, "stats"), question, timeout))
 
 
 def wait_until(what: str, reached: Callable[[], bool], seconds: float = 60.0) -> float:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import count, cycle
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from common.settings.capacity import estimated_bytes
@@ -48,7 +48,8 @@ def segments(spec: EnvSpec, steps: int, streams: int = 8) -> Iterator[Segment]:
     for sequence in count():
         carried = spec.stack if sequence else 0
         for stream in range(streams):
-            yield replace(first, stream=stream, sequence=sequence, frames=frames[stream], carried=carried)
+            changed = {"stream": stream, "sequence": sequence, "frames": frames[stream], "carried": carried}
+            yield msgspec.structs.replace(first, **changed)
 
 
 def seconds(action: Callable[[], object]) -> float:

@@ -26,10 +26,11 @@ import numpy as np
 import torch
 from table import ATARI, segments
 
-from common.messaging import messages
-from common.messaging.clients import InsertClient, replay_key
+from common.messaging.clients import InsertClient
 from common.messaging.joining import join
-from common.messaging.messages import Join
+from common.messaging.keys import replay_key
+from common.messaging.messages.join import Join
+from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
@@ -155,9 +156,9 @@ class Topology:
             self._inserts.submit(next(self._segments))
 
     def _drawn(self) -> int | None:
-        question = messages.encode_question(RUN, "stats")
+        question = StatsQuestion().encode(RUN)
         try:
-            return messages.decode_stats(self._node.ask(replay_key(self._node, "stats"), question)).drawn
+            return ReplayStats.decode(self._node.ask(replay_key(self._node, "stats"), question)).drawn
         except NoAnswer:  # it has not begun to answer
             return None
 

@@ -15,8 +15,12 @@ MAX_ENV_ID = 256  # characters
 MAX_PAYLOAD = 1 << 28  # bytes of a message; also what a session takes in from one peer for one message
 MAX_LAYERS = 64  # hidden layers of a network
 MAX_STEPS = 10**12  # environment steps of a run
+MAX_COUNT = 2**40  # steps that an actor played, segments of a stream, episodes: a little above MAX_STEPS
 MAX_RATIO = 1e6  # updates per environment step; with MAX_STEPS, updates stay below 2^62
+MAX_UPDATES = 2**62
 MAX_TOLERANCE = 1e12  # environment steps
+MAX_MAGNITUDE = 1e9  # of a reward and of an observation: what is larger teaches a network nothing
+MAX_FLOAT32 = 3.4028234663852886e38
 MAX_INTEGER = 2**63 - 1  # of TOML, and of the counters on the wire
 
 # ALE counts frames in 32 bits, MAX_FRAME_SKIP * MAX_GAME_STEPS of them at most.

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
+
+from common.bounded import Count, Float32, Incarnation, Name, Share
+from common.bounds import MAX_COUNT, MAX_SEGMENT_STEPS, MAX_STACK, MAX_STREAMS, MAX_UPDATES
 
 Array = NDArray[Any]
 
 _NOT_GIVEN: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
-@dataclass(frozen=True, slots=True)
-class EnvSpec:
+class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
     """What a network and a table must know of an environment.
 
     frame_shape: shape of one stored frame, e.g. (84, 84) on Atari, (4,) on CartPole.
@@ -23,11 +27,11 @@ class EnvSpec:
     num_actions: size of the Discrete action space.
     """
 
-    env_id: str
-    frame_shape: tuple[int, ...]
-    frame_dtype: str
-    stack: int
-    num_actions: int
+    env_id: Name
+    frame_shape: Annotated[tuple[Annotated[int, Meta(ge=1, le=65_536)], ...], Meta(max_length=4)]
+    frame_dtype: Annotated[str, Meta(pattern="^(uint8|float32)$")]
+    stack: Annotated[int, Meta(ge=1, le=MAX_STACK)]
+    num_actions: Annotated[int, Meta(ge=1, le=100_000)]
 
     @property
     def obs_shape(self) -> tuple[int, ...]:
@@ -35,8 +39,7 @@ class EnvSpec:
         return self.frame_shape if self.stack == 1 else (self.stack, *self.frame_shape)
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodeEnd:
+class EpisodeEnd(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """One finished episode, told by the actor inside the segment that ends it.
 
     step_in_segment: index of the episode's last step in its segment.
@@ -44,17 +47,16 @@ class EpisodeEnd:
     q1_mean, q2_mean: mean over actions of Q1 and Q2 at the last observation.
     """
 
-    step_in_segment: int
-    episode_return: float
-    length: int
-    epsilon: float
-    q1_mean: float
-    q2_mean: float
-    param_version: int
+    step_in_segment: Annotated[int, Meta(ge=0, lt=MAX_SEGMENT_STEPS)]
+    episode_return: Annotated[float, Meta(ge=-1e15, le=1e15)]
+    length: Annotated[int, Meta(ge=1, le=MAX_COUNT)]
+    epsilon: Share
+    q1_mean: Float32
+    q2_mean: Float32
+    param_version: Annotated[int, Meta(ge=-1, le=MAX_UPDATES)]
 
 
-@dataclass(frozen=True, slots=True)
-class Segment:
+class Segment(Struct, frozen=True, forbid_unknown_fields=True):
     """Transitions that begin with consecutive steps of one emulator stream, as an actor sends them.
 
     frames: <frame_dtype>[n_frames, *frame_shape], each frame once.
@@ -68,9 +70,9 @@ class Segment:
     acked: transitions of this incarnation that had been acknowledged when this segment was sent first.
     """
 
-    incarnation: int
-    stream: int
-    sequence: int
+    incarnation: Incarnation
+    stream: Annotated[int, Meta(ge=0, lt=MAX_STREAMS)]
+    sequence: Count
     frames: Array
     obs_index: NDArray[np.int32]
     next_index: NDArray[np.int32]
@@ -78,14 +80,15 @@ class Segment:
     rewards: NDArray[np.float32]
     terminated: NDArray[np.bool_]
     param_version: NDArray[np.int64]
-    span: NDArray[np.uint8] = field(default_factory=lambda: _NOT_GIVEN)
-    carried: int = 0
-    acked: int = 0
-    episodes: tuple[EpisodeEnd, ...] = field(default=())
+    span: NDArray[np.uint8] = msgspec.field(default_factory=lambda: _NOT_GIVEN)
+    carried: Annotated[int, Meta(ge=0, le=1024)] = 0
+    acked: Count = 0
+    episodes: Annotated[tuple[EpisodeEnd, ...], Meta(max_length=MAX_SEGMENT_STEPS)] = ()
 
     def __post_init__(self) -> None:
         """Let each transition span one step where nothing else was said."""
-        _default_span(self)
+        if self.span is _NOT_GIVEN:
+            msgspec.structs.force_setattr(self, "span", _one_each(self.steps))
 
     @property
     def steps(self) -> int:
@@ -123,7 +126,8 @@ class Batch:
 
     def __post_init__(self) -> None:
         """Let each transition span one step where nothing else was said."""
-        _default_span(self)
+        if self.span is _NOT_GIVEN:
+            object.__setattr__(self, "span", _one_each(len(self)))
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -133,7 +137,6 @@ class Batch:
         return {column.name: getattr(self, column.name) for column in fields(self) if column.name != "frames"}
 
 
-def _default_span(transitions: Segment | Batch) -> None:
+def _one_each(count: int) -> NDArray[np.uint8]:
     """What was recorded before transitions could span several steps does not say that they span one."""
-    if transitions.span is _NOT_GIVEN:
-        object.__setattr__(transitions, "span", np.ones(len(transitions.actions), np.uint8))
+    return np.ones(count, np.uint8)

@@ -3,35 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from rich.console import Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from common.messaging.schema import Int, ListOf, Real, Rule, Text
-from common.messaging.schema import Table as TableOf
+from common.errors import BadMessage
+from common.messaging.keys import status_key
+from common.messaging.messages.status import LearnerStatus
 from common.messaging.transport import Node, open_session
 from common.process.display import LiveDisplay
 from common.process.lifecycle import Stop
-
-# What a display needs of the learner's status; a status where it does not fit is not shown.
-_SHOWN: dict[str, Rule] = {
-    "env_steps": Int(),
-    "total_steps": Int(),
-    "updates": Int(),
-    "updates_per_s": Real(),
-    "acting": Int(1, 2),
-    "episodes": Int(),
-    "return_mean_100": Real(),
-    "epsilon": Real(),
-    "s": Real(),
-    "waiting": Text(),
-    "connected": TableOf(),
-    "missing": ListOf(Text(128)),
-}
 
 PLAIN_EVERY = 5.0  # seconds between lines where the output is no terminal
 
@@ -46,16 +31,20 @@ class RunStatus:
 
     def __init__(self, run: str, endpoint: str, incarnation: int, zenoh_config: Path | None = None) -> None:
         self._node = Node(open_session((), (endpoint,), zenoh_config), run, "watch", incarnation)
-        self._learner = self._node.latest(self._node.key("metrics", "learner", "*"))
+        self._learner = self._node.latest(status_key(self._node, "learner"))
         self._told_at = time.monotonic()
         self.learner: dict[str, Any] = {}
 
     def refresh(self) -> None:
         """Take in what has been told since."""
         message = self._learner.take()
-        if message is not None and message.kind == "status" and _can_be_shown(message.fields):
-            self.learner = dict(message.fields)
-            self._told_at = time.monotonic()
+        if message is None:
+            return
+        try:
+            self.learner = msgspec.structs.asdict(LearnerStatus.decode(message))
+        except BadMessage:
+            return  # one that can't be shown; the next may be better
+        self._told_at = time.monotonic()
 
     def silent_for(self) -> float:
         """Seconds since the learner's last status; since the beginning if there was none."""
@@ -95,10 +84,6 @@ class RunStatus:
     def close(self) -> None:
         """Leave the run."""
         self._node.close()
-
-
-def _can_be_shown(fields: Mapping[str, Any]) -> bool:
-    return all(rule.problem(fields.get(name)) is None for name, rule in _SHOWN.items())
 
 
 class Display(LiveDisplay):

@@ -6,10 +6,10 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import torch
 
@@ -18,7 +18,7 @@ from actors.policy import Policy
 from actors.segments import SegmentAssembler
 from common.envs.make import make_vector_env
 from common.errors import UsageError
-from common.messaging.experience import EpisodeRecord
+from common.messaging.messages.sample import EpisodeRecord
 from common.process.randomness import generator_state, set_generator_state
 from common.settings import schedules
 from common.settings.config import RunConfig
@@ -68,7 +68,7 @@ class Lockstep:
         self._store(turn)
         self.step += 1
         table = self._table
-        told = replace(
+        told = msgspec.structs.replace(
             self.trainer.drawn,
             inserted=self.step,
             size=len(table),
@@ -82,7 +82,7 @@ class Lockstep:
                 table.update_priorities(batch.ids, effects.priorities)
             yield effects
         ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in turn.ended.items())
-        yield self.trainer.note(replace(told, episodes=ended))
+        yield self.trainer.note(msgspec.structs.replace(told, episodes=ended))
         if learner.swap_by == "plays" and self.step % learner.swap_every == 0:
             self.agent.swap()
         if learner.reset_role_at_episode and turn.ended and self.agent.acting:

@@ -13,7 +13,7 @@ import torch
 
 from common.envs.make import env_spec
 from common.errors import RunError, UsageError
-from common.messaging.experience import DrawRequest
+from common.messaging.messages.sample import DrawRequest
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from common.messaging import messages
-from common.messaging.messages import Role
+from common.messaging.keys import role_key, weights_key
+from common.messaging.messages.weights import Current, Role, Weights
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 from learner.agent import Agent
@@ -21,7 +21,7 @@ class Broadcaster:
         self.publish()
         node.serve(self._weights_key(0), lambda message: self._answer(message, self._weights[0]))
         node.serve(self._weights_key(1), lambda message: self._answer(message, self._weights[1]))
-        node.serve(node.key("role"), lambda message: self._answer(message, self._role))
+        node.serve(role_key(node), lambda message: self._answer(message, self._role))
 
     def publish(self) -> None:
         """Broadcast the networks that changed since they were published, then the role."""
@@ -29,7 +29,7 @@ class Broadcaster:
         for number, version in enumerate(agent.versions):
             if version != self._published[number]:
                 flat = agent.networks[number].snapshot()
-                self._weights[number] = messages.encode_weights(node.run, number + 1, version, flat)
+                self._weights[number] = Weights(number + 1, version, flat).encode(node.run)
                 self._published[number] = version
                 node.publish(self._weights_key(number), self._weights[number])
         self.publish_role()
@@ -38,12 +38,12 @@ class Broadcaster:
         """Broadcast who acts, and with which versions of the networks as they were published last."""
         agent, node = self._agent, self._node
         role = Role(agent.acting + 1, (self._published[0], self._published[1]), agent.updates)
-        self._role = messages.encode_role(node.run, role)
-        node.publish(node.key("role"), self._role)
+        self._role = role.encode(node.run)
+        node.publish(role_key(node), self._role)
 
     def _weights_key(self, number: int) -> str:
-        return self._node.key("weights", str(number + 1))
+        return weights_key(self._node, number + 1)
 
     def _answer(self, message: Message, payload: bytearray) -> bytearray:
-        messages.decode_question("current", message)
+        Current.decode(message)
         return payload

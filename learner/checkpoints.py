@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import CoopError, RunError
-from common.messaging import messages
-from common.messaging.clients import SampleClient, replay_key
+from common.messaging.clients import SampleClient
+from common.messaging.keys import replay_key
+from common.messaging.messages.answers import Retry
+from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.transport import NoAnswer, Node
 from common.messaging.wire import Message
 from learner.records.epochs import complete_epochs, save_epoch
@@ -70,10 +72,10 @@ class Checkpoints:
     def _save(self, number: int, state: dict[str, Any]) -> None:
         try:
             try:
-                self._ask(messages.encode_snapshot(self._node.run, number, complete_epochs(self._run_dir)))
+                self._ask(Snapshot(number, complete_epochs(self._run_dir)).encode(self._node.run))
             finally:
                 self._samples.release()
-            written = messages.encode_written(self._node.run, number)
+            written = Written(number).encode(self._node.run)
             save_epoch(self._run_dir, number, state, lambda _: self._wait_for(written))
         except OSError as error:
             raise RunError(f"epoch {number} in {self._run_dir}: {error.strerror or error}") from error
@@ -82,7 +84,7 @@ class Checkpoints:
         self.newest = number
 
     def _wait_for(self, question: bytearray) -> None:
-        while self._ask(question).kind == "retry":
+        while self._ask(question).kind == Retry.kind:
             time.sleep(PAUSE)
 
     def _ask(self, question: bytearray) -> Message:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from functools import partial
 
 from common.errors import BadMessage
-from common.messaging import messages
-from common.messaging.joining import join_key
-from common.messaging.messages import Join, Joined
+from common.messaging.keys import join_key
+from common.messaging.messages.answers import Retry
+from common.messaging.messages.join import Join, Joined
 from common.messaging.presence import Origin
 from common.messaging.transport import Node
 from common.messaging.wire import Message
@@ -48,13 +48,13 @@ class Reception:
             node.serve(join_key(node, role), partial(self._answer, role))
 
     def _answer(self, role: str, message: Message) -> bytearray:
-        request = messages.decode_join(message)
+        request = Join.decode(message)
         if request.role != role:
             raise BadMessage("fields.role", f"{request.role!r}; this key is for {role!r}")
         try:
             index = self._roster.actor(request) if role == "actor" else self._admit(request)
         except Occupied as other:
-            return messages.encode_retry(self._node.run, str(other))
+            return Retry(str(other)).encode(self._node.run)
         joined = Joined(
             self._config,
             self._spec,
@@ -65,7 +65,7 @@ class Reception:
             self._newest_epoch(),
             replay=self._replay,
         )
-        return messages.encode_joined(joined)
+        return joined.answer()
 
     def _admit(self, request: Join) -> int:
         """The number of the replay service that serves, and to which actors are sent; raises as `Roster`."""

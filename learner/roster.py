@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from common.errors import BadMessage, RunError
-from common.messaging.messages import Join
+from common.messaging.messages.join import Join
 from common.messaging.presence import LEASE, Origin
 from common.process.files import write_whole
 

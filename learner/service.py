@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import Any
 
-from common.messaging import messages
-from common.messaging.clients import SampleClient, replay_key
-from common.messaging.messages import ReplayStats
+import msgspec
+
+from common.messaging.clients import SampleClient
+from common.messaging.keys import replay_key, stop_key
+from common.messaging.messages.stats import ReplayStats, StatsQuestion
+from common.messaging.messages.stop import EndOfRun
 from common.messaging.transport import NoAnswer, Node
 from common.process.lifecycle import Stop
 from learner.broadcast import Broadcaster
@@ -86,7 +88,7 @@ class LearnerService:
             if trainer.epoch_due() and self._checkpoints.begin(self._state):
                 trainer.epoch_begun()
         elif trainer.trained_out() and (stats := self._replay_stats()) is not None:
-            self._carry_out(trainer.note(replace(trainer.drawn, inserted=stats.inserted)))
+            self._carry_out(trainer.note(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
         if time.monotonic() >= self._status_due:
             self._tell()
 
@@ -160,9 +162,9 @@ class LearnerService:
         return summary
 
     def _replay_stats(self) -> ReplayStats | None:
-        question = messages.encode_question(self._node.run, "stats")
+        question = StatsQuestion().encode(self._node.run)
         try:
-            return messages.decode_stats(self._node.ask(replay_key(self._node, "stats"), question))
+            return ReplayStats.decode(self._node.ask(replay_key(self._node, "stats"), question))
         except NoAnswer:
             return None
 
@@ -177,7 +179,7 @@ class LearnerService:
         """Announce the stop until the other roles have gone, or their time is up."""
         deadline = time.monotonic() + FAREWELL
         while time.monotonic() < deadline:
-            self._node.announce(self._node.key("stop"), messages.encode_stop(self._node.run, outcome))
+            self._node.announce(stop_key(self._node), EndOfRun.because(outcome).encode(self._node.run))
             time.sleep(0.1)
             alive = self._node.presence.counts()
             if not alive.get("actor") and not alive.get("replay"):

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.messaging.experience import Drawn
+from common.messaging.messages.sample import Drawn
 from common.returns import RETURN_WINDOW
 from common.types import Array, Batch
 from learner.agent import Agent, Update

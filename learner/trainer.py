@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messaging.experience import Drawn, EpisodeRecord
+from common.messaging.messages.sample import Drawn, EpisodeRecord
 from common.settings import schedules
 from common.types import Batch
 from learner.agent import Agent
@@ -136,7 +137,7 @@ class Trainer:
         return {
             "agent": self.agent.state(),
             "telemetry": self.telemetry.state(),
-            "drawn": {name: value for name, value in asdict(self.drawn).items() if name != "episodes"},
+            "drawn": {name: value for name, value in msgspec.structs.asdict(self.drawn).items() if name != "episodes"},
             "seconds": self.seconds(now),
         }
 
@@ -154,7 +155,7 @@ class Trainer:
 
     def _book(self, drawn: Drawn) -> list[EpisodeRow]:
         """Keep the counters, and number the episodes."""
-        self.drawn = replace(drawn, episodes=()) if drawn.episodes else drawn
+        self.drawn = msgspec.structs.replace(drawn, episodes=()) if drawn.episodes else drawn
         number, updates, s = self.telemetry.episode, self.agent.updates, self.agent.exploration_rate()
         return [EpisodeRow(number(record.end.episode_return), record, updates, s) for record in drawn.episodes]
 

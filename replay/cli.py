@@ -7,7 +7,7 @@ from pathlib import Path
 
 from common.errors import PeerLost, RunError, UsageError
 from common.messaging.joining import Membership, join
-from common.messaging.messages import Join, Joined
+from common.messaging.messages.join import Join, Joined
 from common.messaging.presence import LEASE
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process import cli

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import RunError
-from common.messaging.experience import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
+from common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
 from common.settings.capacity import check_memory
 from common.settings.config import RunConfig
 from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
@@ -219,7 +220,7 @@ class ReplayCore:
             "duplicates": self.duplicates,
             "seen": self._seen.state(),
             "first_episode": self._first_episode,
-            "episodes": [astuple(record) for record in self._episodes],
+            "episodes": msgspec.to_builtins(self._episodes),
             "accounts": [[actor, account.accepted, account.acked] for actor, account in self._accounts.items()],
             "learners": list(self._learners),
             "limiter": asdict(self.limiter),

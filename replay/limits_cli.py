@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from common.errors import RunError
-from common.messaging import limits, messages
-from common.messaging.clients import replay_key
 from common.messaging.joining import join
-from common.messaging.limits import Limits
-from common.messaging.messages import Join
+from common.messaging.keys import replay_key
+from common.messaging.messages.join import Join
+from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
 from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation, open_session
 from common.process import cli
 from common.process.lifecycle import Stop, run_main
@@ -42,11 +41,11 @@ def _run() -> None:
         return
     endpoints = (*options.connect, *joined.replay_endpoints)
     with Node(open_session((), endpoints, options.zenoh_config), options.run, "watch", 0) as node:
-        now = _ask(node, messages.encode_question(node.run, "limits"))
+        now = _ask(node, LimitsQuestion().encode(node.run))
         if options.ratio is not None or options.tolerance is not None:
             ratio = now.ratio if options.ratio is None else options.ratio
             tolerance = now.tolerance if options.tolerance is None else options.tolerance
-            now = _ask(node, limits.encode_limit(node.run, ratio, tolerance))
+            now = _ask(node, Limit(ratio, tolerance).encode(node.run))
     print(f"ratio {now.ratio:g}, tolerance {now.tolerance:g} steps")
     print(f"{now.inserted:,} transitions, {now.drawn:,} batches of {now.planned:,}")
     print(f"inserts: {now.inserts_wait_for or 'admitted'}; samples: {now.samples_wait_for or 'admitted'}")
@@ -54,7 +53,7 @@ def _run() -> None:
 
 def _ask(node: Node, question: bytearray) -> Limits:
     try:
-        return limits.decode_limits(node.ask(replay_key(node, "limits"), question))
+        return Limits.decode(node.ask(replay_key(node, "limits"), question))
     except NoAnswer as error:
         raise RunError(f"the replay service of run {node.run!r} does not answer") from error
     except Refused as error:

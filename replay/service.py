@@ -13,11 +13,13 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from common.errors import BadMessage, RunError
-from common.messaging import experience, limits, messages
-from common.messaging.clients import replay_key
-from common.messaging.experience import DrawRequest, SegmentReader
-from common.messaging.limits import Limits
-from common.messaging.messages import ReplayStats
+from common.messaging.keys import replay_key
+from common.messaging.messages.answers import Ack, Retry
+from common.messaging.messages.epoch import Snapshot, Written
+from common.messaging.messages.insert import SegmentReader
+from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from common.messaging.messages.sample import DrawRequest, encode_batch
+from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
@@ -123,16 +125,16 @@ class ReplayService:
         segment = self._read_segment(message)
         outcome = self._admit(self._inserts, lambda: self._core.insert(segment, message.payload))
         if isinstance(outcome, Wait):
-            return messages.encode_retry(self._node.run, outcome.reason)
-        return messages.encode_ack(self._node.run, outcome)
+            return Retry(outcome.reason).encode(self._node.run)
+        return Ack(outcome).encode(self._node.run)
 
     def _sample(self, message: Message) -> bytearray:
-        request = experience.decode_sample(message)
+        request = DrawRequest.decode(message)
         if request.batch_size != self._core.batch_size:
             raise BadMessage("fields.batch_size", f"{request.batch_size}; this run draws {self._core.batch_size}")
         outcome = self._admit(self._draws, lambda: self._draw(request))
         if isinstance(outcome, Wait):
-            return messages.encode_retry(self._node.run, outcome.reason)
+            return Retry(outcome.reason).encode(self._node.run)
         return outcome
 
     def _draw(self, request: DrawRequest) -> bytearray | Wait:
@@ -141,7 +143,7 @@ class ReplayService:
         if isinstance(reply, Wait):
             return reply
         batch, drawn = reply
-        return experience.encode_batch(self._node.run, batch.frames, batch.columns, drawn, into=self._batch)
+        return encode_batch(self._node.run, batch.frames, batch.columns, drawn, into=self._batch)
 
     def _admit(self, gate: _Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
         """Try, and try again whenever the core has changed, until the gate's deadline."""
@@ -162,22 +164,22 @@ class ReplayService:
         return None if time.monotonic() < self._confirmed else Wait(UNCONFIRMED)
 
     def _stats(self, message: Message) -> bytearray:
-        messages.decode_question("stats", message)
-        return messages.encode_stats(self._node.run, self.stats())
+        StatsQuestion.decode(message)
+        return self.stats().encode(self._node.run)
 
     def _limits(self, message: Message) -> bytearray:
         with self._changed:
             core = self._core
-            if message.kind == "limit":
-                ratio, tolerance = limits.decode_limit(message)
+            if message.kind == Limit.kind:
+                asked = Limit.decode(message)
                 try:
                     inserted, drawn = core.table.inserted, core.drawn
-                    core.limit(core.limiter.changed(inserted, drawn, ratio=ratio, tolerance=tolerance))
+                    core.limit(core.limiter.changed(inserted, drawn, ratio=asked.ratio, tolerance=asked.tolerance))
                 except OSError as error:
                     raise RunError(f"the journal can't be written: {error.strerror or error}") from error
                 self._changed.notify_all()
             else:
-                messages.decode_question("limits", message)
+                LimitsQuestion.decode(message)
             now = Limits(
                 ratio=core.limiter.ratio,
                 tolerance=core.limiter.tolerance,
@@ -187,11 +189,12 @@ class ReplayService:
                 inserts_wait_for=core.inserts_wait_for,
                 samples_wait_for=core.samples_wait_for,
             )
-        return limits.encode_limits(self._node.run, now)
+        return now.encode(self._node.run)
 
     def _snapshot(self, message: Message) -> bytearray:
-        if message.kind == "snapshot":
-            self._epochs.begin(self._core, self._changed, *messages.decode_snapshot(message))
-        elif not self._epochs.written(messages.decode_written(message), HOLD):
-            return messages.encode_retry(self._node.run, "the replay service is writing its part of the epoch")
-        return messages.encode_ack(self._node.run, self._core.table.inserted)
+        if message.kind == Snapshot.kind:
+            request = Snapshot.decode(message)
+            self._epochs.begin(self._core, self._changed, request.number, request.keep)
+        elif not self._epochs.written(Written.decode(message).number, HOLD):
+            return Retry("the replay service is writing its part of the epoch").encode(self._node.run)
+        return Ack(self._core.table.inserted).encode(self._node.run)

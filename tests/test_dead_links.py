@@ -9,7 +9,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from common.messaging import messages
+from common.messaging.messages.answers import Ack
+from common.messaging.messages.weights import Current
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 
 FROZEN = 3  # more than the threads that Zenoh receives with, left to itself
@@ -26,7 +27,7 @@ time.sleep(120)
 @pytest.fixture
 def server() -> Iterator[Node]:
     with Node(open_session(("tcp/127.0.0.1:0",)), "test", "learner", new_incarnation()) as node:
-        node.serve(node.key("role"), lambda message: messages.encode_ack("test", 1))
+        node.serve(node.key("role"), lambda message: Ack(1).encode("test"))
         yield node
 
 
@@ -51,7 +52,7 @@ def test_frozen_peers_do_not_make_a_process_deaf(server: Node) -> None:
         while len(server.session.info.peers_zid()) > 1:
             server.publish(server.key("weights", "1"), weights)
             time.sleep(0.02)
-        question = messages.encode_question("test", "current")
+        question = Current().encode("test")
         for _ in range(20):
             client.ask(client.key("role"), question, timeout=4.0)
             time.sleep(0.1)

@@ -10,7 +10,7 @@ from samples import make_segment
 from table_reference import check_references
 
 from common.errors import RunError, UsageError
-from common.messaging.experience import DrawRequest
+from common.messaging.messages.sample import DrawRequest
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec
 from learner.records.epochs import complete_epochs, go_back, load_learner, newest_epoch, save_epoch

@@ -1,18 +1,21 @@
 """Who may join, who is named when it goes, and when the dead are started again."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 from samples import make_segment
 
 from common.errors import JoinError
-from common.messaging import experience, limits, messages, wire
-from common.messaging.clients import replay_key
-from common.messaging.experience import DrawRequest
-from common.messaging.joining import difference, join, join_key
-from common.messaging.messages import Join, Joined
+from common.messaging import wire
+from common.messaging.joining import difference, join
+from common.messaging.keys import join_key, replay_key
+from common.messaging.messages.join import Join, Joined
+from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from common.messaging.messages.sample import DrawRequest
+from common.messaging.messages.stop import EndOfRun
+from common.messaging.messages.weights import Current
 from common.messaging.transport import Node, Refused, new_incarnation, open_session
 from common.process.lifecycle import Stop
 from common.settings.config import RunConfig
@@ -37,16 +40,16 @@ def test_another_protocol_is_refused_with_both_versions(
     learner, actor = nodes
     with monkeypatch.context() as patch:
         patch.setattr(wire, "PROTOCOL", 7)
-        payload = messages.encode_join("test", REQUEST)
-        newer = messages.encode_stop("test", "an answer of another protocol")
+        payload = REQUEST.encode("test")
+        newer = EndOfRun.because("an answer of another protocol").encode("test")
     # Before the reception, so that who has joined knows of it too.
     learner.serve(learner.key("newer"), lambda message: newer)
     _receive(learner, spec)
     assert join(actor, Stop(), REQUEST, (), 5) is not None
-    with pytest.raises(Refused, match="version 7; this process speaks 1"):
+    with pytest.raises(Refused, match="version 7; this process speaks 2"):
         actor.ask(join_key(actor, "actor"), payload)
-    with pytest.raises(Refused, match="version 7; this process speaks 1"):
-        actor.ask(actor.key("newer"), messages.encode_question("test", "current"))
+    with pytest.raises(Refused, match="version 7; this process speaks 2"):
+        actor.ask(actor.key("newer"), Current().encode("test"))
 
 
 def test_another_run_is_named(nodes: tuple[Node, Node], endpoint: str) -> None:
@@ -106,14 +109,14 @@ def test_the_limiter_changes_while_the_run_goes_on(nodes: tuple[Node, Node], spe
     for sequence in range(125):
         core.insert(make_segment(spec, sequence))
     request = DrawRequest(1, 0, 0, config.learner.batch_size, 0)
-    drawn = client.ask(replay_key(client, "sample"), experience.encode_sample("test", request))
+    drawn = client.ask(replay_key(client, "sample"), request.encode("test"))
     assert drawn.fields["planned"] == 500
-    now = limits.decode_limits(client.ask(key, limits.encode_limit("test", 0.5, 16)))
+    now = Limits.decode(client.ask(key, Limit(0.5, 16).encode("test")))
     assert (now.ratio, now.tolerance, now.inserted, now.drawn, now.planned) == (0.5, 16, 500, 1, 251)
-    assert limits.decode_limits(client.ask(key, messages.encode_question("test", "limits"))) == now
+    assert Limits.decode(client.ask(key, LimitsQuestion().encode("test"))) == now
     for ratio, tolerance, field in ((0.0, 1.0, "ratio"), (1.0, -1.0, "tolerance")):
         with pytest.raises(Refused, match=field):
-            client.ask(key, limits.encode_limit("test", ratio, tolerance))
+            client.ask(key, Limit(ratio, tolerance).encode("test"))
     assert core.limiter.ratio == 0.5
 
 

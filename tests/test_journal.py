@@ -12,8 +12,8 @@ from samples import make_segment
 from test_epochs import CONFIG, save
 
 from common.errors import RunError, UsageError
-from common.messaging import experience
-from common.messaging.experience import DrawRequest
+from common.messaging.messages.insert import encode_segment
+from common.messaging.messages.sample import DrawRequest
 from common.process.files import LineFile
 from common.types import EnvSpec
 from replay.core import ReplayCore, Wait
@@ -24,7 +24,7 @@ from replay.persistence.recovery import recover
 
 def _insert(core: ReplayCore, spec: EnvSpec, sequence: int) -> int | Wait:
     segment = make_segment(spec, sequence, acked=4 * sequence)
-    return core.insert(segment, bytes(experience.encode_segment("test", segment)))
+    return core.insert(segment, bytes(encode_segment("test", segment)))
 
 
 def _draw(core: ReplayCore) -> bool:

@@ -14,10 +14,16 @@ from hypothesis import strategies as st
 from samples import make_segment
 
 from common.errors import BadMessage, RunError
-from common.messaging import experience, limits, messages, wire
-from common.messaging.experience import BatchReader, Drawn, DrawRequest, EpisodeRecord, SegmentReader
-from common.messaging.limits import Limits
-from common.messaging.messages import Join, Joined, ReplayStats, Role
+from common.messaging import wire
+from common.messaging.messages.answers import Ack, Error, Retry
+from common.messaging.messages.epoch import Snapshot, Written
+from common.messaging.messages.insert import OPTIONAL, SegmentReader, encode_segment
+from common.messaging.messages.join import Join, Joined, Leave
+from common.messaging.messages.limits import Limit, Limits
+from common.messaging.messages.sample import MAX_AHEAD, BatchReader, Drawn, DrawRequest, EpisodeRecord, encode_batch
+from common.messaging.messages.stats import ReplayStats
+from common.messaging.messages.stop import EndOfRun
+from common.messaging.messages.weights import Current, Role, Weights
 from common.messaging.presence import Origin
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
@@ -45,28 +51,28 @@ def _batch() -> tuple[PinnedBatch, Drawn]:
 
 def _encoded_batch() -> bytearray:
     batch, drawn = _batch()
-    return experience.encode_batch("r", batch.frames, batch.columns, drawn)
+    return encode_batch("r", batch.frames, batch.columns, drawn)
 
 
 READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
-    "join": (messages.encode_join("r", JOIN), messages.decode_join),
-    "joined": (messages.encode_joined(JOINED), messages.decode_joined),
-    "leave": (messages.encode_leave("r", 5), messages.decode_leave),
-    "insert": (experience.encode_segment("r", make_segment(SPEC)), SegmentReader(SPEC)),
-    "ack": (messages.encode_ack("r", 9), messages.decode_ack),
-    "retry": (messages.encode_retry("r", "later"), messages.decode_retry),
-    "error": (messages.encode_error("r", BadMessage("f", "wrong")), messages.decode_error),
-    "sample": (experience.encode_sample("r", DrawRequest(1, 3, 2, 4, 5, ((7, 0.5),))), experience.decode_sample),
+    "join": (JOIN.encode("r"), Join.decode),
+    "joined": (JOINED.answer(), Joined.decode),
+    "leave": (Leave(5).encode("r"), Leave.decode),
+    "insert": (encode_segment("r", make_segment(SPEC)), SegmentReader(SPEC)),
+    "ack": (Ack(9).encode("r"), Ack.decode),
+    "retry": (Retry("later").encode("r"), Retry.decode),
+    "error": (Error.of(BadMessage("f", "wrong")).encode("r"), Error.decode),
+    "sample": (DrawRequest(1, 3, 2, 4, 5, ((7, 0.5),)).encode("r"), DrawRequest.decode),
     "batch": (_encoded_batch(), BatchReader(SPEC)),
-    "weights": (messages.encode_weights("r", 2, 8, FLAT), partial(messages.decode_weights, parameters=3)),
-    "role": (messages.encode_role("r", Role(2, (4, 5), 6)), messages.decode_role),
-    "stats": (messages.encode_stats("r", STATS), messages.decode_stats),
-    "snapshot": (messages.encode_snapshot("r", 12, [4, 8]), messages.decode_snapshot),
-    "written": (messages.encode_written("r", 12), messages.decode_written),
-    "limit": (limits.encode_limit("r", 0.5, 8), limits.decode_limit),
-    "limits": (limits.encode_limits("r", LIMITS), limits.decode_limits),
-    "stop": (messages.encode_stop("r", "complete"), messages.decode_stop),
-    "current": (messages.encode_question("r", "current"), partial(messages.decode_question, "current")),
+    "weights": (Weights(2, 8, FLAT).encode("r"), partial(Weights.decode, parameters=3)),
+    "role": (Role(2, (4, 5), 6).encode("r"), Role.decode),
+    "stats": (STATS.encode("r"), ReplayStats.decode),
+    "snapshot": (Snapshot(12, [4, 8]).encode("r"), Snapshot.decode),
+    "written": (Written(12).encode("r"), Written.decode),
+    "limit": (Limit(0.5, 8).encode("r"), Limit.decode),
+    "limits": (LIMITS.encode("r"), Limits.decode),
+    "stop": (EndOfRun.because("complete").encode("r"), EndOfRun.decode),
+    "current": (Current().encode("r"), Current.decode),
 }
 
 
@@ -79,19 +85,19 @@ def _valid(kind: str) -> Message:
     [
         ("join", JOIN),
         ("joined", JOINED),
-        ("leave", 5),
-        ("ack", 9),
-        ("retry", "later"),
-        ("error", "f: wrong"),
+        ("leave", Leave(5)),
+        ("ack", Ack(9)),
+        ("retry", Retry("later")),
+        ("error", Error("f", "f: wrong")),
         ("sample", DrawRequest(1, 3, 2, 4, 5, ((7, 0.5),))),
         ("role", Role(2, (4, 5), 6)),
         ("stats", STATS),
-        ("snapshot", (12, [4, 8])),
-        ("written", 12),
-        ("limit", (0.5, 8.0)),
+        ("snapshot", Snapshot(12, [4, 8])),
+        ("written", Written(12)),
+        ("limit", Limit(0.5, 8.0)),
         ("limits", LIMITS),
-        ("stop", "complete"),
-        ("current", None),
+        ("stop", EndOfRun("complete")),
+        ("current", Current()),
     ],
 )
 def test_everything_comes_back(kind: str, value: object) -> None:
@@ -99,13 +105,13 @@ def test_everything_comes_back(kind: str, value: object) -> None:
 
 
 def test_an_error_that_is_not_about_a_field_comes_back() -> None:
-    payload = messages.encode_error("r", RunError("disk full"))
-    assert messages.decode_error(wire.decode(bytes(payload))) == "disk full"
+    payload = Error.of(RunError("disk full")).encode("r")
+    assert Error.decode(wire.decode(bytes(payload))).problem == "disk full"
 
 
 def test_arrays_come_back() -> None:
-    number, version, flat = READERS["weights"][1](_valid("weights"))
-    assert (number, version, flat.tolist()) == (2, 8, FLAT.tolist())
+    weights = READERS["weights"][1](_valid("weights"))
+    assert (weights.network, weights.version, weights.flat.tolist()) == (2, 8, FLAT.tolist())
     segment, back = make_segment(SPEC), READERS["insert"][1](_valid("insert"))
     assert back.episodes == segment.episodes
     for name in ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version"):
@@ -143,7 +149,6 @@ FIELDS = [
     ("joined", "index", -1),
     ("joined", "replay_endpoints", "tcp/h:1"),
     ("joined", "spec", {}),
-    ("joined", "spec", _spec(frame_shape=[0])),
     ("insert", "incarnation", -1),
     ("insert", "incarnation", True),
     ("insert", "stream", 65_536),
@@ -183,7 +188,7 @@ FIELDS = [
     ("written", "number", 1.0),
     ("sample", "base", -1),
     ("sample", "sequence", 1),
-    ("sample", "sequence", 2 + experience.MAX_AHEAD),
+    ("sample", "sequence", 2 + MAX_AHEAD),
     ("batch", "planned", -1),
     ("limit", "ratio", 0.0),
     ("limit", "ratio", math.nan),
@@ -202,12 +207,20 @@ def test_a_bad_field_is_refused_by_name(kind: str, field: str, value: object) ->
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("env_id", 5), ("frame_dtype", "object"), ("stack", 0), ("stack", 65), ("num_actions", 0)],
+    [
+        ("env_id", 5),
+        ("frame_shape", [0]),
+        ("frame_shape", [1] * 5),
+        ("frame_dtype", "object"),
+        ("stack", 0),
+        ("stack", 65),
+        ("num_actions", 0),
+    ],
 )
 def test_a_bad_specification_is_refused_by_name(field: str, value: object) -> None:
     message = _valid("joined")
     with pytest.raises(BadMessage) as caught:
-        messages.decode_joined(replace(message, fields={**message.fields, "spec": _spec(**{field: value})}))
+        Joined.decode(replace(message, fields={**message.fields, "spec": _spec(**{field: value})}))
     assert caught.value.field == f"fields.spec.{field}"
 
 
@@ -263,7 +276,7 @@ def test_every_kind_refuses_what_is_missing_or_unknown(kind: str) -> None:
     for name in message.fields:
         with pytest.raises(BadMessage, match=f"fields: missing {name}"):
             read(replace(message, fields={key: value for key, value in message.fields.items() if key != name}))
-    for name in message.arrays:
+    for name in message.arrays.keys() - OPTIONAL:
         with pytest.raises(BadMessage, match=f"arrays: missing {name}"):
             read(replace(message, arrays={key: value for key, value in message.arrays.items() if key != name}))
 

@@ -1,7 +1,6 @@
 """n-step transitions: exact across terminal states, truncation, lost lives, and wherever segments are cut."""
 
-from dataclasses import replace
-
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +11,7 @@ from table_reference import Stream, make_spec
 from actors.segments import SegmentAssembler
 from common.envs.protocol import Steps
 from common.messaging import wire
-from common.messaging.experience import SegmentReader, encode_segment
+from common.messaging.messages.insert import SegmentReader, encode_segment
 from common.types import EnvSpec, EpisodeEnd, Segment
 from replay.table.table import Table
 
@@ -184,7 +183,7 @@ def test_what_was_recorded_before_spans_one_step() -> None:
 def test_spans_survive_the_wire_and_a_snapshot() -> None:
     spec = make_spec(1)
     span = np.array([3, 3, 2, 1], np.uint8)
-    segment = replace(Stream(spec, 0, np.random.default_rng(0), 10).segment(4), span=span)
+    segment = msgspec.structs.replace(Stream(spec, 0, np.random.default_rng(0), 10).segment(4), span=span)
     read = SegmentReader(spec)(wire.decode(bytes(encode_segment("run", segment))))
     assert read.span.tolist() == span.tolist()
     table, again = (Table(spec, 10, rng=np.random.default_rng(1)) for _ in range(2))

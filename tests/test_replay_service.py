@@ -10,9 +10,13 @@ import pytest
 from samples import make_segment
 
 from common.errors import RunError
-from common.messaging import experience, messages
-from common.messaging.clients import InsertClient, SampleClient, replay_key
-from common.messaging.experience import DrawRequest
+from common.messaging.clients import InsertClient, SampleClient
+from common.messaging.keys import replay_key
+from common.messaging.messages.answers import Ack, Retry
+from common.messaging.messages.epoch import Snapshot, Written
+from common.messaging.messages.insert import encode_segment
+from common.messaging.messages.sample import DrawRequest
+from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, locators, new_incarnation, open_session
 from common.process.lifecycle import Stop
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
@@ -36,7 +40,7 @@ def _serve(node: Node, core: ReplayCore, folder: Path, asker: Node | None = None
     deadline = time.monotonic() + 5
     while asker is not None and time.monotonic() < deadline:
         try:
-            asker.ask(replay_key(asker, "stats"), messages.encode_question("test", "stats"))
+            asker.ask(replay_key(asker, "stats"), StatsQuestion().encode("test"))
             break
         except NoAnswer:
             time.sleep(0.02)
@@ -49,19 +53,19 @@ def test_receipts_duplicates_and_reasons(nodes: tuple[Node, Node], spec: EnvSpec
     service = _serve(server, core, tmp_path, client)
     key = replay_key(client, "insert")
 
-    sample = experience.encode_sample("test", DrawRequest(1, 0, 0, 4, 0))
+    sample = DrawRequest(1, 0, 0, 4, 0).encode("test")
     began = time.monotonic()
     reply = client.ask(replay_key(client, "sample"), sample)
     assert 0.5 < time.monotonic() - began < 4
-    assert messages.decode_retry(reply) == "waiting for 8 transitions, have 0"
+    assert Retry.decode(reply).reason == "waiting for 8 transitions, have 0"
 
-    first = experience.encode_segment("test", make_segment(spec, 0))
-    assert messages.decode_ack(client.ask(key, first)) == 4
-    assert messages.decode_ack(client.ask(key, first)) == 4, "a retry is acknowledged and not taken twice"
+    first = encode_segment("test", make_segment(spec, 0))
+    assert Ack.decode(client.ask(key, first)).inserted == 4
+    assert Ack.decode(client.ask(key, first)).inserted == 4, "a retry is acknowledged and not taken twice"
     for sequence in range(1, 5):
-        client.ask(key, experience.encode_segment("test", make_segment(spec, sequence)))
-    reply = client.ask(key, experience.encode_segment("test", make_segment(spec, 5)))
-    assert messages.decode_retry(reply) == "inserts are 12 steps ahead of updates"
+        client.ask(key, encode_segment("test", make_segment(spec, sequence)))
+    reply = client.ask(key, encode_segment("test", make_segment(spec, 5)))
+    assert Retry.decode(reply).reason == "inserts are 12 steps ahead of updates"
 
     drawn = client.ask(replay_key(client, "sample"), sample)
     again = client.ask(replay_key(client, "sample"), sample)
@@ -69,8 +73,8 @@ def test_receipts_duplicates_and_reasons(nodes: tuple[Node, Node], spec: EnvSpec
         np.testing.assert_array_equal(drawn.arrays[name], again.arrays[name])
     stats = service.stats()
     assert (stats.inserted, stats.drawn, stats.duplicates, stats.lost, stats.episodes) == (20, 1, 1, 0, 5)
-    question = messages.encode_question("test", "stats")
-    asked = messages.decode_stats(client.ask(replay_key(client, "stats"), question))
+    question = StatsQuestion().encode("test")
+    asked = ReplayStats.decode(client.ask(replay_key(client, "stats"), question))
     assert asked.inserted == 20
 
 
@@ -80,12 +84,12 @@ def test_a_waiting_insert_goes_in_when_updates_catch_up(
     server, client = nodes
     _serve(server, ReplayCore(CONFIG, spec), tmp_path, client)
     for sequence in range(5):
-        client.ask(replay_key(client, "insert"), experience.encode_segment("test", make_segment(spec, sequence)))
-    payload = experience.encode_segment("test", make_segment(spec, 5))
+        client.ask(replay_key(client, "insert"), encode_segment("test", make_segment(spec, sequence)))
+    payload = encode_segment("test", make_segment(spec, 5))
     pending = client.begin(replay_key(client, "insert"), payload)
     for number in range(4):
-        client.ask(replay_key(client, "sample"), experience.encode_sample("test", DrawRequest(1, number, 0, 4, 0)))
-    assert messages.decode_ack(pending.wait()) == 24
+        client.ask(replay_key(client, "sample"), DrawRequest(1, number, 0, 4, 0).encode("test"))
+    assert Ack.decode(pending.wait()).inserted == 24
 
 
 def test_bad_messages_change_nothing(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
@@ -97,30 +101,30 @@ def test_bad_messages_change_nothing(nodes: tuple[Node, Node], spec: EnvSpec, tm
     for payload, field in (
         (bytearray(b"nonsense, but long enough"), "magic"),
         (bytearray(), "payload"),
-        (experience.encode_segment("test", wrong), "arrays.actions"),
-        (experience.encode_segment("other", make_segment(spec)), "run"),
+        (encode_segment("test", wrong), "arrays.actions"),
+        (encode_segment("other", make_segment(spec)), "run"),
     ):
         with pytest.raises(Refused, match=field):
             client.ask(key, payload)
     assert service.stats().bad_messages == before.bad_messages + 4
     assert service.stats().inserted == 0
-    assert messages.decode_ack(client.ask(key, experience.encode_segment("test", make_segment(spec)))) == 4
+    assert Ack.decode(client.ask(key, encode_segment("test", make_segment(spec)))).inserted == 4
 
 
 def test_snapshot_on_disk(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:
     server, client = nodes
     core = ReplayCore(CONFIG, spec)
     _serve(server, core, tmp_path, client)
-    client.ask(replay_key(client, "insert"), experience.encode_segment("test", make_segment(spec)))
+    client.ask(replay_key(client, "insert"), encode_segment("test", make_segment(spec)))
     key = replay_key(client, "snapshot")
-    client.ask(key, messages.encode_snapshot("test", 12, []))
-    while client.ask(key, messages.encode_written("test", 12)).kind == "retry":
+    client.ask(key, Snapshot(12, []).encode("test"))
+    while client.ask(key, Written(12).encode("test")).kind == "retry":
         pass
     folder = tmp_path / "checkpoints" / "12" / "replay"
     assert np.load(folder / "rewards.npy").tolist() == [0, 1, 2, 3]
     assert np.load(folder / "frames.npy").shape == (5, 4)
     with pytest.raises(Refused, match="epoch 13 was not begun"):
-        client.ask(key, messages.encode_written("test", 13))
+        client.ask(key, Written(13).encode("test"))
 
 
 def test_lost_counts_receipts_without_transitions(spec: EnvSpec) -> None:
@@ -188,7 +192,7 @@ def test_segments_wait_behind_their_window_without_being_sent_again(
     waiter.start()
     began = time.monotonic()
     for number in range(44):
-        client.ask(replay_key(client, "sample"), experience.encode_sample("test", DrawRequest(1, number, 0, 4, 0)))
+        client.ask(replay_key(client, "sample"), DrawRequest(1, number, 0, 4, 0).encode("test"))
         time.sleep(0.14)
     waiter.join(5)
     assert time.monotonic() - began > ASK_TIMEOUT, "the last one waited longer than an ordinary question may"
@@ -208,7 +212,7 @@ def test_a_stop_ends_the_waiting(endpoint: str, spec: EnvSpec) -> None:
         assert inserts.waiting == "the replay service does not answer"
         assert told.count(inserts.waiting) > 1, "the reason is told again and again"
         with pytest.raises(NoAnswer):
-            client.ask(replay_key(client, "stats"), messages.encode_question("test", "stats"))
+            client.ask(replay_key(client, "stats"), StatsQuestion().encode("test"))
 
 
 def test_a_port_in_use_is_named() -> None:
@@ -225,7 +229,7 @@ def test_a_learner_sets_priorities_with_its_next_draw(nodes: tuple[Node, Node], 
     core = ReplayCore(replace(CONFIG, replay=replay), spec)
     _serve(server, core, tmp_path, client)
     for sequence in range(15):
-        client.ask(replay_key(client, "insert"), experience.encode_segment("test", make_segment(spec, sequence)))
+        client.ask(replay_key(client, "insert"), encode_segment("test", make_segment(spec, sequence)))
     samples = SampleClient(client, Stop(), 1, spec, 4, 2)
     chosen = -1
     for number in range(12):

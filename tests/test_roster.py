@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import BadMessage, RunError
-from common.messaging.messages import Join
+from common.messaging.messages.join import Join
 from common.messaging.presence import LEASE, Origin
 from learner.roster import Occupied, Roster
 

@@ -9,8 +9,11 @@ from pathlib import Path
 from samples import make_segment
 from test_topology import lines, running, wait_for
 
-from common.messaging import experience, messages
-from common.messaging.clients import InsertClient, replay_key
+from common.messaging.clients import InsertClient
+from common.messaging.keys import replay_key
+from common.messaging.messages.answers import Ack, Retry
+from common.messaging.messages.insert import encode_segment
+from common.messaging.messages.sample import DrawRequest
 from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.process.lifecycle import Stop
@@ -28,16 +31,16 @@ def test_a_service_that_is_not_confirmed_neither_acknowledges_nor_draws(
     core = ReplayCore(RunConfig(run="test"), spec)
     service = ReplayService(server, core, ReplayEpochs(tmp_path, 5), confirmed=0.0)
     service.start()
-    segment = experience.encode_segment("test", make_segment(spec))
-    draw = experience.encode_sample("test", experience.DrawRequest(1, 0, 0, core.batch_size, 0))
+    segment = encode_segment("test", make_segment(spec))
+    draw = DrawRequest(1, 0, 0, core.batch_size, 0).encode("test")
     for question, payload in (("insert", segment), ("sample", draw)):
         answer = client.ask(replay_key(client, question), payload)
-        assert messages.decode_retry(answer) == "the learner has not confirmed this replay service lately"
+        assert Retry.decode(answer).reason == "the learner has not confirmed this replay service lately"
     assert core.table.inserted == 0
     service.confirm(time.monotonic() + 60)
-    assert messages.decode_ack(client.ask(replay_key(client, "insert"), segment)) == 4
+    assert Ack.decode(client.ask(replay_key(client, "insert"), segment)).inserted == 4
     service.confirm(time.monotonic() - 1)  # as after a freeze
-    payload = experience.encode_segment("test", make_segment(spec, 1))
+    payload = encode_segment("test", make_segment(spec, 1))
     assert client.ask(replay_key(client, "insert"), payload).kind == "retry"
     assert core.table.inserted == 4
 

@@ -12,11 +12,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from common.messaging import experience, limits, messages
-from common.messaging.clients import replay_key
-from common.messaging.experience import DrawRequest
-from common.messaging.joining import join_key
-from common.messaging.messages import Join, ReplayStats
+from common.messaging.keys import join_key, replay_key
+from common.messaging.messages.epoch import Snapshot
+from common.messaging.messages.join import Join
+from common.messaging.messages.limits import Limit
+from common.messaging.messages.sample import DrawRequest
+from common.messaging.messages.stats import ReplayStats, StatsQuestion
+from common.messaging.messages.stop import EndOfRun
+from common.messaging.messages.weights import Current
 from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
 from common.process.processes import ChildProcess, command, free_endpoint
 
@@ -38,7 +41,7 @@ def joined(at: tuple[str, str], config: Path | None, role: str = "actor") -> Ite
 
 
 def stats(node: Node) -> ReplayStats:
-    return messages.decode_stats(node.ask(replay_key(node, "stats"), messages.encode_question(RUN, "stats")))
+    return ReplayStats.decode(node.ask(replay_key(node, "stats"), StatsQuestion().encode(RUN)))
 
 
 def training(node: Node) -> bool:
@@ -100,7 +103,7 @@ def assert_outside(at: tuple[str, str], config: Path | None) -> None:
         time.sleep(1.5)
         assert stranger.session.info.peers_zid() == []
         with pytest.raises(NoAnswer):
-            stranger.ask(join_key(stranger, "actor"), messages.encode_join(RUN, Join("actor", 1, [])))
+            stranger.ask(join_key(stranger, "actor"), Join("actor", 1, []).encode(RUN))
 
 
 def test_strangers_stay_outside(run: tuple[str, str], keys: Path, tmp_path: Path) -> None:
@@ -118,24 +121,24 @@ def test_strangers_stay_outside(run: tuple[str, str], keys: Path, tmp_path: Path
             assert_outside(at, config)
         wait_for_more(inside)
         with joined(run, keys / "actor.json5") as actor:
-            assert actor.ask(join_key(actor, "actor"), messages.encode_join(RUN, Join("actor", 1, []))).kind == "joined"
+            assert actor.ask(join_key(actor, "actor"), Join("actor", 1, []).encode(RUN)).kind == "joined"
 
 
 def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, str], keys: Path) -> None:
     with joined(run, keys / "replay.json5", "watch") as inside, joined(run, keys / "actor.json5") as actor:
         before = stats(inside)
-        assert actor.ask(actor.key("weights", "1"), messages.encode_question(RUN, "current")).kind == "weights"
+        assert actor.ask(actor.key("weights", "1"), Current().encode(RUN)).kind == "weights"
         for key, payload in (
-            (replay_key(actor, "sample"), experience.encode_sample(RUN, DrawRequest(1, 0, 0, 32, 0))),
-            (replay_key(actor, "stats"), messages.encode_question(RUN, "stats")),
-            (replay_key(actor, "limits"), limits.encode_limit(RUN, 1.0, 64.0)),
-            (replay_key(actor, "snapshot"), messages.encode_snapshot(RUN, 1, [])),
-            (join_key(actor, "replay"), messages.encode_join(RUN, Join("replay", 1, ["tls/127.0.0.1:9"]))),
+            (replay_key(actor, "sample"), DrawRequest(1, 0, 0, 32, 0).encode(RUN)),
+            (replay_key(actor, "stats"), StatsQuestion().encode(RUN)),
+            (replay_key(actor, "limits"), Limit(1.0, 64.0).encode(RUN)),
+            (replay_key(actor, "snapshot"), Snapshot(1, []).encode(RUN)),
+            (join_key(actor, "replay"), Join("replay", 1, ["tls/127.0.0.1:9"]).encode(RUN)),
         ):
             with pytest.raises(NoAnswer):
                 actor.ask(key, payload)
         for _ in range(20):
-            actor.announce(actor.key("stop"), messages.encode_stop(RUN, "forged"))
+            actor.announce(actor.key("stop"), EndOfRun.because("forged").encode(RUN))
             actor.session.delete(actor.key("stop"))
         token = actor.session.liveliness().declare_token(actor.key("alive", "learner", "0"))
         overheard = actor.session.declare_subscriber(actor.key("metrics", "**"), zenoh.handlers.FifoChannel(8))

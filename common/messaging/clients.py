@@ -7,22 +7,24 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from common.bounds import MAX_AHEAD
 from common.errors import BadMessage
-from common.messaging import experience, messages
-from common.messaging.experience import BatchReader, Drawn, DrawRequest
+from common.messaging.keys import Place, replay_key
+from common.messaging.messages.answers import Ack, Retry
+from common.messaging.messages.insert import encode_segment
+from common.messaging.messages.sample import BatchReader, Drawn, DrawRequest
 from common.messaging.transport import NoAnswer, Node, Pending
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
 from common.types import Batch, EnvSpec, Segment
 
-REPLAY_SHARD = "0"
 # Seconds. A segment may wait behind its whole window while the limiter lets them in one by one; that a peer has gone is
 # noticed sooner, by its link.
 INSERT_TIMEOUT = 60.0
@@ -30,21 +32,13 @@ NO_ANSWER = "the replay service does not answer"
 BAD_ANSWER = "the replay service's answer is bad"
 
 
-class Line(Protocol):
+class Line(Place, Protocol):
     """What queries to the replay service are sent by: a `Node`, or an actor's `ReplayRoute`."""
 
     run: str
 
-    def key(self, *parts: str) -> str:
-        """See `Node`."""
-
     def begin(self, key: str, payload: bytearray, timeout: float) -> Pending:
         """See `Node`."""
-
-
-def replay_key(node: Line, what: str) -> str:
-    """Key of one of the replay service's queryables: insert, sample, stats or snapshot."""
-    return node.key("replay", REPLAY_SHARD, what)
 
 
 class Backoff:
@@ -106,7 +100,7 @@ class InsertClient:
             if not self._settle(self._outstanding[0]):
                 return False
             self._outstanding.popleft()
-        payload = experience.encode_segment(self._node.run, replace(segment, acked=self.acked))
+        payload = encode_segment(self._node.run, msgspec.structs.replace(segment, acked=self.acked))
         self._outstanding.append(_Sent(payload, segment.steps, self._send(payload)))
         return True
 
@@ -165,10 +159,10 @@ class InsertClient:
         return self._node.begin(self._key, payload, INSERT_TIMEOUT)
 
     def _accept(self, message: Message, sent: _Sent) -> bool:
-        if message.kind == "retry":
-            self.waiting = messages.decode_retry(message)
+        if message.kind == Retry.kind:
+            self.waiting = Retry.decode(message).reason
             return False
-        self.inserted = max(self.inserted, messages.decode_ack(message))
+        self.inserted = max(self.inserted, Ack.decode(message).inserted)
         self.acked += sent.steps
         self.waiting = ""
         self._backoff.reset()
@@ -245,11 +239,11 @@ class SampleClient:
         sequence, pending = self._outstanding[0]
         try:
             message = pending.wait()
-            if message.kind != "retry":
+            if message.kind != Retry.kind:
                 accepted = self._accept(message, sequence)
                 self._outstanding.popleft()
                 return accepted
-            self.waiting = messages.decode_retry(message)
+            self.waiting = Retry.decode(message).reason
         except NoAnswer:
             self.waiting = NO_ANSWER
         except BadMessage as error:
@@ -265,7 +259,7 @@ class SampleClient:
     def _request(self, sequence: int) -> Pending:
         priorities = self._carried[sequence]
         request = DrawRequest(self._incarnation, sequence, self._base, self._batch_size, self.episodes, priorities)
-        return self._node.begin(self._key, experience.encode_sample(self._node.run, request))
+        return self._node.begin(self._key, request.encode(self._node.run))
 
     def _accept(self, message: Message, sequence: int) -> tuple[Batch, Drawn]:
         batch, drawn = self._read(message)
@@ -278,4 +272,4 @@ class SampleClient:
         first = max(self.episodes, drawn.first_episode)
         fresh = drawn.episodes[first - drawn.first_episode :]
         self.episodes = first + len(fresh)
-        return batch, replace(drawn, first_episode=first, episodes=fresh)
+        return batch, msgspec.structs.replace(drawn, first_episode=first, episodes=fresh)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
 from typing import Any, Self
 
+import msgspec
+
 from common.errors import BadMessage, JoinError
-from common.messaging import messages
-from common.messaging.messages import Join, Joined
+from common.messaging.keys import join_key
+from common.messaging.messages.answers import Retry
+from common.messaging.messages.join import Join, Joined
 from common.messaging.transport import NoAnswer, Node, Refused
 from common.process.lifecycle import Stop
 from common.settings.tables import first_difference, identity
@@ -19,11 +21,6 @@ RETRY_PAUSE = 0.1  # seconds
 OCCUPIED = 5.0  # seconds that a replay service waits for the end of another one: a dead one is given up sooner
 ASK_EVERY = 0.4  # seconds between a member's questions, where its work depends on the answer
 SELDOM = 5.0  # seconds between those of one to which nothing has happened
-
-
-def join_key(node: Node, role: str) -> str:
-    """Where a role asks: the replay service, which all others are sent to, at a key that access control can keep."""
-    return node.key("config", "replay") if role == "replay" else node.key("config")
 
 
 def join(
@@ -71,8 +68,8 @@ def ask_to_join(node: Node, request: Join) -> Joined | str:
         JoinError: it refused this process.
     """
     try:
-        message = node.ask(join_key(node, request.role), messages.encode_join(node.run, request), timeout=1.0)
-        return messages.decode_retry(message) if message.kind == "retry" else messages.decode_joined(message)
+        message = node.ask(join_key(node, request.role), request.encode(node.run), timeout=1.0)
+        return Retry.decode(message).reason if message.kind == "retry" else Joined.decode(message)
     except (Refused, BadMessage) as error:
         raise JoinError(f"the learner of run {node.run!r} refused: {error}") from error
 
@@ -106,7 +103,7 @@ class Membership:
     ) -> None:
         self._node = node
         self._stop = stop
-        self._request = replace(request, index=joined.index)
+        self._request = msgspec.structs.replace(request, index=joined.index)
         self._joined = joined
         self._patience = patience
         self._learned = learned
@@ -159,7 +156,7 @@ def difference(mine: Joined, theirs: Joined) -> str | None:
 def _identity(joined: Joined) -> dict[str, Any]:
     return {
         "run id": joined.run_id,
-        "environment": asdict(joined.spec),
+        "environment": msgspec.structs.asdict(joined.spec),
         "network layout": joined.layout,
         "config": identity(joined.config),
     }

@@ -11,9 +11,12 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import zenoh
+from msgspec import Meta
+
+from common.bounded import Name
 
 ROLES = ("learner", "replay", "actor")
 LEASE = 1.5  # seconds of silence after which a link is given up, and the learner's word no longer holds
@@ -23,8 +26,8 @@ FORGOTTEN = 60.0  # seconds after which one that has gone is no longer missed
 class Origin(NamedTuple):
     """The host and the process id of a member of a run."""
 
-    host: str
-    pid: int
+    host: Name
+    pid: Annotated[int, Meta(ge=0, le=2**31)]
 
     @classmethod
     def here(cls) -> Origin:

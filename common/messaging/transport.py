@@ -19,8 +19,12 @@ import zenoh
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage, CoopError, RunError, UsageError
-from common.messaging import messages, wire
+from common.messaging import wire
+from common.messaging.keys import run_key, stop_key
 from common.messaging.links import never_linger
+from common.messaging.messages.answers import Error
+from common.messaging.messages.status import encode_status
+from common.messaging.messages.stop import EndOfRun
 from common.messaging.presence import LEASE, Presence
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
@@ -148,7 +152,7 @@ class Node:
 
     def key(self, *parts: str) -> str:
         """A key of this run."""
-        return "/".join(("coop", self.run, *parts))
+        return run_key(self.run, *parts)
 
     def begin(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Pending:
         """Send a query and return at once."""
@@ -190,7 +194,7 @@ class Node:
                     if isinstance(error, BadMessage):
                         self.count_bad()
                     with contextlib.suppress(zenoh.ZError):
-                        query.reply_err(messages.encode_error(self.run, error))
+                        query.reply_err(Error.of(error).encode(self.run))
                     continue
                 with contextlib.suppress(zenoh.ZError):  # the asker may be gone, and will ask again if it is not
                     query.reply(key, reply)
@@ -217,7 +221,7 @@ class Node:
 
     def publish_status(self, status: dict[str, Any]) -> None:
         """Tell displays what this process does."""
-        self._status.put(wire.encode("status", self.run, status))
+        self._status.put(encode_status(self.run, status))
 
     def latest(self, key: str) -> Latest:
         """Follow a key of which only the latest value matters."""
@@ -228,11 +232,11 @@ class Node:
 
         def stopped(sample: zenoh.Sample) -> None:
             try:
-                stop.set(messages.decode_stop(self.read(sample.payload)))
+                stop.set(EndOfRun.decode(self.read(sample.payload)).reason)
             except BadMessage:
                 self.count_bad()
 
-        self.session.declare_subscriber(self.key("stop"), stopped)
+        self.session.declare_subscriber(stop_key(self), stopped)
 
     def close(self) -> None:
         """Close the session and wait for the serving threads."""
@@ -275,7 +279,7 @@ def _answer(reply: zenoh.Reply) -> Message:
     raw = part.payload.to_bytes()
     try:
         message = wire.decode(raw)
-        problem = None if reply.ok is not None else messages.decode_error(message)
+        problem = None if reply.ok is not None else Error.decode(message).problem
     except BadMessage as error:
         if error.field == "protocol":  # asking again would not help
             raise Refused(str(error)) from error

@@ -1,26 +1,28 @@
 """The wire format: `[u32 magic][u32 header length][msgpack header][raw little-endian arrays, 64-byte aligned]`.
 
 Decoding views the arrays in place and allocates nothing that the sender names: every length is checked against the
-bytes that arrived. What the fields of each kind of message mean is `common.messages`' concern.
+bytes that arrived. What the fields of each kind of message mean is `common.messaging.messages`' concern.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from reprlib import repr as shown
 from typing import Any, Protocol
 
 import msgpack
+import msgspec
 import numpy as np
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage
 from common.types import Array
 
-PROTOCOL = 1
+PROTOCOL = 2
+ON_DISK = frozenset({1, 2})  # protocols whose segments and batches, as journals and snapshots hold them, are ours
 MAGIC = 0x434F4F50  # "COOP"
 ALIGNMENT = 64
 MAX_HEADER = 1 << 20
@@ -33,6 +35,7 @@ _DTYPES = {name: np.dtype(name).newbyteorder("<") for name in DTYPES}
 _NAMES = {np.dtype(name): name for name in DTYPES}
 
 _PREFIX = struct.Struct("<II")
+_pack = msgspec.msgpack.Encoder().encode
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +71,7 @@ class Source(Protocol):
 def encode(
     kind: str,
     run: str,
-    fields: Mapping[str, Any],
+    fields: Mapping[str, Any] | msgspec.Struct,
     arrays: Mapping[str, Array | Source] | None = None,
     into: bytearray | None = None,
 ) -> bytearray:
@@ -83,9 +86,7 @@ def encode(
         offset = _aligned(size)
         table.append((name, _NAMES[array.dtype], array.shape, offset))
         size = offset + array.nbytes
-    header = msgpack.packb(
-        {"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": table}, use_bin_type=True
-    )
+    header = _pack({"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": table})
     head = _PREFIX.pack(MAGIC, len(header)) + header
     start = _aligned(len(head))
     payload = _sized(into, start + size)
@@ -114,13 +115,13 @@ def _sized(memory: bytearray | None, size: int) -> bytearray:
     return memory
 
 
-def decode(payload: bytes) -> Message:
-    """View a message.
+def decode(payload: bytes, protocols: frozenset[int] | None = None) -> Message:
+    """View a message of this protocol, or of one of `protocols`.
 
     Raises:
         BadMessage: anything that is not a whole, well-formed message of this protocol; names the field.
     """
-    header, start = _header(payload)
+    header, start = _header(payload, protocols or {PROTOCOL})
     arrays: dict[str, Array] = {}
     for entry in header["arrays"]:
         name, array = _view(payload, start, entry)
@@ -134,7 +135,7 @@ def _aligned(offset: int) -> int:
     return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
-def _header(payload: bytes) -> tuple[dict[str, Any], int]:
+def _header(payload: bytes, protocols: Set[int]) -> tuple[dict[str, Any], int]:
     if not _PREFIX.size <= len(payload) <= MAX_PAYLOAD:
         raise BadMessage("payload", f"{len(payload)} bytes; allowed: {_PREFIX.size} to {MAX_PAYLOAD}")
     magic, length = _PREFIX.unpack_from(payload)
@@ -148,7 +149,7 @@ def _header(payload: bytes) -> tuple[dict[str, Any], int]:
         raise BadMessage("header", f"not msgpack ({type(error).__name__})") from error
     if not isinstance(header, dict) or header.keys() != {"protocol", "kind", "run", "fields", "arrays"}:
         raise BadMessage("header", "must hold exactly protocol, kind, run, fields, arrays")
-    if header["protocol"] != PROTOCOL:
+    if type(header["protocol"]) is not int or header["protocol"] not in protocols:
         raise BadMessage("protocol", f"version {shown(header['protocol'])}; this process speaks {PROTOCOL}")
     for name, kind in (("kind", str), ("run", str), ("fields", dict), ("arrays", list)):
         if not isinstance(header[name], kind):

@@ -14,16 +14,17 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, astuple
+from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
 import msgpack
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
-from common.messaging.experience import DrawRequest
+from common.messaging.messages.sample import DrawRequest
 from replay.limiter import RateLimiter
 
 FORMAT = 1
@@ -74,7 +75,7 @@ class Journal:
 
     def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
         """Take down a draw. Without space it is kept and goes before whatever is taken down next."""
-        self._late.append((DRAW, msgpack.packb([*astuple(request), ids.tobytes()])))
+        self._late.append((DRAW, msgpack.packb([*msgspec.structs.astuple(request), ids.tobytes()])))
         with contextlib.suppress(OSError):
             self._append_late()
 

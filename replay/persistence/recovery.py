@@ -10,7 +10,8 @@ import numpy as np
 
 from common.errors import RunError
 from common.messaging import wire
-from common.messaging.experience import DrawRequest, SegmentReader
+from common.messaging.messages.insert import SegmentReader
+from common.messaging.messages.sample import DrawRequest
 from replay.core import ReplayCore
 from replay.persistence.journal import (
     DRAW,
@@ -53,7 +54,7 @@ def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Itera
     read = SegmentReader(core.table.spec)
     for kind, payload in read_file(folder, number, run_id):
         if kind == SEGMENT:
-            core.take(read(wire.decode(payload)))
+            core.take(read(wire.decode(payload, wire.ON_DISK)))
         elif kind == DRAW:
             request, ids = read_draw(payload)
             batch, _ = core.give(request)

@@ -17,8 +17,8 @@ import msgpack
 import numpy as np
 
 from common.errors import BadMessage, UsageError
-from common.messaging import experience, wire
-from common.messaging.experience import BatchReader
+from common.messaging import wire
+from common.messaging.messages.sample import BatchReader, encode_batch
 from common.process.files import PIECE, SyncedFile, measure, sync_folder, write_whole
 from common.types import Array
 from replay.core import CoreSnapshot, ReplayCore
@@ -79,9 +79,7 @@ def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path, mark: 
                 piece = frames.read(start, min(len(frames), start + FRAMES_AT_ONCE))
             file.write(piece.tobytes())
     files["frames"] = file.size, file.checksum
-    replies = [
-        bytes(experience.encode_batch("", batch.frames, batch.columns(), drawn)) for batch, drawn in snapshot.replies
-    ]
+    replies = [bytes(encode_batch("", batch.frames, batch.columns(), drawn)) for batch, drawn in snapshot.replies]
     state = {"books": snapshot.books, "table": meta, "replies": replies, "mark": mark, "files": files}
     packed = msgpack.packb(state)
     write_whole(part / STATE, zlib.crc32(packed).to_bytes(4, "little") + packed)
@@ -100,7 +98,7 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int) -> Mark:
     arrays = {name: _read_array(path / f"{name}.npy", tuple(written)) for name, written in state["files"].items()}
     read = BatchReader(core.table.spec)
     try:
-        replies = [read(wire.decode(payload)) for payload in state["replies"]]
+        replies = [read(wire.decode(payload, wire.ON_DISK)) for payload in state["replies"]]
     except BadMessage as error:
         raise TornSnapshot(f"{path / STATE}: {error}") from error
     core.restore(state["books"], state["table"], arrays, replies)

@@ -1,0 +1,106 @@
+"""What all messages have in common: a kind, fields with bounds in their types, and arrays of known dtype and shape."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping, Set
+from reprlib import repr as shown
+from typing import Any, ClassVar, Self, TypeVar
+
+import msgspec
+
+from common.errors import BadMessage
+from common.messaging import wire
+from common.messaging.wire import Message
+
+T = TypeVar("T", bound=msgspec.Struct)
+Layout = Mapping[str, tuple[str, tuple[int | str, ...]]]
+"""Name of an array -> (dtype, shape); a word in a shape stands for any length, the same one in the whole message."""
+
+NO_ARRAYS: Layout = {}
+_PLACE = re.compile(r"^(?P<problem>.*?)(?: - at .*`\$(?P<path>[^`]*)`)?$", re.DOTALL)  # of msgspec's messages
+
+
+class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A message without arrays; all its fields are on the wire."""
+
+    kind: ClassVar[str]
+
+    def encode(self, run: str) -> bytearray:
+        """Build the message."""
+        return wire.encode(self.kind, run, self)
+
+    @classmethod
+    def decode(cls, message: Message) -> Self:
+        """Read it; raises BadMessage."""
+        check_kind(message, cls.kind)
+        check_arrays(message, NO_ARRAYS)
+        return typed(message, cls)
+
+
+def check_kind(message: Message, kind: str) -> None:
+    """Raises BadMessage where a message is of another kind."""
+    if message.kind != kind:
+        raise BadMessage("kind", f"{shown(message.kind)} instead of {kind!r}")
+
+
+def check_arrays(message: Message, layout: Layout, optional: Set[str] = frozenset()) -> dict[str, int]:
+    """Return the lengths that the layout's words stand for; raises BadMessage for the first array that does not fit.
+
+    optional: names of arrays that may be missing.
+    """
+    if message.arrays.keys() | optional != layout.keys():
+        raise BadMessage("arrays", _difference(message.arrays.keys(), layout.keys()))
+    lengths: dict[str, int] = {}
+    for name, (dtype, shape) in layout.items():
+        array = message.arrays.get(name)
+        if array is None:
+            continue
+        if array.dtype != dtype:
+            raise BadMessage(f"arrays.{name}", f"dtype {array.dtype.name} instead of {dtype}")
+        expected = tuple(
+            lengths.setdefault(length, have) if isinstance(length, str) else length
+            for length, have in zip(shape, array.shape, strict=False)
+        )
+        if array.shape != expected or len(shape) != array.ndim:
+            raise BadMessage(f"arrays.{name}", f"shape {list(array.shape)} instead of {list(shape)}")
+    return lengths
+
+
+def typed(message: Message, kind: type[T], layout: Layout = NO_ARRAYS) -> T:
+    """A message's fields, and its arrays that were checked against `layout`, as a struct; raises BadMessage."""
+    fields, expected = message.fields, _names(kind)
+    if layout:
+        expected = expected - layout.keys()
+    if fields.keys() != expected:
+        raise BadMessage("fields", _difference(fields.keys(), expected))
+    try:
+        return msgspec.convert({**fields, **message.arrays} if layout else fields, kind, strict=True)
+    except msgspec.ValidationError as error:
+        raise bad_field(error, fields) from error
+
+
+@functools.cache
+def _names(kind: type[msgspec.Struct]) -> frozenset[str]:
+    return frozenset(kind.__struct_fields__)
+
+
+def bad_field(error: msgspec.ValidationError, fields: Mapping[str, Any]) -> BadMessage:
+    """By name what msgspec found, which says it in its text only: "Expected `int` >= 0 - at `$.episodes[0][1]`"."""
+    found = _PLACE.match(str(error))
+    assert found is not None
+    path = (found["path"] or "").partition("[")[0]
+    problem = found["problem"].replace("`", "")[:200]
+    value = fields.get(path[1:])
+    return BadMessage(f"fields{path}", f"{shown(value)}; {problem[0].lower()}{problem[1:]}")
+
+
+def _difference(have: Set[str], want: Set[str]) -> str:
+    missing, unknown = sorted(want - have), sorted(have - want)
+    both = (("missing", missing), ("unknown", unknown))
+    return "; ".join(f"{word} {', '.join(map(_short, names))}" for word, names in both if names)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= wire.MAX_NAME else shown(name)

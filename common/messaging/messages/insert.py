@@ -1,0 +1,88 @@
+"""Experience on its way to the table: a segment, which is answered with a receipt or "not now"."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from common.bounds import MAX_MAGNITUDE, MAX_N_STEP, MAX_SEGMENT_STEPS, MAX_UPDATES
+from common.errors import BadMessage
+from common.messaging import wire
+from common.messaging.messages.body import Layout, check_arrays, check_kind, typed
+from common.messaging.wire import Message
+from common.types import Array, EnvSpec, Segment
+
+KIND = "insert"
+_ARRAYS = ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version", "span")
+OPTIONAL = frozenset({"span"})  # journals and snapshots from before n-step returns lack it
+_FIELDS = tuple(name for name in Segment.__struct_fields__ if name not in _ARRAYS)
+
+
+def encode_segment(run: str, segment: Segment) -> bytearray:
+    """Build an insert request."""
+    fields = {name: getattr(segment, name) for name in _FIELDS}
+    return wire.encode(KIND, run, fields, {name: getattr(segment, name) for name in _ARRAYS})
+
+
+def transitions(spec: EnvSpec, rows: str) -> Layout:
+    """The arrays that segments and batches share, one row a transition."""
+    return {
+        "frames": (spec.frame_dtype, ("frames", *spec.frame_shape)),
+        "obs_index": ("int32", (rows, spec.stack)),
+        "next_index": ("int32", (rows, spec.stack)),
+        "actions": ("int32", (rows,)),
+        "rewards": ("float32", (rows,)),
+        "terminated": ("bool", (rows,)),
+        "param_version": ("int64", (rows,)),
+        "span": ("uint8", (rows,)),
+    }
+
+
+def check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
+    """Check the values of the arrays that segments and batches share, at least one row; raises BadMessage."""
+    frames = arrays["frames"]
+    for name in ("obs_index", "next_index"):
+        within(f"arrays.{name}", arrays[name], 0, len(frames) - 1)
+    within("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
+    within("arrays.rewards", arrays["rewards"], -MAX_MAGNITUDE, MAX_MAGNITUDE)
+    if frames.dtype == np.float32:
+        within("arrays.frames", frames, -MAX_MAGNITUDE, MAX_MAGNITUDE)
+    within("arrays.terminated", arrays["terminated"].view(np.uint8), 0, 1)
+    within("arrays.param_version", arrays["param_version"], 0, MAX_UPDATES)
+    if "span" in arrays:
+        within("arrays.span", arrays["span"], 1, MAX_N_STEP)
+
+
+def within(field: str, array: Array, low: float, high: float) -> None:
+    """Raises BadMessage for a value outside [low, high], and for what is no number."""
+    least, most = array.min(), array.max()
+    if not (low <= least and most <= high):
+        raise BadMessage(field, f"values from {least} to {most}; allowed: {low} to {high}")
+
+
+class SegmentReader:
+    """Reads insert requests for one environment."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        self._spec = spec
+        self._layout = transitions(spec, "steps")
+
+    def __call__(self, message: Message) -> Segment:
+        """Read one; raises BadMessage for anything the table could not take."""
+        check_kind(message, KIND)
+        lengths = check_arrays(message, self._layout, OPTIONAL)
+        steps, frames = lengths["steps"], lengths["frames"]
+        if not 1 <= steps <= MAX_SEGMENT_STEPS:
+            raise BadMessage("arrays.actions", f"{steps} steps; allowed: 1 to {MAX_SEGMENT_STEPS}")
+        check_transitions(self._spec, message.arrays)
+        segment = typed(message, Segment, self._layout)
+        if segment.carried > frames:
+            raise BadMessage("fields.carried", f"{segment.carried} of {frames} frames")
+        last = -1
+        for end in segment.episodes:
+            if not last < end.step_in_segment < steps:
+                text = f"one ends with step {end.step_in_segment} of {steps}, the one before it with {last}"
+                raise BadMessage("fields.episodes", text)
+            last = end.step_in_segment
+        return segment

@@ -1,0 +1,109 @@
+"""Experience on its way to the learner: the request of a batch, and its answer, which also tells of ended episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Self
+
+from msgspec import Meta, Struct
+
+from common.bounded import Count, Counter, Incarnation, Updates
+from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_PRIORITIES, MAX_STREAMS, MAX_UPDATES
+from common.errors import BadMessage
+from common.messaging import wire
+from common.messaging.messages.body import Body, check_arrays, check_kind, typed
+from common.messaging.messages.insert import OPTIONAL, check_transitions, transitions, within
+from common.messaging.wire import Message, Source
+from common.types import Array, Batch, EnvSpec, EpisodeEnd
+
+MAX_EPISODES = 1000  # told with one batch; later ones come with the next
+KIND = "batch"
+
+Priority = Annotated[float, Meta(ge=0, le=MAX_FLOAT32)]
+
+
+class EpisodeRecord(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A finished episode as the replay service books it, in order of acceptance.
+
+    env_step: transitions accepted up to the episode's last step.
+    """
+
+    env_step: Counter
+    actor: Incarnation
+    stream: Annotated[int, Meta(ge=0, lt=MAX_STREAMS)]
+    end: EpisodeEnd
+
+
+class Drawn(Struct, frozen=True):
+    """What the table says beside a batch: its counters, and the episodes from number `first_episode` on.
+
+    planned: batches that the complete run will have drawn.
+    """
+
+    sequence: Counter
+    inserted: Counter
+    size: Counter
+    evicted: Counter
+    evicted_unsampled: Counter
+    first_episode: Counter
+    episodes: Annotated[tuple[EpisodeRecord, ...], Meta(max_length=MAX_EPISODES)]
+    planned: Counter = 0
+
+
+class DrawRequest(Body, frozen=True):
+    """A request for the batch of update number `sequence`; repeated, it is answered with the same batch.
+
+    base: updates that the learner has done for good: it never asks again for a batch below. A replay service that
+        has drawn less than that, or that served another incarnation, takes it for its own count of draws.
+    episodes_from: number of the first episode that the learner has not been told of.
+    priorities: new priorities (id of a transition, |TD error|), to be set before the draw.
+    """
+
+    kind: ClassVar[str] = "sample"
+
+    incarnation: Incarnation
+    sequence: Annotated[int, Meta(ge=0, lt=MAX_UPDATES + MAX_AHEAD)]
+    base: Updates
+    batch_size: Annotated[int, Meta(ge=1, le=MAX_BATCH)]
+    episodes_from: Count
+    priorities: Annotated[tuple[tuple[Counter, Priority], ...], Meta(max_length=MAX_PRIORITIES)] = ()
+
+    @classmethod
+    def decode(cls, message: Message) -> Self:
+        """Read it; raises BadMessage."""
+        request = super().decode(message)
+        if not request.base <= request.sequence < request.base + MAX_AHEAD:
+            allowed = f"{request.base} to {request.base + MAX_AHEAD - 1}"
+            raise BadMessage("fields.sequence", f"{request.sequence}; with base {request.base}: {allowed}")
+        return request
+
+
+def encode_batch(
+    run: str, frames: Array | Source, columns: Mapping[str, Array], drawn: Drawn, into: bytearray | None = None
+) -> bytearray:
+    """Build the answer to a draw: the frames of a batch and its other fields; into: see `wire.encode`."""
+    return wire.encode(KIND, run, drawn, {"frames": frames, **columns}, into)
+
+
+class BatchReader:
+    """Reads batches of one environment."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        self._spec = spec
+        self._layout = {
+            **transitions(spec, "batch"),
+            "weights": ("float32", ("batch",)),
+            "ids": ("int64", ("batch",)),
+            "age": ("int64", ("batch",)),
+            "reuse": ("int32", ("batch",)),
+        }
+
+    def __call__(self, message: Message) -> tuple[Batch, Drawn]:
+        """Read one; raises BadMessage."""
+        check_kind(message, KIND)
+        arrays = message.arrays
+        if not check_arrays(message, self._layout, OPTIONAL)["batch"]:
+            raise BadMessage("arrays.actions", "an empty batch")
+        check_transitions(self._spec, arrays)
+        within("arrays.weights", arrays["weights"], 0.0, MAX_FLOAT32)
+        return Batch(**arrays), typed(message, Drawn)

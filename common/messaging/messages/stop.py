@@ -1,0 +1,23 @@
+"""The learner ends the run."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Self
+
+from common.bounded import Text
+from common.messaging.messages.body import Body
+
+MAX_REASON = 1024  # characters
+
+
+class EndOfRun(Body, frozen=True):
+    """Broadcast by the learner: the run is over, and why."""
+
+    kind: ClassVar[str] = "stop"
+
+    reason: Text
+
+    @classmethod
+    def because(cls, reason: str) -> Self:
+        """With a reason that is cut where it is too long."""
+        return cls(reason[:MAX_REASON])

@@ -1,0 +1,51 @@
+"""Who acts and with what: the learner's broadcasts of the networks and of the acting role."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+from msgspec import Meta, Struct
+
+from common.bounded import Updates
+from common.messaging import wire
+from common.messaging.messages.body import Body, Layout, check_arrays, check_kind, typed
+from common.messaging.wire import Message
+from common.types import Array
+
+Network = Annotated[int, Meta(ge=1, le=2)]
+
+
+class Current(Body, frozen=True):
+    """Asks for the latest broadcast of a key."""
+
+    kind: ClassVar[str] = "current"
+
+
+class Weights(Struct, frozen=True):
+    """One network: float32 [P] parameters in `flat`."""
+
+    network: Network
+    version: Updates
+    flat: Array
+
+    def encode(self, run: str) -> bytearray:
+        """Build the message."""
+        return wire.encode("weights", run, {"network": self.network, "version": self.version}, {"flat": self.flat})
+
+    @classmethod
+    def decode(cls, message: Message, parameters: int) -> Self:
+        """Read a network of `parameters` parameters; raises BadMessage."""
+        layout: Layout = {"flat": ("float32", (parameters,))}
+        check_kind(message, "weights")
+        check_arrays(message, layout)
+        return typed(message, cls, layout)
+
+
+class Role(Body, frozen=True):
+    """Who acts: the network (1 or 2), the newest version of each network, and how far the run is."""
+
+    kind: ClassVar[str] = "role"
+
+    acting: Network
+    versions: tuple[Updates, Updates]
+    updates: Updates
