@@ -48,6 +48,7 @@ def _run() -> None:
     use_threads(config.learner.threads)
     stop = Stop()
     stop.on_signals()
+    stop.on_thread_failures()
     path = options.directory()
     trainer = Trainer(Agent(config, spec), time.monotonic())
     agent = trainer.agent
@@ -73,3 +74,5 @@ def _run() -> None:
     print(summary, flush=True)
     if trainer.diverged:
         raise RunError(trainer.diverged)
+    if stop.failed:
+        raise RunError(stop.reason)

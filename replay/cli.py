@@ -45,6 +45,7 @@ def _run() -> None:
     keep_freed_memory()
     stop = Stop()
     stop.on_signals()
+    stop.on_thread_failures()
     incarnation = new_incarnation()
     session = open_session(options.listen, options.connect, options.zenoh_config, options.shared_memory)
     with Node(session, options.run, "replay", incarnation) as node:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
-from common.errors import BadMessage, RunError
+from common.errors import BadMessage, CoopError, RunError
 from common.messaging.keys import replay_key
 from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.epoch import Snapshot, Written
@@ -63,6 +64,7 @@ class ReplayService:
         self._inserts = _Gate()
         self._draws = _Gate()
         self._closing = False
+        self._broken = ""  # why the core must not be used any more
         self._batch = bytearray()  # the last one answered; one thread answers, and sending has copied it
 
     def start(self) -> None:
@@ -78,6 +80,8 @@ class ReplayService:
         """Tell displays what goes on, until the stop."""
         problem = ""
         while not stop.wait(STATUS_EVERY):
+            if self._broken:
+                stop.set(self._broken, failed=True)
             if problem != self._core.problem:
                 problem = self._core.problem
                 print(problem or "the journal can be written again", flush=True)
@@ -90,6 +94,7 @@ class ReplayService:
                     "inserts_wait_for": stats.inserts_wait_for,
                     "samples_wait_for": stats.samples_wait_for,
                     "bad_messages": stats.bad_messages,
+                    "faults": stats.faults,
                 }
             )
         with self._changed:
@@ -119,6 +124,7 @@ class ReplayService:
                 bad_messages=self._node.bad_messages,
                 inserts_wait_for=core.inserts_wait_for,
                 samples_wait_for=core.samples_wait_for,
+                faults=self._node.faults.count,
             )
 
     def _insert(self, message: Message) -> bytearray:
@@ -148,6 +154,9 @@ class ReplayService:
     def _admit(self, gate: _Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
         """Try, and try again whenever the core has changed, until the gate's deadline."""
         with self._changed:
+            if self._broken:  # and let others send it again, to the one that follows
+                return Wait(self._broken)
+        with self._changing():
             while isinstance(outcome := self._why_not() or attempt(), Wait):
                 now = time.monotonic()
                 gate.closed_at = gate.closed_at or now
@@ -159,6 +168,24 @@ class ReplayService:
             self._changed.notify_all()
             return outcome
 
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Hold the lock, and note where an error of this program may have left the core half changed.
+
+        Raises:
+            RunError: that has happened before, and nothing may be done with the core any more.
+        """
+        with self._changed:
+            if self._broken:
+                raise RunError(self._broken)
+            try:
+                yield
+            except CoopError:
+                raise
+            except Exception as error:
+                self._broken = f"an error of this program may have left the table half changed: {error!r}"
+                raise
+
     def _why_not(self) -> Wait | None:
         """Why this service may neither acknowledge nor draw now; None while it may."""
         return None if time.monotonic() < self._confirmed else Wait(UNCONFIRMED)
@@ -168,7 +195,7 @@ class ReplayService:
         return self.stats().encode(self._node.run)
 
     def _limits(self, message: Message) -> bytearray:
-        with self._changed:
+        with self._changing():
             core = self._core
             if message.kind == Limit.kind:
                 asked = Limit.decode(message)
@@ -194,7 +221,8 @@ class ReplayService:
     def _snapshot(self, message: Message) -> bytearray:
         if message.kind == Snapshot.kind:
             request = Snapshot.decode(message)
-            self._epochs.begin(self._core, self._changed, request.number, request.keep)
+            with self._changing():
+                self._epochs.begin(self._core, self._changed, request.number, request.keep)
         elif not self._epochs.written(Written.decode(message).number, HOLD):
             return Retry("the replay service is writing its part of the epoch").encode(self._node.run)
         return Ack(self._core.table.inserted).encode(self._node.run)

@@ -10,6 +10,7 @@ from typing import Any, Self
 import msgspec
 
 from common.errors import BadMessage, JoinError
+from common.messaging.endpoints import unknown_hosts
 from common.messaging.keys import join_key
 from common.messaging.messages.answers import Retry
 from common.messaging.messages.join import Join, Joined
@@ -54,6 +55,8 @@ def join(
             where = ", ".join(connect) or "no endpoint (give --connect)"
             missing = "replay service" if answered else "learner"
             text = f"no {missing} of run {node.run!r} found at {where} within {timeout:g} s"
+            if not answered and (unknown := unknown_hosts(connect)):
+                text = f"{text}; the host {unknown[0]!r} is not known"
             others = [] if answered else other_runs(node)
             raise JoinError(f"{text}; there is run {', '.join(map(repr, others))}" if others else text)
         stop.wait(RETRY_PAUSE)

@@ -17,6 +17,7 @@ import zenoh
 from msgspec import Meta
 
 from common.bounded import Name
+from common.messaging.faults import Faults
 
 ROLES = ("learner", "replay", "actor")
 LEASE = 1.5  # seconds of silence after which a link is given up, and the learner's word no longer holds
@@ -44,16 +45,19 @@ class Presence:
 
     Args:
         prefix: key under which the tokens are, as ROLE/INCARNATION.
+        faults: told of errors of this program in Zenoh's threads.
     """
 
-    def __init__(self, session: zenoh.Session, prefix: str) -> None:
+    def __init__(self, session: zenoh.Session, prefix: str, faults: Faults) -> None:
         self._there: set[str] = set()
         self._gone: dict[str, float] = {}  # since when
         self._lock = threading.Lock()
         self._on_change: Callable[[], None] = lambda: None
         self._began = time.monotonic()
         for role in ROLES:  # one subscriber each: access control may let a process see some roles only
-            session.liveliness().declare_subscriber(f"{prefix}/{role}/*", self._tell, history=True)
+            session.liveliness().declare_subscriber(
+                f"{prefix}/{role}/*", faults.guarded("watching who is there", self._tell), history=True
+            )
 
     def on_change(self, call: Callable[[], None]) -> None:
         """Have `call` called whenever somebody comes or goes, in a thread of Zenoh's."""

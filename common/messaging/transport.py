@@ -20,6 +20,8 @@ import zenoh
 from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage, CoopError, RunError, UsageError
 from common.messaging import wire
+from common.messaging.endpoints import check_endpoints, first_line, why_not
+from common.messaging.faults import Faults
 from common.messaging.keys import run_key, stop_key
 from common.messaging.links import never_linger
 from common.messaging.messages.answers import Error
@@ -73,6 +75,7 @@ def open_session(
         RunError: an endpoint that can't be listened on, for example because its port is in use.
     """
     zenoh.init_log_from_env_or("off")
+    check_endpoints((*listen, *connect))
     try:
         config = zenoh.Config.from_file(str(zenoh_config)) if zenoh_config else zenoh.Config()
         for key, value in _QUIET.items():
@@ -81,11 +84,11 @@ def open_session(
         config.insert_json5("listen/endpoints", json.dumps(list(listen)))
         config.insert_json5("connect/endpoints", json.dumps(list(connect)))
     except zenoh.ZError as error:
-        raise UsageError(f"zenoh configuration: {_first_line(error)}") from error
+        raise UsageError(f"zenoh configuration: {first_line(error)}") from error
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        raise RunError(f"can't listen on {', '.join(listen) or 'any endpoint'}: {_first_line(error)}") from error
+        raise RunError(f"can't listen on {', '.join(listen) or 'any endpoint'}: {why_not(listen, error)}") from error
     never_linger(session)
     return session
 
@@ -136,18 +139,20 @@ class Node:
 
     Attributes:
         presence: who else is connected.
+        faults: errors of this program in the threads of this node.
     """
 
     def __init__(self, session: zenoh.Session, run: str, role: str, incarnation: int) -> None:
         self.session = session
         self.run = run
         self.bad_messages = 0
+        self.faults = Faults()
         self._counting = threading.Lock()
         self._name = f"{role}/{incarnation:x}"
         self._threads: list[threading.Thread] = []
         self._closing = False
         self._status = session.declare_publisher(self.key("metrics", self._name))
-        self.presence = Presence(session, self.key("alive"))
+        self.presence = Presence(session, self.key("alive"), self.faults)
         self._token = session.liveliness().declare_token(self.key("alive", self._name))
 
     def key(self, *parts: str) -> str:
@@ -174,7 +179,8 @@ class Node:
         """Answer the queries on `key`, one after the other, in a thread of its own, until the session closes.
 
         A message that does not decode, names another run, or that `answer` refuses with BadMessage gets an error
-        reply, is counted, and changes nothing. Any other CoopError of `answer` becomes an error reply too.
+        reply, is counted, and changes nothing. Any other CoopError of `answer` becomes an error reply too, and so does
+        an error of this program, which is noted.
         """
         queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(depth), complete=True)
         thread = threading.Thread(target=self._serve, args=(queryable, key, answer), name=f"serve {key}", daemon=True)
@@ -190,9 +196,11 @@ class Node:
             with query:
                 try:
                     reply = answer(self.read(query.payload))
-                except CoopError as error:
+                except Exception as error:
                     if isinstance(error, BadMessage):
                         self.count_bad()
+                    elif not isinstance(error, CoopError):
+                        self.faults.note(f"serving {key}", error)
                     with contextlib.suppress(zenoh.ZError):
                         query.reply_err(Error.of(error).encode(self.run))
                     continue
@@ -236,7 +244,7 @@ class Node:
             except BadMessage:
                 self.count_bad()
 
-        self.session.declare_subscriber(stop_key(self), stopped)
+        self.session.declare_subscriber(stop_key(self), self.faults.guarded("reading the stop", stopped))
 
     def close(self) -> None:
         """Close the session and wait for the serving threads."""
@@ -288,7 +296,3 @@ def _answer(reply: zenoh.Reply) -> Message:
     if problem is not None:
         raise Refused(problem)
     return message
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0].split(" at ")[0]

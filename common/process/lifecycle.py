@@ -53,6 +53,16 @@ class Stop:
         signal.signal(signal.SIGINT, handle)
         signal.signal(signal.SIGTERM, handle)
 
+    def on_thread_failures(self) -> None:
+        """Let a thread that ends of an error of this program end the process, which would live on without it."""
+
+        def handle(failure: threading.ExceptHookArgs) -> None:
+            threading.__excepthook__(failure)  # prints the traceback
+            name = failure.thread.name if failure.thread is not None else "?"
+            self.set(f"error of this program in the thread {name!r}: {failure.exc_value!r}", failed=True)
+
+        threading.excepthook = handle
+
 
 def run_main(program: str, main: Callable[[], None]) -> None:
     """Run a command's body; a failure that the user can meet ends in one line and its exit status."""

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Self
 from msgspec import Meta
 
 from common.bounded import Counter, Text
-from common.errors import BadMessage
+from common.errors import BadMessage, CoopError
 from common.messaging.messages.body import Body
 
 LONGEST_PROBLEM = 4096  # characters
@@ -44,4 +44,5 @@ class Error(Body, frozen=True):
     def of(cls, error: Exception) -> Self:
         """What to answer where a message led to `error`."""
         field = error.field if isinstance(error, BadMessage) else ""
-        return cls(field[:1024], str(error)[:LONGEST_PROBLEM])
+        problem = str(error) if isinstance(error, CoopError) else f"error of this program: {error!r}"
+        return cls(field[:1024], problem[:LONGEST_PROBLEM])

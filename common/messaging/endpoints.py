@@ -1,0 +1,72 @@
+"""Endpoints as people write them, and in words what is wrong with one."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import socket
+from collections.abc import Sequence
+
+from common.errors import UsageError
+
+PORTS = ("tcp", "tls", "udp", "quic", "ws")  # protocols whose address is HOST:PORT
+OTHERS = ("unixsock-stream", "unixpipe", "serial", "vsock")
+_OS_ERROR = re.compile(r"\(os error (\d+)\)")
+_WORDS = {
+    errno.EADDRINUSE: "the port is in use",
+    errno.EADDRNOTAVAIL: "this machine does not have that address",
+    errno.EACCES: "not permitted",
+}
+
+
+def check_endpoints(endpoints: Sequence[str]) -> None:
+    """Raises UsageError for the first one that is not PROTOCOL/ADDRESS; says what may be meant."""
+    for endpoint in endpoints:
+        protocol, slash, address = endpoint.partition("/")
+        if not slash:
+            raise UsageError(f"endpoint {endpoint!r}: no protocol; tcp/{endpoint or 'HOST:PORT'} is meant?")
+        if protocol.endswith(":"):
+            raise UsageError(f"endpoint {endpoint!r}: {protocol[:-1]}/{address.lstrip('/')} is meant?")
+        if protocol not in PORTS + OTHERS:
+            allowed = ", ".join(PORTS + OTHERS)
+            raise UsageError(f"endpoint {endpoint!r}: no such protocol as {protocol!r}; allowed: {allowed}")
+        if protocol in PORTS:
+            host, port = _host_and_port(address)
+            if not (host and port.isdecimal() and int(port) < 2**16):
+                raise UsageError(f"endpoint {endpoint!r}: {protocol}/HOST:PORT with a port from 0 to 65535 is needed")
+
+
+def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
+    """Names of hosts in `endpoints` that can't be resolved now."""
+    unknown = []
+    for endpoint in endpoints:
+        protocol, _, address = endpoint.partition("/")
+        host, _ = _host_and_port(address)
+        try:
+            if protocol in PORTS:
+                socket.getaddrinfo(host, None)
+        except (socket.gaierror, UnicodeError):
+            unknown.append(host)
+    return unknown
+
+
+def why_not(listen: Sequence[str], error: Exception) -> str:
+    """In words why Zenoh, which raised `error`, can't listen."""
+    if hosts := unknown_hosts(listen):
+        return f"the host {hosts[0]!r} is not known"
+    found = _OS_ERROR.search(str(error))
+    if found is None:
+        return first_line(error)
+    number = int(found[1])
+    return _WORDS.get(number, os.strerror(number).lower())
+
+
+def first_line(error: Exception) -> str:
+    """What Zenoh says, without the places in its source."""
+    return str(error).splitlines()[0].split(" at /")[0]
+
+
+def _host_and_port(address: str) -> tuple[str, str]:
+    host, _, port = re.split("[?#]", address)[0].rpartition(":")
+    return host.strip("[]"), port

@@ -1,0 +1,115 @@
+"""Errors of this program in threads: answered, counted, printed once; and a table that they left half changed."""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from samples import make_segment
+
+from common.messaging.keys import replay_key
+from common.messaging.messages.answers import Ack, Retry
+from common.messaging.messages.epoch import Snapshot
+from common.messaging.messages.insert import encode_segment
+from common.messaging.messages.stats import ReplayStats, StatsQuestion
+from common.messaging.messages.weights import Current
+from common.messaging.transport import Node, Refused, new_incarnation, open_session
+from common.messaging.wire import Message
+from common.process.lifecycle import Stop
+from common.settings.config import RunConfig
+from common.types import EnvSpec
+from replay.core import ReplayCore
+from replay.persistence.epochs import ReplayEpochs
+from replay.service import ReplayService
+
+
+def _until(reached: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_serving_thread_outlives_an_error(nodes: tuple[Node, Node], capfd: pytest.CaptureFixture[str]) -> None:
+    server, client = nodes
+    broken = [True, True]
+
+    def answer(message: Message) -> bytearray:
+        if broken:
+            broken.pop()
+            raise ZeroDivisionError("of no use to anybody")
+        return Ack(1).encode("test")
+
+    server.serve(server.key("role"), answer)
+    for _ in range(2):
+        with pytest.raises(Refused, match="error of this program: ZeroDivisionError"):
+            client.ask(client.key("role"), Current().encode("test"))
+    assert Ack.decode(client.ask(client.key("role"), Current().encode("test"))) == Ack(1)
+    assert (server.faults.count, server.bad_messages) == (2, 0)
+    printed = capfd.readouterr().err
+    assert printed.count("Traceback") == 1
+    assert "serving coop/test/role" in printed
+
+
+def test_a_callback_of_zenoh_outlives_an_error(nodes: tuple[Node, Node], endpoint: str) -> None:
+    learner, _ = nodes
+
+    def look() -> None:
+        raise ZeroDivisionError
+
+    learner.presence.on_change(look)
+    with Node(open_session((), (endpoint,)), "test", "replay", new_incarnation()):
+        _until(lambda: learner.faults.count == 1)
+        assert learner.presence.counts()["replay"] == 1
+    _until(lambda: learner.faults.count == 2)
+
+
+@pytest.mark.parametrize("question", ["insert", "snapshot"])
+def test_a_table_that_may_be_half_changed_is_not_used_any_more(
+    nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, question: str
+) -> None:
+    server, client = nodes
+    core, stop = ReplayCore(RunConfig(run="test"), spec), Stop()
+    service = ReplayService(server, core, ReplayEpochs(tmp_path, 5))
+    service.start()
+    running = threading.Thread(target=service.run, args=(stop,))
+    running.start()
+    first, second = (encode_segment("test", make_segment(spec, number)) for number in range(2))
+    client.ask(replay_key(client, "insert"), first)
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("half way")
+
+    monkeypatch.setattr(core.table, question, fail)
+    payload = second if question == "insert" else Snapshot(1, []).encode("test")
+    with pytest.raises(Refused, match="half way"):
+        client.ask(replay_key(client, question), payload)
+    _until(stop.is_set)
+    running.join(20)
+    assert stop.failed
+    assert "may have left the table half changed: ZeroDivisionError" in stop.reason
+    monkeypatch.undo()
+    assert "half changed" in Retry.decode(client.ask(replay_key(client, "insert"), second)).reason
+    with pytest.raises(Refused, match="half changed"):
+        client.ask(replay_key(client, "snapshot"), Snapshot(2, []).encode("test"))
+    stats = ReplayStats.decode(client.ask(replay_key(client, "stats"), StatsQuestion().encode("test")))
+    assert (stats.faults, stats.inserted) == (1, 4)
+
+
+def test_a_thread_that_ends_of_an_error_ends_the_process(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # so that the old one comes back
+    stop = Stop()
+    stop.on_thread_failures()
+
+    def fail() -> None:
+        raise ZeroDivisionError("gone")
+
+    thread = threading.Thread(target=fail, name="epoch 7")
+    thread.start()
+    thread.join()
+    assert stop.failed
+    assert stop.reason == "error of this program in the thread 'epoch 7': ZeroDivisionError('gone')"
+    assert "Traceback" in capfd.readouterr().err
