@@ -56,7 +56,7 @@ class Figures(NamedTuple):
 def run_config(envs: int, dtype: str) -> RunConfig:
     """Breakout as Mnih played it late in a run, with a limiter that never says no."""
     tables = load_tables("breakout", None)
-    tables["replay"] |= {"capacity": 20_000, "start": 1000, "tolerance": 1e12}
+    tables["replay"] |= {"capacity": 20_000, "learning_starts": 1000, "tolerance": 1e12}
     tables["actor"] |= {"envs": envs, "epsilon_start": EPSILON, "epsilon_final": EPSILON}
     tables["network"] |= {"dtype": dtype}
     return resolve({**tables, "run": RUN, "total_steps": 10**12})

@@ -58,7 +58,7 @@ def report(preset: str, steps: int, folder: Path, memory: Array) -> None:
     print(f"  lost {lost}, duplicates refused {twice}, transitions {summary['transitions_accepted']:,}")
     replay = resolve(shortened(load_tables(preset, None), steps)).replay
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    ahead = [row["env_step"] - replay.start - row["update"] / replay.ratio for row in rows]
+    ahead = [row["env_step"] - replay.learning_starts - row["update"] / replay.ratio for row in rows]
     print(
         f"  steps ahead of updates x {1 / replay.ratio:g}: {min(ahead):+.0f} to {max(ahead):+.0f}, first "
         f"{ahead[0]:+.0f}, last {ahead[-1]:+.0f} in {len(rows)} rows (tolerance {replay.tolerance:g} and a segment)"

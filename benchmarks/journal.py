@@ -44,7 +44,7 @@ class Service:
                 "run": run,
                 "total_steps": 10**12,
                 "env": {"id": "breakout"},
-                "replay": {"capacity": CAPACITY, "start": 1000, "tolerance": 1e12, "journal": journal},
+                "replay": {"capacity": CAPACITY, "learning_starts": 1000, "tolerance": 1e12, "journal": journal},
             }
         )
         head, at = free_endpoint(), free_endpoint()

@@ -49,7 +49,7 @@ CONFIG = validated(
         "run": RUN,
         "total_steps": 10**12,
         "env": {"id": "breakout"},
-        "replay": {"capacity": CAPACITY, "start": 1000, "tolerance": 1e12},
+        "replay": {"capacity": CAPACITY, "learning_starts": 1000, "tolerance": 1e12},
     }
 )
 

@@ -2,7 +2,7 @@
 
 Memory, threads and file descriptors of every role must stay flat after the first minute: the last quarter of the time
 is compared with the first one. Exit status 1 if they do not. Further flags go to the learner; the table must be full
-within the minute (`--preset catch --replay.capacity 2000 --replay.start 1000`).
+within the minute (`--preset catch --replay.capacity 2000 --replay.learning-starts 1000`).
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def run_config(method: str, dtype: str, batch_size: int, device: str) -> RunConf
     tables = load_tables("breakout", None)
     tables["network"] |= {"dtype": dtype}
     tables["learner"] |= {"batch_size": batch_size, "device": device}
-    tables["replay"] |= {"capacity": 10_000, "start": 1000, "tolerance": 1e12}
+    tables["replay"] |= {"capacity": 10_000, "learning_starts": 1000, "tolerance": 1e12}
     return resolve({**tables, "run": RUN, "total_steps": 10**12}, method)
 
 

@@ -83,7 +83,7 @@ class Lockstep:
             yield effects
         ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in turn.ended.items())
         yield self.trainer.note(msgspec.structs.replace(told, episodes=ended))
-        if learner.swap_by == "plays" and self.step % learner.swap_every == 0:
+        if learner.swap_unit == "steps" and self.step % self.config.swap_period == 0:
             self.agent.swap()
         if learner.reset_role_at_episode and turn.ended and self.agent.acting:
             self.agent.swap()
@@ -95,7 +95,7 @@ class Lockstep:
     def _updates_due(self) -> int:
         """Updates that the replay ratio asks for after this step."""
         settings = self.config.replay
-        since = self.step - settings.start
+        since = self.step - settings.learning_starts
         return 0 if since <= 0 else math.floor(settings.ratio * since) - math.floor(settings.ratio * (since - 1))
 
     def save(self, directory: RunDirectory) -> None:

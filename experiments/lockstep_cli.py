@@ -24,7 +24,8 @@ def main() -> None:
 
 
 def _run() -> None:
-    options = parse_run(RunOptions, "coop-lockstep", "Run Algorithm 1 exactly, in one process without a network.")
+    description = "Run Algorithm 1 exactly, in one process without a network."
+    options = parse_run(RunOptions, "coop-lockstep", description, lockstep=True)
     config = options.run_config()
     use_threads(config.learner.threads)
     path = options.directory()

@@ -153,7 +153,7 @@ class Agent:
         self.updates += 1
         self.versions[self.acting] = self.updates
         settings = self.config.learner
-        due = settings.swap_by == "updates" and self.updates % settings.swap_every == 0
+        due = settings.swap_unit == "updates" and self.updates % self.config.swap_period == 0
         if due:
             self.swap()
         return due

@@ -109,18 +109,18 @@ class SGD(Optimizer):
 
 
 class RMSProp(Optimizer):
-    """PyTorch's: v <- decay v + (1 - decay) g^2;  u = g / (sqrt(v) + constant).
+    """PyTorch's: v <- alpha v + (1 - alpha) g^2;  u = g / (sqrt(v) + eps).
 
     Then theta <- theta - rate u; with momentum, m <- momentum m + u takes the place of u.
     """
 
-    def __init__(self, theta: Array, gradient: Array, decay: float, constant: float, momentum: float) -> None:
+    def __init__(self, theta: Array, gradient: Array, alpha: float, eps: float, momentum: float) -> None:
         super().__init__(theta, gradient, "square", *(["velocity"] if momentum else []))
-        self._decay, self._constant, self._momentum = decay, constant, momentum
+        self._alpha, self._eps, self._momentum = alpha, eps, momentum
 
     def _step(self, rate: float) -> None:
-        root = self._root(self._average_square(self._decay))
-        root += self._constant
+        root = self._root(self._average_square(self._alpha))
+        root += self._eps
         if self._momentum:
             velocity = self.buffers["velocity"]
             velocity *= self._momentum
@@ -131,56 +131,56 @@ class RMSProp(Optimizer):
 
 
 class MnihRMSProp(Optimizer):
-    """Mnih et al. 2015: centred, with the constant inside the root.
+    """Mnih et al. 2015: centred, with eps inside the root.
 
-    m <- momentum m + (1 - momentum) g;  v <- decay v + (1 - decay) g^2;
-    theta <- theta - rate g / sqrt(max(v - m^2, 0) + constant). The variance v - m^2 is never negative where both decays
+    m <- gradient_alpha m + (1 - gradient_alpha) g;  v <- alpha v + (1 - alpha) g^2;
+    theta <- theta - rate g / sqrt(max(v - m^2, 0) + eps). The variance v - m^2 is never negative where both constants
     are equal, as theirs are.
     """
 
-    def __init__(self, theta: Array, gradient: Array, decay: float, constant: float, momentum: float) -> None:
+    def __init__(self, theta: Array, gradient: Array, alpha: float, eps: float, gradient_alpha: float) -> None:
         super().__init__(theta, gradient, "square", "mean")
-        self._decay, self._constant, self._momentum = decay, constant, momentum
+        self._alpha, self._eps, self._gradient_alpha = alpha, eps, gradient_alpha
 
     def _step(self, rate: float) -> None:
-        mean = self._average("mean", self._momentum)
-        square = self._average_square(self._decay)
+        mean = self._average("mean", self._gradient_alpha)
+        square = self._average_square(self._alpha)
         root = self._variance(square, mean)
         self._xp.clip(root, 0, None, out=root)
-        root += self._constant
+        root += self._eps
         self._descend(self.gradient, rate, self._xp.sqrt(root, out=root))
 
 
 class Adam(Optimizer):
     """Kingma & Ba 2015, after k steps.
 
-    m <- b1 m + (1 - b1) g;  v <- b2 v + (1 - b2) g^2;
-    theta <- theta - rate (m / (1 - b1^k)) / (sqrt(v / (1 - b2^k)) + constant).
+    m <- beta1 m + (1 - beta1) g;  v <- beta2 v + (1 - beta2) g^2;
+    theta <- theta - rate (m / (1 - beta1^k)) / (sqrt(v / (1 - beta2^k)) + eps).
     """
 
-    def __init__(self, theta: Array, gradient: Array, decays: tuple[float, float], constant: float) -> None:
+    def __init__(self, theta: Array, gradient: Array, betas: tuple[float, float], eps: float) -> None:
         super().__init__(theta, gradient, "mean", "square")
-        self._decays, self._constant = decays, constant
+        self._betas, self._eps = betas, eps
 
     def _step(self, rate: float) -> None:
-        first, second = self._decays
-        mean = self._average("mean", first)
-        correction = (1 - second**self.steps) ** 0.5
-        root = self._root(self._average_square(second))
-        root += self._constant * correction
-        self._descend(mean, rate * correction / (1 - first**self.steps), root)
+        beta1, beta2 = self._betas
+        mean = self._average("mean", beta1)
+        correction = (1 - beta2**self.steps) ** 0.5
+        root = self._root(self._average_square(beta2))
+        root += self._eps * correction
+        self._descend(mean, rate * correction / (1 - beta1**self.steps), root)
 
 
 def make_optimizer(settings: LearnerSettings, theta: Array, gradient: Array) -> Optimizer:
     """The configured optimizer of parameters theta, float32 [P], and their gradient."""
-    decay, constant, momentum = settings.squared_decay, settings.denominator, settings.momentum
+    alpha, eps, momentum = settings.alpha, settings.eps, settings.momentum
     match settings.optimizer:
         case "sgd":
             return SGD(theta, gradient, momentum)
         case "rmsprop":
-            return RMSProp(theta, gradient, decay, constant, momentum)
+            return RMSProp(theta, gradient, alpha, eps, momentum)
         case "rmsprop-mnih":
-            # Mnih's gradients are sums over the batch, these are means; the update notices by this constant alone.
-            return MnihRMSProp(theta, gradient, decay, constant / settings.batch_size**2, momentum)
+            # Mnih's gradients are sums over the batch, these are means; the update notices by eps alone.
+            return MnihRMSProp(theta, gradient, alpha, eps / settings.batch_size**2, settings.gradient_alpha)
         case "adam":
-            return Adam(theta, gradient, (momentum or 0.9, decay), constant)
+            return Adam(theta, gradient, (settings.beta1, settings.beta2), eps)

@@ -96,7 +96,7 @@ class ReplayCore:
         settings = config.replay
         self.table = make_table(config, spec)
         self.limiter = RateLimiter(
-            settings.ratio, settings.start, settings.tolerance, config.total_steps, settings.capacity
+            settings.ratio, settings.learning_starts, settings.tolerance, config.total_steps, settings.capacity
         )
         self.recorder: Recorder = recorder or Unrecorded()
         self.batch_size = config.learner.batch_size

@@ -123,7 +123,7 @@ def test_weight_decay_by_layer() -> None:
 def test_rmsprop_of_mnih() -> None:
     rng = np.random.default_rng(1)
     theta, gradient = torch.tensor([1.0, -2.0, 3.0]), torch.zeros(3)
-    optimizer = MnihRMSProp(theta, gradient, decay=0.9, constant=0.01, momentum=0.95)
+    optimizer = MnihRMSProp(theta, gradient, alpha=0.9, eps=0.01, gradient_alpha=0.95)
     expected, mean, square = theta.numpy().astype(np.float64), np.zeros(3), np.zeros(3)
     for _ in range(5):
         g = rng.standard_normal(3)
@@ -136,9 +136,7 @@ def test_rmsprop_of_mnih() -> None:
 
 
 def test_rmsprop_of_mnih_moves_as_with_gradients_summed_over_the_batch() -> None:
-    settings = LearnerSettings(
-        optimizer="rmsprop-mnih", batch_size=32, momentum=0.95, squared_decay=0.95, denominator=0.01
-    )
+    settings = LearnerSettings(optimizer="rmsprop-mnih", batch_size=32, gradient_alpha=0.95, alpha=0.95, eps=0.01)
     moved, summed = torch.zeros(50), torch.zeros(50)
     gradient = torch.zeros(50)
     of_means, of_sums = make_optimizer(settings, moved, gradient), MnihRMSProp(summed, 32 * gradient, 0.95, 0.01, 0.95)
@@ -150,9 +148,9 @@ def test_rmsprop_of_mnih_moves_as_with_gradients_summed_over_the_batch() -> None
     torch.testing.assert_close(moved, summed)
 
 
-@pytest.mark.parametrize("momentum", [0.0, 0.9])
-def test_mnihs_rmsprop_stays_finite_where_the_two_decays_differ(momentum: float) -> None:
-    settings = {"optimizer": "rmsprop-mnih", "momentum": momentum, "denominator": 0.01, "learning_rate": 3e-5}
+@pytest.mark.parametrize("gradient_alpha", [0.0, 0.9])
+def test_mnihs_rmsprop_stays_finite_where_the_two_constants_differ(gradient_alpha: float) -> None:
+    settings = {"optimizer": "rmsprop-mnih", "gradient_alpha": gradient_alpha, "eps": 0.01, "learning_rate": 3e-5}
     agent = Agent(_config("dqn", **settings), SPEC)
     for batch in _batches(20):
         assert np.isfinite(agent.update(batch).td_errors).all()
@@ -164,13 +162,13 @@ def test_mnihs_rmsprop_stays_finite_where_the_two_decays_differ(momentum: float)
     [
         ("sgd", lambda p, momentum: torch.optim.SGD(p, 0.1, momentum=momentum)),
         ("rmsprop", lambda p, momentum: torch.optim.RMSprop(p, 0.1, alpha=0.9, eps=1e-3, momentum=momentum)),
-        ("adam", lambda p, momentum: torch.optim.Adam(p, 0.1, betas=(momentum or 0.9, 0.9), eps=1e-3)),
+        ("adam", lambda p, _: torch.optim.Adam(p, 0.1, betas=(0.8, 0.95), eps=1e-3)),
     ],
 )
 def test_optimizers_are_pytorchs(
     name: OptimizerName, momentum: float, reference: Callable[[list[torch.nn.Parameter], float], torch.optim.Optimizer]
 ) -> None:
-    settings = LearnerSettings(optimizer=name, momentum=momentum, squared_decay=0.9, denominator=1e-3)
+    settings = LearnerSettings(optimizer=name, momentum=momentum, alpha=0.9, beta1=0.8, beta2=0.95, eps=1e-3)
     parameter = torch.nn.Parameter(torch.linspace(-1, 1, 50))
     theta, gradient = parameter.detach().clone(), torch.zeros(50)
     other = reference([parameter], momentum)

@@ -94,12 +94,12 @@ def test_a_method_table_overrides_the_rest() -> None:
         (["--total_steps=20000"], 2000),
         (["--total-steps", "1000000"], 50_000),
         (["--total-steps", "9"], 1),
-        (["--total-steps", "20000", "--replay.start", "7000"], 7000),
+        (["--total-steps", "20000", "--replay.learning-starts", "7000"], 7000),
     ],
 )
 def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["coop-local", "--preset", "breakout", *flags])
-    assert parse_run(RunOptions, "coop-local", "").run_config().replay.start == start
+    assert parse_run(RunOptions, "coop-local", "").run_config().replay.learning_starts == start
 
 
 @pytest.mark.parametrize(
@@ -112,10 +112,13 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
         (["--seed", "x"], ["--seed", "x"]),
         (["--method", "sarsa"], ["method", "sarsa", "g-coop"]),
         (["--edl.rate", "nan"], ["edl.rate", "nan"]),
-        (["--replay.start", "400", "--replay.capacity", "300"], ["replay.start", "400", "300"]),
-        (["--replay.start", "4", "--replay.n-step", "5"], ["replay.start = 4", "at least replay.n_step = 5"]),
+        (["--replay.learning-starts", "400", "--replay.capacity", "300"], ["replay.learning_starts", "400", "300"]),
+        (
+            ["--replay.learning-starts", "4", "--replay.n-step", "5"],
+            ["replay.learning_starts = 4", "at least replay.n_step = 5"],
+        ),
         (["--actor.segment-steps", "4090", "--replay.n-step", "9"], ["actor.segment_steps = 4090", "at most 4088"]),
-        (["--total-steps", "100", "--replay.start", "128"], ["replay.start", "128", "100"]),
+        (["--total-steps", "100", "--replay.learning-starts", "128"], ["replay.learning_starts", "128", "100"]),
         (["--total-steps", "0"], ["total_steps", "0", "greater than 0"]),
         (["--total-steps", "many"], ["--total-steps", "many"]),
         (["--run", "a/b"], ["run", "a/b"]),
@@ -125,7 +128,7 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
         (["--network.hidden", "3", "x"], ["--network.hidden", "x", "INT"]),
         (["--replay.eviction", "lru"], ["--replay.eviction", "lru", "reservoir"]),
         (["stray"], ["stray", "unknown"]),
-        (["--total-steps", "300", "--replay.start", "300"], ["total_steps", "300", "at least 301"]),
+        (["--total-steps", "300", "--replay.learning-starts", "300"], ["total_steps", "300", "at least 301"]),
         (["--total-steps", "1000", "--replay.ratio", "0.0001"], ["total_steps", "1000", "at least 5101"]),
         (["--env.stack=-3"], ["env.stack", "-3", "greater than 0"]),
         (["--env.stack", "0"], ["env.stack", "0", "greater than 0"]),
@@ -159,7 +162,7 @@ def test_refused_in_one_line(flags: list[str], words: list[str], monkeypatch: py
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
-        ({"replay": {"capcity": 5}}, "replay.capcity = 5: no such field; allowed: capacity, start"),
+        ({"replay": {"capcity": 5}}, "replay.capcity = 5: no such field; allowed: capacity, learning_starts"),
         ({"speed": 5}, "speed = 5: no such field; allowed: run, method"),
         ({"replay": 5}, "replay = 5"),
         ({"replay": {"capacity": "many"}}, "replay.capacity = 'many'"),

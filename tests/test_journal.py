@@ -115,7 +115,7 @@ def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
     sequence = 0
     while not isinstance(outcome := _insert(core, spec, sequence), Wait):
         sequence += 1
-        while core.drawn < core.table.inserted - CONFIG.replay.start:
+        while core.drawn < core.table.inserted - CONFIG.replay.learning_starts:
             assert _draw(core)
     assert outcome.reason == "the journal can't be written: No space left on device"
     assert core.inserts_wait_for == outcome.reason

@@ -37,7 +37,7 @@ def test_the_same_bytes_for_a_seed(method: Method, tmp_path: Path) -> None:
     content = (tmp_path / "a" / "episodes.csv").read_bytes()
     assert content.count(b"\n") > 10
     assert (tmp_path / "b" / "episodes.csv").read_bytes() == content
-    assert first.agent.updates == second.agent.updates == 700 - first.config.replay.start
+    assert first.agent.updates == second.agent.updates == 700 - first.config.replay.learning_starts
 
 
 def test_killed_and_resumed_to_the_byte(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_killed_and_resumed_to_the_byte(tmp_path: Path) -> None:
 
 
 def test_a_run_without_an_ended_episode_says_so(tmp_path: Path) -> None:
-    flags = ["--total-steps", "5", "--replay.start", "4", "--run-dir", str(tmp_path / "run")]
+    flags = ["--total-steps", "5", "--replay.learning_starts", "4", "--run-dir", str(tmp_path / "run")]
     done = subprocess.run([COMMAND, *flags], capture_output=True, text=True, check=True)
     assert "updates, no episode ended, " in done.stdout
     assert not (tmp_path / "run" / "learning_curve.png").exists()
@@ -73,9 +73,9 @@ def test_resuming_something_else_is_refused(tmp_path: Path) -> None:
         assert "--resume" in done.stderr
 
 
-def test_roles_swap_by_plays_and_start_anew_with_each_episode(tmp_path: Path) -> None:
+def test_roles_swap_by_steps_and_start_anew_with_each_episode(tmp_path: Path) -> None:
     config = base_config(["--method", "coop"])
-    learner = replace(config.learner, swap_by="plays", swap_every=7, reset_role_at_episode=True)
+    learner = replace(config.learner, swap_unit="steps", swap_every=7, reset_role_at_episode=True)
     run = Lockstep(replace(config, learner=learner))
     acting, expected, swaps, resets = 0, [], 0, 0
     seen = []
@@ -96,7 +96,7 @@ def test_roles_swap_by_plays_and_start_anew_with_each_episode(tmp_path: Path) ->
     assert resets > 0
 
 
-@pytest.mark.parametrize("flags", [["--learner.swap-by", "plays"], ["--learner.reset-role-at-episode"]])
+@pytest.mark.parametrize("flags", [["--learner.swap-unit", "steps"], ["--learner.reset-role-at-episode"]])
 @pytest.mark.parametrize("name", ["coop-learner", "coop-local"])
 def test_roles_in_processes_have_no_plays(name: str, flags: list[str], tmp_path: Path) -> None:
     command = [Path(COMMAND).with_name(name), *flags, "--run-dir", tmp_path / "run"]

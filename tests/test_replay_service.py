@@ -29,7 +29,7 @@ CONFIG = RunConfig(
     run="test",
     total_steps=1000,
     learner=LearnerSettings(batch_size=4),
-    replay=ReplaySettings(capacity=100, start=8, tolerance=8.0),
+    replay=ReplaySettings(capacity=100, learning_starts=8, tolerance=8.0),
 )
 
 

@@ -52,7 +52,7 @@ def test_cells_of_the_small_buffers() -> None:
     assert {cell.config.method for cell in cells} == {"dqn", "edql", "g-coop", "coop"}
     # What the preset says for one method holds there, and what the grid says holds over it.
     assert {cell.config.learner.optimizer for cell in cells if cell.config.method == "g-coop"} == {"adam"}
-    assert {cell.config.replay.start for cell in cells} == {50}
+    assert {cell.config.replay.learning_starts for cell in cells} == {50}
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_cells_of_the_small_buffers() -> None:
         ("seeds = [-1]", "-1"),
         ('preset = "cartpol"', "cartpol: unknown; allowed: "),
         ('mode = "both"', "mode = 'both'"),
-        ("vary.replay.capacity = [50]", "replay.start = 128: must not exceed replay.capacity = 50"),
+        ("vary.replay.capacity = [50]", "replay.learning_starts = 128: must not exceed replay.capacity = 50"),
         ("vary.replay.capacity = [500, 500]", "two cells collide: both are called coop-capacity=500-seed=0"),
         ("vary.replay.ratio = [1, 1.0]", "two cells collide: coop-ratio=1-seed=0 and coop-ratio=1.0-seed=0"),
         ("seeds = [3, 3]", "two cells collide: both are called coop-seed=3"),
@@ -77,7 +77,10 @@ def test_cells_of_the_small_buffers() -> None:
         ("fixed.replay = 5", "replay = 5: must be a table"),
         ('fixed.env.id = "CartPoles-v0"', "CartPoles-v0"),
         ('preset = "catch"', "actor.envs = 4: lockstep cells play one emulator"),
-        ('mode = "distributed"\nfixed.learner.swap_by = "plays"', "learner.swap_by = 'plays': in lockstep runs only"),
+        (
+            'mode = "distributed"\nfixed.learner.swap_unit = "steps"',
+            "learner.swap_unit = 'steps': in lockstep runs only",
+        ),
         ("a = = 1", "line 1"),
     ],
 )

@@ -93,7 +93,7 @@ def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, 
         assert isinstance(env_steps, int)
         assert isinstance(updates, int)
         assert steps <= env_steps < steps + 64
-        assert abs(updates - (steps - config["replay"]["start"])) <= 0.02 * steps
+        assert abs(updates - (steps - config["replay"]["learning_starts"])) <= 0.02 * steps
     epochs = sorted((path / "checkpoints").iterdir(), key=lambda folder: int(folder.name))
     assert 1 <= len(epochs) <= 2
     assert all((epoch / "DONE").exists() for epoch in epochs)

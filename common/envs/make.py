@@ -24,7 +24,7 @@ def make_vector_env(settings: EnvSettings, num_envs: int, seed: int) -> VectorEn
     if num_envs < 1:
         raise UsageError(f"envs: {num_envs} is not allowed; at least 1")
     seeds = np.random.SeedSequence(seed).generate_state(num_envs) & 0x7FFFFFFF  # ALE takes 31 bits
-    if (game := _atari_game(settings.id)) is not None:
+    if (game := _atari_game(settings)) is not None:
         from common.envs.atari import AtariEnv  # noqa: PLC0415
 
         return AtariEnv(settings, game, seeds.tolist())
@@ -39,7 +39,7 @@ def env_spec(settings: EnvSettings) -> EnvSpec:
     Raises:
         UsageError: as `make_vector_env`.
     """
-    if (game := _atari_game(settings.id)) is not None:
+    if (game := _atari_game(settings)) is not None:
         from common.envs.atari import atari_spec  # noqa: PLC0415
 
         return atari_spec(settings, game)
@@ -48,17 +48,14 @@ def env_spec(settings: EnvSettings) -> EnvSpec:
     return gymnasium_spec(settings)
 
 
-def _atari_game(env_id: str) -> str | None:
-    """The ROM's name if `env_id` means an ALE game; None leaves the id to gymnasium.
-
-    Ids with a slash or a version are gymnasium's, except ALE's own namespace; the rest are games.
-    """
-    if not env_id.startswith("ALE/") and ("/" in env_id or "-v" in env_id):
+def _atari_game(settings: EnvSettings) -> str | None:
+    """The ROM's name if the id means an ALE game; None leaves the id to gymnasium."""
+    if not settings.atari:
         return None
     from ale_py.roms import get_all_rom_ids  # noqa: PLC0415
 
     games = {game.replace("_", ""): game for game in get_all_rom_ids()}
-    wanted = env_id.removeprefix("ALE/").split("-v")[0]
+    wanted = settings.id.removeprefix("ALE/").split("-v")[0]
     plain = wanted.replace("_", "").replace("-", "").lower()
     if plain in games:
         return games[plain]

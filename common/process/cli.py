@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from typing import Any, NoReturn, TypeVar, get_type_hints
@@ -46,10 +45,9 @@ def flags(kind: type[Any], prefix: str = "") -> Iterator[str]:
             yield f"--{name}"
 
 
-def given_flags(args: Sequence[str] | None = None) -> set[str]:
+def given_flags(args: Sequence[str]) -> set[str]:
     """The fields that a command line sets, as dotted names: "learner.swap_every"; `--learner.no-double` too."""
-    tokens = sys.argv[1:] if args is None else args
-    names = {token[2:].partition("=")[0].replace("-", "_") for token in tokens if token.startswith("--")}
+    names = {token[2:].partition("=")[0].replace("-", "_") for token in args if token.startswith("--")}
     return names | {name.replace(".no_", ".") for name in names}
 
 
@@ -57,7 +55,8 @@ def _problem(event: tyro_errors.ParseErrorEvent, known: Sequence[str]) -> str:
     """What is wrong, in one line."""
     match event:
         case tyro_errors.UnrecognizedArgs(tokens=[first, *_]):
-            near = get_close_matches(first.partition("=")[0].replace("_", "-"), known, n=1)
+            flag = first.partition("=")[0].replace("_", "-")
+            near = get_close_matches(flag, [name for name in known if name != flag], n=1)
             return f"{first}: unknown{f'; perhaps {near[0]}' if near else ''}; --help lists what there is"
         case tyro_errors.InvalidChoice(argument=argument, value=value, choices=choices):
             return f"{argument.display_name()} {value}: allowed: {', '.join(choices)}"

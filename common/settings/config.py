@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
+import tyro
 from pydantic import ConfigDict, Field
 
 from common.bounds import (
@@ -50,9 +51,12 @@ class LearnerSettings:
     __pydantic_config__ = _STRICT
     batch_size: Annotated[int, Field(gt=0, le=MAX_BATCH)] = 32
     swap_every: Positive = 30
-    """C: updates (or plays) between swaps of the acting role, or between copies to the target network."""
-    swap_by: Literal["updates", "plays"] = "updates"
-    """What C counts; plays (environment steps) exist in lockstep runs only."""
+    """C: updates between swaps of the acting role."""
+    target_update_every: Positive | None = None
+    """Updates between copies to the target network (dqn, edql); as swap_every if not given, so that all methods have
+    one C."""
+    swap_unit: Literal["updates", "steps"] = "updates"
+    """What these two count; environment steps in lockstep runs only."""
     reset_role_at_episode: bool = False
     """Let network 1 act at the start of each episode, as Algorithm 1 writes it; lockstep runs only."""
     gamma: Share = 0.99
@@ -60,16 +64,23 @@ class LearnerSettings:
     double: bool = False
     """Take the target's value at the action that the trained network prefers, as in double Q-learning."""
     optimizer: OptimizerName = "rmsprop"
-    """rmsprop is PyTorch's; rmsprop-mnih is centred, with the constant inside the root, beside gradients summed over
-    the batch."""
+    """rmsprop is PyTorch's; rmsprop-mnih is centred, with eps inside the root, beside gradients summed over the
+    batch."""
     learning_rate: PositiveFloat = 1e-3
     learning_rate_final: PositiveShare = 1.0
     """The learning rate falls exponentially to this share of itself over the whole run."""
     momentum: Decay = 0.0
-    squared_decay: Decay = 0.99
-    """Decay of the running mean of squared gradients (rmsprop, adam)."""
-    denominator: PositiveFloat = 1e-8
-    """Constant added to the optimizer's denominator."""
+    """Of the steps (sgd, rmsprop)."""
+    alpha: Decay = 0.99
+    """Smoothing constant of the squared gradients' running mean (rmsprop, rmsprop-mnih)."""
+    gradient_alpha: Decay = 0.95
+    """Smoothing constant of the gradients' running mean, Mnih's gradient momentum (rmsprop-mnih)."""
+    beta1: Decay = 0.9
+    """Smoothing constant of the gradients' running mean (adam)."""
+    beta2: Decay = 0.999
+    """Smoothing constant of the squared gradients' running mean (adam)."""
+    eps: PositiveFloat = 1e-8
+    """Added to the optimizer's denominator; not for sgd."""
     weight_decay: Annotated[tuple[NonNegative, ...], Field(max_length=MAX_LAYERS + 1)] = ()
     """lambda(i) of each layer, input first; one value holds for all layers; none means 0."""
     device: str = "cpu"
@@ -107,7 +118,7 @@ class ReplaySettings:
     __pydantic_config__ = _STRICT
     capacity: Steps = 5000
     """Exact number of transitions held."""
-    start: Steps = 500
+    learning_starts: Steps = 500
     """Transitions to collect before the first update; --total-steps cuts a preset's to a tenth of the run."""
     ratio: Annotated[float, Field(gt=0, le=MAX_RATIO)] = 1.0
     """Updates per environment step."""
@@ -173,16 +184,26 @@ class RunConfig:
     edl: EdlSettings = field(default_factory=EdlSettings)
     replay: ReplaySettings = field(default_factory=ReplaySettings)
     actor: ActorSettings = field(default_factory=ActorSettings)
+    methods: Annotated[dict[Method, dict[str, Any]], tyro.conf.Fixed, tyro.conf.Suppress] = field(
+        default_factory=dict, compare=False
+    )
+    """What the preset or file sets differently for other methods, for a run of theirs with this config."""
 
     @property
     def planned_updates(self) -> int:
-        """Updates of a run that goes through all its steps: the ratio holds from the first `start` steps on."""
-        return round(self.replay.ratio * (self.total_steps - self.replay.start))
+        """Updates of a run that goes through all its steps: the ratio holds from `learning_starts` on."""
+        return round(self.replay.ratio * (self.total_steps - self.replay.learning_starts))
 
     @property
     def two_networks(self) -> bool:
         """True for the cooperative methods, false where the second network is a copy of the first."""
         return self.method in ("g-coop", "coop")
+
+    @property
+    def swap_period(self) -> int:
+        """C of this method, in `learner.swap_unit`: between swaps of the roles, or copies to the target network."""
+        settings = self.learner
+        return settings.swap_every if self.two_networks else settings.target_update_every or settings.swap_every
 
     @property
     def feedback(self) -> str:
@@ -191,8 +212,8 @@ class RunConfig:
 
 
 def check_distributed(config: RunConfig) -> None:
-    """Raises UsageError for what only lockstep runs can do: with many actors there is no single play or episode."""
-    if config.learner.swap_by == "plays":
-        raise UsageError("learner.swap_by = 'plays': in lockstep runs only; the roles' processes count updates")
+    """Raises UsageError for what only lockstep runs can do: with many actors there is no single step or episode."""
+    if config.learner.swap_unit == "steps":
+        raise UsageError("learner.swap_unit = 'steps': in lockstep runs only; the roles' processes count updates")
     if config.learner.reset_role_at_episode:
         raise UsageError("learner.reset_role_at_episode = True: in lockstep runs only")

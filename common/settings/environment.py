@@ -33,3 +33,8 @@ class EnvSettings:
     """All 18 actions in place of the game's own; ALE only."""
     max_episode_steps: Annotated[int, Field(ge=0, le=MAX_GAME_STEPS)] = 0
     """Truncate after so many steps; 0 keeps the environment's own limit (ALE: 108,000 frames)."""
+
+    @property
+    def atari(self) -> bool:
+        """Whether the id means an ALE game: gymnasium's have a slash or a version, ALE's own namespace excepted."""
+        return self.id.startswith("ALE/") or not ("/" in self.id or "-v" in self.id)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,9 +11,13 @@ from typing import TypeVar
 
 from common.errors import UsageError
 from common.process import cli
+from common.process.notices import note_renamed, warn
 from common.settings.config import RunConfig
+from common.settings.effects import without_effect
+from common.settings.renamed import current_flags
+from common.settings.resuming import check_resumed
 from common.settings.sources import base_config
-from common.settings.tables import first_difference, identity, load_tables, resolve, validated
+from common.settings.tables import load_tables, resolve, validated
 
 
 @dataclass(frozen=True)
@@ -73,22 +78,30 @@ class RunOptions(RunConfig):
         path = self.run_dir
         if path is None or not (path / "config.toml").exists():
             raise UsageError(f"--resume: no run in --run-dir {path}")
-        saved = resolve(load_tables(None, path / "config.toml"))
-        if problem := first_difference(identity(self.run_config()), identity(saved)):
-            name, here, there = problem
-            raise UsageError(f"--resume: {name} = {here}, but {there} in {path / 'config.toml'}, which goes on")
+        file = path / "config.toml"
+        check_resumed(self.run_config(), resolve(load_tables(None, file)), file)
         return path
 
 
 OptionsT = TypeVar("OptionsT", bound=RunOptions)
 
 
-def parse_run(kind: type[OptionsT], program: str, description: str) -> OptionsT:
-    """Parse flags over the config that `--preset`, `--config` or `--resume` names.
+def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep: bool = False) -> OptionsT:
+    """Parse flags over the config that `--preset`, `--config` or `--resume` names; warn of those that change nothing.
+
+    lockstep: the run will be one process.
 
     Raises:
         UsageError: whatever is wrong with them, in one line.
     """
-    base = base_config()
+    args = sys.argv[1:]
+    base = base_config(args)
+    args = current_flags(args, base.learner.optimizer)
     default = kind(**{field.name: getattr(base, field.name) for field in fields(RunConfig)})
-    return cli.parse(kind, program, description, default)
+    options = cli.parse(kind, program, description, default, args)
+    given = cli.given_flags(args)
+    if "learner.swap_every" in given and not options.two_networks and options.learner.target_update_every is None:
+        note_renamed({"--learner.swap-every": f"--learner.target-update-every for {options.method}"})
+    for line in without_effect(options, given, lockstep=lockstep):
+        warn(line)
+    return options

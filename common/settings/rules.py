@@ -19,19 +19,19 @@ def check_rules(config: RunConfig) -> None:
 def _problems(config: RunConfig) -> Iterator[str]:
     replay, learner = config.replay, config.learner
     for name, most in (("replay.capacity", replay.capacity), ("total_steps", config.total_steps)):
-        if replay.start > most:
-            yield f"replay.start = {replay.start}: must not exceed {name} = {most}"
-    if replay.start < replay.n_step:
-        yield f"replay.start = {replay.start}: allowed: at least replay.n_step = {replay.n_step}"
+        if replay.learning_starts > most:
+            yield f"replay.learning_starts = {replay.learning_starts}: must not exceed {name} = {most}"
+    if replay.learning_starts < replay.n_step:
+        yield f"replay.learning_starts = {replay.learning_starts}: allowed: at least replay.n_step = {replay.n_step}"
     if config.actor.segment_steps + replay.n_step - 1 > MAX_SEGMENT_STEPS:
         most = MAX_SEGMENT_STEPS - replay.n_step + 1
         asked = f"actor.segment_steps = {config.actor.segment_steps}"
         yield f"{asked}: allowed: at most {most} with replay.n_step = {replay.n_step}"
     if config.planned_updates < 1:
-        least = replay.start + math.floor(0.5 / replay.ratio) + 1
+        least = replay.learning_starts + math.floor(0.5 / replay.ratio) + 1
         yield (
             f"total_steps = {config.total_steps}: plans no update; allowed: at least {least} "
-            f"with replay.start = {replay.start} and replay.ratio = {replay.ratio:g}"
+            f"with replay.learning_starts = {replay.learning_starts} and replay.ratio = {replay.ratio:g}"
         )
     if replay.journal_keep and not replay.journal:
         yield "replay.journal_keep = True: needs replay.journal = True"

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from common.errors import UsageError
+from common.process.notices import warn
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve, shortened
 
@@ -42,4 +43,6 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     tables = load_tables(preset, file)
     if preset and known.total_steps is not None:
         tables = shortened(tables, known.total_steps)
+    if file and known.method and "methods" not in tables and known.method != tables.get("method", known.method):
+        warn(f"{file} does not say what methods set differently: {known.method} takes what {tables['method']} had")
     return resolve(tables, known.method)

@@ -14,6 +14,8 @@ import tomli_w
 
 from common.errors import UsageError
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+from common.settings.methods import merged, of_method
+from common.settings.renamed import current
 from common.settings.rules import check_rules
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
@@ -48,37 +50,20 @@ def _preset(*place: str) -> dict[str, Any]:
     return tables if base is None else merged(_preset("bases", f"{base}.toml"), tables)
 
 
-def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with the values of `over`, table by table.
-
-    Raises:
-        UsageError: a value stands in a table's place.
-    """
-    result = dict(base)
-    for key, value in over.items():
-        if isinstance(result.get(key), Mapping):
-            if not isinstance(value, Mapping):
-                raise UsageError(f"{key} = {value!r}: must be a table")
-            result[key] = merged(result[key], value)
-        else:
-            result[key] = value
-    return result
-
-
 def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
     """A preset for a run of another length.
 
-    Its `replay.start` is at most a tenth of the run, so that it learns. In a shorter run the learning rate falls as it
-    does in the preset's own: to the share that it would have reached by then.
+    Its `replay.learning_starts` is at most a tenth of the run, so that it learns. In a shorter run the learning rate
+    falls as it does in the preset's own: to the share that it would have reached by then.
     """
     replay, learner = tables.get("replay", {}), tables.get("learner", {})
-    start = min(replay.get("start", ReplaySettings.start), max(1, total_steps // 10))
+    start = min(replay.get("learning_starts", ReplaySettings.learning_starts), max(1, total_steps // 10))
     part = min(1.0, total_steps / tables.get("total_steps", RunConfig.total_steps))
     final = learner.get("learning_rate_final", LearnerSettings.learning_rate_final) ** part
     return {
         **tables,
         "total_steps": total_steps,
-        "replay": {**replay, "start": start},
+        "replay": {**replay, "learning_starts": start},
         "learner": {**learner, "learning_rate_final": final},
     }
 
@@ -86,16 +71,12 @@ def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
 def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     """Turn tables into a checked config; a `[methods.NAME]` table overrides the rest for that method.
 
+    Names of settings of earlier versions are read, too.
+
     Raises:
         UsageError: a misspelt field or a value out of range; names the field, the value and what is allowed.
     """
-    merged = {key: value for key, value in tables.items() if key != "methods"}
-    if method is not None:
-        merged["method"] = method
-    chosen = merged.get("method", RunConfig.method)
-    for section, overrides in tables.get("methods", {}).get(chosen, {}).items():
-        merged[section] = {**merged.get(section, {}), **overrides}
-    return validated(merged)
+    return validated(of_method(current(tables), method))
 
 
 def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
@@ -123,8 +104,8 @@ def to_tables(config: RunConfig) -> dict[str, Any]:
 
 
 def identity(config: RunConfig) -> dict[str, Any]:
-    """What makes two runs the same one, as nested tables: everything but how often it is saved."""
-    return {name: value for name, value in to_tables(config).items() if name != "checkpoint_every"}
+    """What makes two runs the same one, as nested tables: not how often it is saved, nor what other methods have."""
+    return {name: value for name, value in to_tables(config).items() if name not in ("checkpoint_every", "methods")}
 
 
 def first_difference(here: Mapping[str, Any], there: Mapping[str, Any], name: str = "") -> tuple[str, Any, Any] | None:

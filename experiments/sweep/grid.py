@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.resources import files
@@ -21,7 +20,9 @@ from common.errors import UsageError
 from common.settings.config import Method, RunConfig, check_distributed
 from common.settings.environment import EnvSettings
 from common.settings.fields import Count, Positive
-from common.settings.tables import first_problem, load_tables, merged, resolve, shortened, to_tables, validated
+from common.settings.methods import leaves, merged, nested
+from common.settings.renamed import current
+from common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 
@@ -115,20 +116,6 @@ def _text(name: str) -> str:
     return Path(name).read_text(encoding="utf-8")
 
 
-def _leaves(tables: Mapping[str, Any], at: FieldPath = ()) -> Iterator[tuple[FieldPath, Any]]:
-    for key, value in tables.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, (*at, key))
-        else:
-            yield (*at, key), value
-
-
-def _nested(path: FieldPath, value: Any) -> dict[str, Any]:  # noqa: ANN401 (a value of any field)
-    for key in reversed(path):
-        value = {key: value}
-    return dict(value)
-
-
 def _cells(file: GridFile) -> tuple[Cell, ...]:
     axes = _axes(file)
     names = _short_names(tuple(axes))
@@ -142,9 +129,10 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
     for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
         total_steps = dict(zip(axes, values, strict=True)).get(("total_steps",), file.fixed.get("total_steps"))
         fits = type(total_steps) is int and total_steps > 0  # what is not a number of steps is refused below
-        tables = merged(base(method, total_steps if fits else None), file.fixed)
+        start = base(method, total_steps if fits else None)
+        tables = merged(start, current(file.fixed, start["learner"]["optimizer"]))
         for path, value in zip(axes, values, strict=True):
-            tables = merged(tables, _nested(path, value))
+            tables = merged(tables, current(nested(path, value), tables["learner"]["optimizer"]))
         parts = [f"{name}={_word(value)}" for name, value in zip(names, values, strict=True)]
         config = validated({**tables, "method": method, "seed": seed})
         cells.append(Cell("-".join([method, *parts, f"seed={seed}"]), config))
@@ -157,7 +145,7 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
 
 def _axes(file: GridFile) -> dict[FieldPath, list[Any]]:
     """The fields that vary, each with its values."""
-    axes, fixed = dict(_leaves(file.vary)), dict(_leaves(file.fixed))
+    axes, fixed = dict(leaves(file.vary)), dict(leaves(file.fixed))
     for path, values in axes.items():
         if not isinstance(values, list) or not values:
             raise UsageError(f"vary.{'.'.join(path)} = {values!r}: must be a list of at least one value")

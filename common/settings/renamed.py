@@ -1,0 +1,107 @@
+"""Settings under the names that they had in earlier versions, in tables and on command lines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from common.errors import UsageError
+from common.process.notices import note_renamed
+from common.settings.config import LearnerSettings
+
+_RENAMED = {
+    "replay": {"start": "learning_starts"},
+    "learner": {"denominator": "eps", "swap_by": "swap_unit"},
+}
+# What these meant depends on the optimizer; a name that is not listed keeps its meaning.
+_OF_OPTIMIZER = {
+    "sgd": {"squared_decay": "alpha"},
+    "rmsprop": {"squared_decay": "alpha"},
+    "rmsprop-mnih": {"squared_decay": "alpha", "momentum": "gradient_alpha"},
+    "adam": {"squared_decay": "beta2", "momentum": "beta1"},
+}
+_ONLY_NOW = {"eps", "alpha", "beta1", "beta2", "gradient_alpha"}  # momentum beside one of these is momentum
+_VALUES = {"swap_unit": {"plays": "steps"}}
+
+
+def current(tables: Mapping[str, Any], optimizer: str = LearnerSettings.optimizer) -> dict[str, Any]:
+    """Nested tables with the settings' present names; one line on stderr says which were given by former ones.
+
+    optimizer: in use where the tables name none.
+
+    Raises:
+        UsageError: a setting is given by both names.
+    """
+    found: dict[str, str] = {}
+    renamed = _sections(tables, optimizer, found)
+    note_renamed(found)
+    return renamed
+
+
+def current_flags(args: Sequence[str], optimizer: str) -> list[str]:
+    """A command line with the flags' present names; as `current`.
+
+    optimizer: in use where the command line names none.
+    """
+    for token, following in zip(args, [*args[1:], ""], strict=True):
+        flag, equals, value = token.partition("=")
+        if flag == "--learner.optimizer":
+            optimizer = value if equals else following
+    found: dict[str, str] = {}
+    renamed = list(_flags(args, optimizer, found))
+    note_renamed(found)
+    return renamed
+
+
+def _flags(args: Sequence[str], optimizer: str, found: dict[str, str]) -> Iterator[str]:
+    values: Mapping[str, str] = {}  # present values of the flag before, by former ones
+    for token in args:
+        flag, equals, value = token.partition("=")
+        section, _, former = flag.removeprefix("--").replace("-", "_").partition(".")
+        name = _names(section, optimizer).get(former) if flag.startswith("--") else None
+        if name is None:
+            yield values.get(token, token)
+            values = {}
+            continue
+        found[flag] = f"--{section}.{name.replace('_', '-')}"
+        values = _VALUES.get(name, {})
+        yield f"{found[flag]}{equals}{values.get(value, value)}"
+
+
+def _sections(tables: Mapping[str, Any], optimizer: str, found: dict[str, str]) -> dict[str, Any]:
+    learner = tables.get("learner")
+    if isinstance(learner, Mapping):
+        optimizer = str(learner.get("optimizer", optimizer))
+    renamed = dict(tables)
+    for section in _RENAMED:
+        if isinstance(table := tables.get(section), Mapping):
+            renamed[section] = _section(section, table, optimizer, found)
+    if isinstance(methods := tables.get("methods"), Mapping):
+        renamed["methods"] = {
+            method: _sections(over, optimizer, found) if isinstance(over, Mapping) else over
+            for method, over in methods.items()
+        }
+    return renamed
+
+
+def _section(section: str, table: Mapping[str, Any], optimizer: str, found: dict[str, str]) -> dict[str, Any]:
+    names = _names(section, optimizer)
+    if _ONLY_NOW & table.keys():
+        names.pop("momentum", None)
+    renamed: dict[str, Any] = {}
+    for former, value in table.items():
+        name = names.get(former, former)
+        if name != former and name in table:
+            raise UsageError(f"{section}.{former} and {section}.{name}: two names of one setting; give the second")
+        if name == "beta1" and former == "momentum" and value == 0:
+            continue  # stood for Adam's own 0.9, the default of beta1
+        if name != former:
+            found[f"{section}.{former}"] = f"{section}.{name}"
+        renamed[name] = _VALUES.get(name, {}).get(value, value) if isinstance(value, str) else value
+    return renamed
+
+
+def _names(section: str, optimizer: str) -> dict[str, str]:
+    """Present names of a section's settings, by former ones."""
+    of_optimizer = _OF_OPTIMIZER.get(optimizer, {}) if section == "learner" else {}
+    return {**_RENAMED.get(section, {}), **of_optimizer}

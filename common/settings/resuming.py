@@ -1,0 +1,49 @@
+"""Which settings a run may be given anew when it goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from common.errors import UsageError
+from common.settings.config import RunConfig
+from common.settings.methods import leaves
+from common.settings.tables import to_tables
+
+_FREE = ("checkpoint_every", "target_return")
+_LIMITS = ("total_updates", "total_episodes")  # 0: none
+
+
+def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
+    """Refuse what would make the run another one.
+
+    A run may be made longer: `total_steps`, `total_updates` and `total_episodes` may grow, and `target_return` and
+    `checkpoint_every` may be anything. Schedules that span the run (`learner.learning_rate_final`) are then those of
+    the longer run.
+
+    Args:
+        config: what the command line asks for. saved: what the run has been so far. source: the file that says so.
+
+    Raises:
+        UsageError: names every field that must stay as it is, with both values.
+    """
+    here, there = (dict(leaves(to_tables(each))) for each in (config, saved))
+    refused = [
+        f"{'.'.join(path)} = {here.get(path)}, but {there.get(path)}{_allowed(path)}"
+        for path in {**here, **there}
+        if path[0] != "methods" and not _may_change(path, here.get(path), there.get(path))
+    ]
+    if refused:
+        raise UsageError(f"--resume: {'; '.join(refused)} in {source}, which goes on")
+
+
+def _may_change(path: tuple[str, ...], here: Any, there: Any) -> bool:  # noqa: ANN401 (values of any field)
+    if here == there or path[0] in _FREE:
+        return True
+    if path == ("total_steps",):
+        return bool(here > there)
+    return path[0] in _LIMITS and (here == 0 or 0 < there < here)
+
+
+def _allowed(path: tuple[str, ...]) -> str:
+    return " (it may only grow)" if path[0] in ("total_steps", *_LIMITS) else ""

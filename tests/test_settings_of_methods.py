@@ -1,0 +1,176 @@
+"""Settings that methods differ in survive in a resolved config; flags without an effect are named."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from common.errors import UsageError
+from common.settings.config import RunConfig
+from common.settings.options import RunOptions, parse_run
+from common.settings.resuming import check_resumed
+from common.settings.sources import base_config
+from common.settings.tables import load_tables, preset_names, resolve, to_tables, to_toml, validated
+
+METHODS = ["dqn", "edql", "g-coop", "coop"]
+
+
+def parsed(flags: list[str], monkeypatch: pytest.MonkeyPatch, *, lockstep: bool = False) -> RunConfig:
+    monkeypatch.setattr("sys.argv", ["coop-local", *flags])
+    return parse_run(RunOptions, "coop-local", "", lockstep=lockstep).run_config()
+
+
+@pytest.mark.parametrize("preset", preset_names())
+@pytest.mark.parametrize("first", METHODS)
+def test_the_config_of_a_run_of_one_method_gives_that_of_another(preset: str, first: str) -> None:
+    written = tomllib.loads(to_toml(resolve(load_tables(preset, None), first)))
+    for second in METHODS:
+        again = resolve(written, second)
+        assert again == resolve(load_tables(preset, None), second)
+        assert resolve(tomllib.loads(to_toml(again)), first) == resolve(written)
+
+
+def test_a_flag_of_the_first_run_stays_unless_the_second_method_has_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = parsed(["--learner.optimizer", "sgd", "--learner.gamma", "0.9"], monkeypatch)
+    file = tmp_path / "config.toml"
+    file.write_text(to_toml(config))
+    assert parsed([f"--config={file}"], monkeypatch) == config
+    for method, optimizer in (("coop", "sgd"), ("dqn", "sgd"), ("g-coop", "adam")):
+        again = parsed([f"--config={file}", "--method", method], monkeypatch).learner
+        assert (again.optimizer, again.gamma) == (optimizer, 0.9)
+
+
+def test_a_config_that_does_not_know_other_methods_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tables = to_tables(RunConfig())
+    assert tables.pop("methods") == {}
+    file = tmp_path / "old.toml"
+    file.write_text('method = "coop"\n[learner]\noptimizer = "sgd"\n')
+    assert base_config([f"--config={file}", "--method", "dqn"]).learner.optimizer == "sgd"
+    assert capsys.readouterr().err == (
+        f"warning: {file} does not say what methods set differently: dqn takes what coop had\n"
+    )
+    file.write_text(to_toml(RunConfig()))
+    base_config([f"--config={file}", "--method", "dqn"])
+    base_config([f"--config={file}"])
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("methods = 5", "methods: must hold one table for each method"),
+        ("[methods]\ndqn = 5", "methods: must hold one table for each method"),
+        ("[methods.dqnn.learner]\ngamma = 0.5", "methods.dqnn: no such method; allowed: dqn, edql"),
+        ("[methods.coop]\nlearner = 5\n[learner]\ngamma = 0.5", "learner = 5: must be a table"),
+    ],
+)
+def test_tables_of_methods_are_checked(text: str, words: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        resolve(tomllib.loads(text))
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("flags", "names"),
+    [
+        (["--method", "dqn", "--edl.rate", "0.1"], ["edl.rate"]),
+        (["--method", "g-coop", "--edl.polar-dtype=bfloat16", "--edl.decay", "1"], ["edl.decay", "edl.polar-dtype"]),
+        (["--method", "coop", "--edl.rate", "0.1", "--edl.decay-every", "5"], []),
+        (["--edl.feedback", "random", "--edl.rate", "1"], ["edl.rate"]),
+        (["--edl.rate", "0", "--edl.noise", "normal"], ["edl.noise"]),
+        (["--edl.decay", "1", "--edl.decay-every", "5"], ["edl.decay-every"]),
+        (["--edl.feedback", "weight-gradient", "--edl.polar_dtype", "float32"], ["edl.polar-dtype"]),
+        (["--preset", "catch", "--network.hidden", "3", "4"], ["network.hidden"]),
+        (["--method", "dqn", "--learner.target-update-every", "5"], []),
+        (
+            ["--method", "dqn", "--learner.target-update-every", "5", "--learner.swap-every", "5"],
+            ["learner.swap-every"],
+        ),
+        (["--learner.target-update-every", "5"], ["learner.target-update-every"]),
+        (["--method", "edql", "--learner.reset-role-at-episode"], ["learner.reset-role-at-episode"]),
+        (["--learner.beta1", "0.8", "--learner.alpha", "0.8"], ["learner.beta1"]),
+        (["--method", "g-coop", "--learner.beta2", "0.8", "--learner.alpha", "0.8"], ["learner.alpha"]),
+        (["--learner.optimizer", "sgd", "--learner.eps", "1"], ["learner.eps"]),
+        (["--learner.gradient-alpha", "0.5"], ["learner.gradient-alpha"]),
+        (["--replay.eviction", "prioritized", "--replay.priority-exponent", "1"], ["replay.priority-exponent"]),
+        (["--replay.sampling", "prioritized", "--replay.importance-exponent", "1"], []),
+        (
+            ["--actor.epsilon-start", "0.1", "--actor.epsilon-final", "0.1", "--actor.epsilon-steps", "9"],
+            ["actor.epsilon-steps"],
+        ),
+        (["--env.episodic-life", "--env.clip-rewards"], ["env.episodic-life"]),
+        (["--preset", "breakout", "--env.no-episodic-life"], []),
+        (["--env.no-episodic-life"], ["env.episodic-life"]),
+    ],
+)
+def test_flags_without_an_effect_are_named(
+    flags: list[str], names: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parsed(flags, monkeypatch)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(" has no effect: ")[0] for line in lines] == [f"warning: --{name}" for name in names]
+
+
+def test_the_reason_is_said_and_files_may_hold_everything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = parsed(["--method", "dqn", "--edl.rate", "0.1"], monkeypatch)
+    assert capsys.readouterr().err == "warning: --edl.rate has no effect: dqn takes the ordinary gradient\n"
+    file = tmp_path / "config.toml"
+    file.write_text(to_toml(config))
+    assert parsed([f"--config={file}"], monkeypatch) == config
+    assert capsys.readouterr().err == ""
+
+
+def test_what_only_processes_have_means_nothing_in_lockstep(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--replay.tolerance", "9", "--learner.prefetch", "2"]
+    parsed(flags, monkeypatch)
+    assert capsys.readouterr().err == ""
+    parsed(flags, monkeypatch, lockstep=True)
+    assert capsys.readouterr().err == (
+        "warning: --learner.prefetch has no effect: a lockstep run is one process\n"
+        "warning: --replay.tolerance has no effect: a lockstep run is one process\n"
+    )
+
+
+SAVED = validated({"total_steps": 1000, "total_episodes": 7, "replay": {"capacity": 500}})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, None),
+        ({"total_steps": 2000}, None),
+        ({"total_steps": 999}, "--resume: total_steps = 999, but 1000 (it may only grow) in c.toml, which goes on"),
+        ({"total_episodes": 8}, None),
+        ({"total_episodes": 0}, None),
+        ({"total_episodes": 6}, "total_episodes = 6, but 7"),
+        ({"total_updates": 6}, "total_updates = 6, but 0"),
+        ({"target_return": 5.0, "checkpoint_every": 3}, None),
+        ({"methods": {"dqn": {"learner": {"gamma": 0.5}}}}, None),
+        ({"seed": 3, "replay": {"capacity": 600}}, "seed = 3, but 0; replay.capacity = 600, but 500 in c.toml"),
+        ({"learner": {"learning_rate": 0.5}, "total_steps": 2000}, "--resume: learner.learning_rate = 0.5, but 0.001"),
+        ({"method": "dqn"}, "method = dqn, but coop"),
+        ({"env": {"id": "CartPole-v1"}}, "env.id = CartPole-v1, but CartPole-v0"),
+        ({"learner": {"target_update_every": 3}}, "learner.target_update_every = 3, but None"),
+    ],
+)
+def test_what_a_run_that_goes_on_may_be_given_anew(change: dict[str, object], words: str | None) -> None:
+    config = resolve(base_tables_with(change))
+    if words is None:
+        check_resumed(config, SAVED, Path("c.toml"))
+    else:
+        with pytest.raises(UsageError) as caught:
+            check_resumed(config, SAVED, Path("c.toml"))
+        assert words in str(caught.value)
+
+
+def base_tables_with(change: dict[str, object]) -> dict[str, object]:
+    tables = to_tables(SAVED)
+    for name, value in change.items():
+        tables[name] = {**tables[name], **value} if isinstance(value, dict) else value
+    return tables
