@@ -11,7 +11,7 @@ from experiments.report.packed import FILES, PackedStudy, pack, unpack
 from experiments.report.writer import write_report
 
 CONFIG = 'method = "{method}"\nseed = {seed}\ntotal_steps = 4000\n'
-HEADER = "episode,env_step,actor,return,epsilon,s\n"
+HEADER = "episode,env_step,actor,return,epsilon,s,q1_mean,q2_mean\n"
 ROW = {
     "env_step": 128, "q_gap": 0.1, "sample_age_mean": 3.25, "sample_age_p95": 1e300, "reuse_mean": 0.1,
     "evicted_unsampled": 0.0,
@@ -28,7 +28,10 @@ def write(run: Path, files: dict[str, str]) -> None:
 def folder(tmp_path: Path) -> Path:
     """Runs that differ in what they left: whole ones, one too short for metrics, one begun, one of a newer version."""
     for seed in range(2):
-        episodes = "".join(f"{n},{20 * n + 9},{n % 3:x}a,{n * 1.5:g},0.725354,{0.1 * 0.9**n:.6g}\n" for n in range(19))
+        episodes = "".join(
+            f"{n},{20 * n + 9},{n % 3:x}a,{n * 1.5:g},0.725354,{0.1 * 0.9**n:.6g},{n / 3:.6g},{-n / 7:.6g}\n"
+            for n in range(19)
+        )
         rows = [{**ROW, "env_step": 100 * n, "q_gap": 0.1 * n} for n in range(1, 4)]
         lines = "".join(json.dumps(row) + "\n" for row in rows)
         write(
@@ -45,7 +48,7 @@ def folder(tmp_path: Path) -> Path:
         {
             "config.toml": CONFIG.format(method="dqn", seed=2),
             "summary.json": '{"exit": "complete"}',
-            "episodes.csv": HEADER + "0,5,0,1e+06,nan,-inf\n",
+            "episodes.csv": HEADER + "0,5,0,1e+06,nan,-inf,1e-09,0.333333\n",
             "metrics.jsonl": "",
         },
     )
@@ -98,7 +101,11 @@ def test_the_report_is_the_same(folder: Path, tmp_path: Path, monkeypatch: pytes
         ("episodes.csv", HEADER + "0,5", "episodes.csv: a torn line; does the run go on?"),
         ("metrics.jsonl", '{"env_step": 1}\n{"env', "metrics.jsonl: a torn line; does the run go on?"),
         ("metrics.jsonl", '{"env_step":1}\n', "metrics.jsonl: would not come back byte for byte; nothing is packed"),
-        ("episodes.csv", HEADER + "0,5,0,1,1,1", "episodes.csv: would not come back byte for byte; nothing is packed"),
+        (
+            "episodes.csv",
+            HEADER + "0,5,0,1,1,1,1,1",
+            "episodes.csv: would not come back byte for byte; nothing is packed",
+        ),
     ],
 )
 def test_what_would_not_come_back_is_not_packed(name: str, text: str, words: str, folder: Path, tmp_path: Path) -> None:

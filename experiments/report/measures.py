@@ -131,6 +131,23 @@ def breaking_point(capacities: NDArray[np.int64], scores: Sequence[Floats]) -> B
     return Breaking(int(capacities[first]), int(low), int(high), not enough[first:].all())
 
 
+def first_enough(
+    capacities: NDArray[np.int64], scores: Sequence[Floats], best: float
+) -> tuple[int | None, int | None, int | None]:
+    """The smallest capacity whose mean over runs is at least 95 % of `best`, and its 95 % bootstrap interval over runs.
+
+    None where no capacity is enough, and for a bound where that is so in the bootstrap.
+    """
+    generator = np.random.default_rng(0)
+    samples = [each[generator.integers(0, len(each), (REPS, len(each)))].mean(axis=1) for each in scores]
+    means = np.vstack([[each.mean() for each in scores], np.stack(samples, axis=1)])
+    enough = means >= best - (1 - ENOUGH) * abs(best)
+    found = np.where(enough.any(axis=1), capacities[enough.argmax(axis=1)], np.inf)
+    bounds = (found[0], *np.quantile(found[1:], [0.025, 0.975], method="nearest"))
+    first, low, high = (int(value) if np.isfinite(value) else None for value in bounds)
+    return first, low, high
+
+
 def _is_enough(means: Floats) -> NDArray[np.bool_]:
     """True <bool>[..., capacities] at 95 % of the last entry and above (a negative one: less 5 % of its size)."""
     largest = means[..., -1:]

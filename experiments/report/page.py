@@ -45,7 +45,7 @@ def page(
     parts = [
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>{STYLE}</style>",
         f"<h1>{title}</h1>",
-        f"<p>{len(study.runs)} of {total} runs finished: {html.escape(', '.join(study.methods))} on "
+        f"<p>{len(study.runs)} of {total} runs finished{_diverged(study)}: {html.escape(', '.join(study.methods))} on "
         f"{html.escape(', '.join(study.environments))}; they differ by {html.escape(axes)}.</p>",
         _missing(study, lacking),
         *(_table(table) for table in tables[:1]),
@@ -54,6 +54,10 @@ def page(
         f"<p class=note>Made by <code>coop-report {html.escape(folder.name)}</code>: {_versions()}.</p></html>",
     ]
     return "\n".join(parts) + "\n"
+
+
+def _diverged(study: Study) -> str:
+    return f", {len(study.diverged)} diverged" if study.diverged else ""
 
 
 def _missing(study: Study, lacking: Sequence[str]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.settings.config import METHODS
+from experiments.report.comparisons import comparison_tables
 from experiments.report.measures import (
     DIAGNOSTICS,
     breaking_point,
@@ -19,8 +20,8 @@ from experiments.report.measures import (
 )
 from experiments.report.paper import table_1
 from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
-from experiments.report.study import Floats, Run, Setting, Study
-from experiments.report.table import ResultTable, Value
+from experiments.report.study import Floats, Run, Study
+from experiments.report.table import ResultTable, Value, plain
 
 
 def tables(study: Study) -> list[ResultTable]:
@@ -32,7 +33,7 @@ def tables(study: Study) -> list[ResultTable]:
         made.append(aggregate_table(study))
         if len(study.methods) > 1:
             made.append(improvement_table(study))
-    return [*made, runs_table(study)]
+    return [*made, *comparison_tables(study), runs_table(study)]
 
 
 def paper_table(study: Study) -> ResultTable:
@@ -69,7 +70,7 @@ def settings_table(study: Study) -> ResultTable:
             runs = study.of(method, setting)
             if runs:
                 means = [float(np.mean([diagnostic(run, name) for run in runs])) for name in DIAGNOSTICS]
-                rows.append([method, *_plain(setting), *_over_runs(runs), *means])
+                rows.append([method, *plain(setting), *_over_runs(runs), *means])
     columns = [
         *("method", *study.axes, "mean", "sd over runs", "sd of 100 episodes", "IQM", "IQM low", "IQM high"),
         *("runs", "seeds", *DIAGNOSTICS),
@@ -90,7 +91,7 @@ def breaking_table(study: Study) -> ResultTable:
     for others in other_settings(study, CAPACITY):
         for method in study.methods:
             capacities, scores = along(study, CAPACITY, method, others)
-            rows.append([*_plain(others), method, *_breaking(capacities, scores, largest)])
+            rows.append([*plain(others), method, *_breaking(capacities, scores, largest)])
     names = [axis for axis in study.axes if axis != CAPACITY]
     columns = [*names, "method", "breaking point", "low", "high", "gaps", "largest", "return there", "runs each"]
     note = (
@@ -128,7 +129,7 @@ def runs_table(study: Study) -> ResultTable:
     """Every run."""
     rows: list[list[Value]] = [
         [
-            *(run.name, run.config.method, run.config.seed, *_plain(study.setting(run))),
+            *(run.name, run.config.method, run.config.seed, *plain(study.setting(run))),
             *(int(run.end_steps[-1]), len(run.returns), score(run), spread(run)),
             *(diagnostic(run, name) for name in DIAGNOSTICS),
         ]
@@ -136,10 +137,6 @@ def runs_table(study: Study) -> ResultTable:
     ]
     columns = ["run", "method", "seed", *study.axes, "last step", "episodes", "mean", "sd", *DIAGNOSTICS]
     return ResultTable("runs", "Every run", columns, rows, "mean and sd: of the returns of the last 100 episodes.")
-
-
-def _plain(setting: Setting) -> list[Value]:
-    return [value if isinstance(value, int | float | str) else str(value) for value in setting]
 
 
 def _over_runs(runs: Sequence[Run]) -> list[Value]:

@@ -33,8 +33,8 @@ PRESET = "cartpole"
 class Run:
     """One finished run with at least one episode.
 
-    end_steps: float64 [episodes], environment steps when each episode ended. returns, s: float64 [episodes].
-    metrics: float64 [rows] of each name of SERIES.
+    end_steps: float64 [episodes], environment steps when each episode ended. returns, s, q1_means, q2_means: float64
+    [episodes], of the columns `return`, `s`, `q1_mean` and `q2_mean`. metrics: float64 [rows] of each name of SERIES.
     """
 
     name: str
@@ -42,6 +42,8 @@ class Run:
     end_steps: Floats
     returns: Floats
     s: Floats
+    q1_means: Floats
+    q2_means: Floats
     metrics: Mapping[str, Floats]
 
 
@@ -51,12 +53,14 @@ class Study:
 
     axes: dotted names of the fields that differ between runs of one method.
     missing: names of runs that are expected or begun but not finished, each with what there is of it.
+    diverged: names and configs of runs that ended because they diverged; they are counted and averaged nowhere.
     reference: the value of each axis that is nearest to the preset's.
     """
 
     title: str
     runs: tuple[Run, ...]
     missing: Mapping[str, str]
+    diverged: Mapping[str, RunConfig]
     axes: tuple[str, ...]
     reference: Setting
 
@@ -72,7 +76,11 @@ class Study:
 
     def setting(self, run: Run) -> Setting:
         """The run's value on each axis."""
-        return tuple(field_of(run.config, axis) for axis in self.axes)
+        return self.setting_of(run.config)
+
+    def setting_of(self, config: RunConfig) -> Setting:
+        """A config's value on each axis."""
+        return tuple(field_of(config, axis) for axis in self.axes)
 
     @cached_property
     def settings(self) -> list[Setting]:
@@ -111,22 +119,26 @@ def load_study(path: Path) -> Study:
     names = source.names if grid is None else [cell.name for cell in grid.cells]
     if not names:
         raise UsageError(f"{path}: holds no run and no {SWEEP}")
-    runs, missing = [], {}
+    runs, missing, diverged = [], {}, {}
     for name in names:
         state = _state(source, name)
         run = None if state else _read(source, name, path)
-        if run is None:
+        if state.startswith("diverged"):
+            diverged[name] = _config(source, name, path)
+            missing[name] = state
+        elif run is None:
             missing[name] = state
         elif not len(run.returns):
             missing[name] = "finished without a finished episode"
         else:
             runs.append(run)
     if not runs:
-        raise RunError(f"{path}: none of its {len(names)} runs is finished")
-    axes = _axes(runs)
+        also = f", {len(diverged)} diverged" if diverged else ""
+        raise RunError(f"{path}: none of its {len(names)} runs is finished{also}")
+    axes = _axes([*(run.config for run in runs), *diverged.values()])
     preset = resolve(load_tables(grid.file.preset if grid else PRESET, None))
     reference = tuple(_nearest(field_of(preset, axis), {field_of(run.config, axis) for run in runs}) for axis in axes)
-    return Study(grid.file.title if grid else "", tuple(runs), missing, axes, reference)
+    return Study(grid.file.title if grid else "", tuple(runs), missing, diverged, axes, reference)
 
 
 def field_of(config: RunConfig, axis: str) -> Any:  # noqa: ANN401 (a value of any field)
@@ -144,27 +156,36 @@ def _state(source: Source, run: str) -> str:
         begun = any(source.text(run, file) is not None for file in (CONFIG, EPISODES))
         return "begun, not finished" if begun else "not begun"
     outcome = str(json.loads(summary)["exit"])
+    if outcome.startswith("diverged"):
+        return outcome
     return "" if outcome.startswith("complete") else f"begun, not finished: {outcome}"
 
 
 def _read(source: Source, run: str, path: Path) -> Run:
+    config = _config(source, run, path)
     try:
-        config = resolve(tomllib.loads(source.text(run, CONFIG) or ""))
-        episodes = source.columns(run, EPISODES, ("env_step", "return", "s"))
+        episodes = source.columns(run, EPISODES, ("env_step", "return", "s", "q1_mean", "q2_mean"))
         rows = source.columns(run, METRICS, SERIES)
-        ends, returns, s = (np.array(values, np.float64) for values in episodes.values())
+        ends, returns, s, q1, q2 = (np.array(values, np.float64) for values in episodes.values())
         metrics = {name: np.array(values, np.float64) for name, values in rows.items()}
     except (OSError, ValueError, KeyError, UsageError) as error:
         raise RunError(f"{path / run}: a finished run with a file that can't be read: {error!r}") from error
-    return Run(run, config, ends, returns, s, metrics)
+    return Run(run, config, ends, returns, s, q1, q2, metrics)
 
 
-def _axes(runs: list[Run]) -> tuple[str, ...]:
+def _config(source: Source, run: str, path: Path) -> RunConfig:
+    try:
+        return resolve(tomllib.loads(source.text(run, CONFIG) or ""))
+    except (OSError, ValueError, UsageError) as error:
+        raise RunError(f"{path / run}: a run whose config can't be read: {error!r}") from error
+
+
+def _axes(configs: list[RunConfig]) -> tuple[str, ...]:
     """Fields that differ within a method; what differs between methods alone is part of the method."""
     values: dict[tuple[str, str], set[Any]] = {}
-    for run in runs:
-        for name, value in _flat(identity(run.config)):
-            values.setdefault((run.config.method, name), set()).add(value)
+    for config in configs:
+        for name, value in _flat(identity(config)):
+            values.setdefault((config.method, name), set()).add(value)
     names = dict.fromkeys(name for (_, name), found in values.items() if len(found) > 1)
     return tuple(name for name in names if name not in NOT_AXES)
 

@@ -48,6 +48,11 @@ class ResultTable:
         return f"<table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>{note}"
 
 
+def plain(setting: Sequence[object]) -> list[Value]:
+    """The values of a setting as a table's."""
+    return [value if isinstance(value, int | float | str) else str(value) for value in setting]
+
+
 def rounded(value: Value) -> str:
     """A value for people: four digits, more where the number is an integer."""
     if value is None or (isinstance(value, float) and math.isnan(value)):

@@ -1,0 +1,111 @@
+"""How a run learned over its whole course, and how methods differ over the same seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import gymnasium
+import numpy as np
+import pandas as pd
+
+from common.returns import RETURN_WINDOW, running_mean
+from experiments.report.measures import REPS
+from experiments.report.study import Floats, Run, Study
+
+SHORT = 20  # episodes of the running mean by which a run is healthy or collapses
+FALL = 3 / 13  # of the threshold: below that a healthy run has collapsed; for CartPole 195 and 150
+
+
+class Course(NamedTuple):
+    """A run against a threshold of return, by the running mean of 20 episodes.
+
+    steps_to: environment steps until it first reached the threshold; inf if it never did. share_above: of the steps
+    after that, those at which it was at the threshold or above; nan if it never was. collapses: how often it fell from
+    the threshold or above to below 10/13 of it. healthy_steps: steps between reaching the threshold and collapsing.
+    """
+
+    steps_to: float
+    share_above: float
+    collapses: int
+    healthy_steps: float
+
+
+class Estimate(NamedTuple):
+    """A mean over seeds with its 95 % bootstrap interval; nan where there are too few seeds."""
+
+    value: float
+    low: float
+    high: float
+
+
+def reward_threshold(environment: str) -> float | None:
+    """The return at which gymnasium calls an environment solved; None where it names none."""
+    try:
+        return gymnasium.spec(environment).reward_threshold
+    except gymnasium.error.Error:
+        return None
+
+
+def area(run: Run) -> float:
+    """Area under the curve by steps, divided by the steps: the mean over steps of the running mean of 100 episodes.
+
+    Until the first episode has ended its return counts.
+    """
+    lengths = np.diff(run.end_steps, prepend=0.0)
+    latest = np.concatenate((run.returns[:1], running_mean(run.returns)[:-1]))
+    return float(np.average(latest, weights=lengths))
+
+
+def course(run: Run, threshold: float) -> Course:
+    """Follow a run; see `Course`."""
+    means = running_mean(run.returns, SHORT)[SHORT - 1 :]
+    steps = run.end_steps[SHORT - 1 :]
+    fallen = threshold - FALL * abs(threshold)
+    collapses, healthy_steps, since = 0, 0.0, math.nan
+    for step, mean in zip(steps, means, strict=True):
+        if math.isnan(since) and mean >= threshold:
+            since = step
+        elif mean < fallen and not math.isnan(since):
+            collapses, healthy_steps, since = collapses + 1, healthy_steps + step - since, math.nan
+    if not math.isnan(since):
+        healthy_steps += steps[-1] - since
+    reached = np.flatnonzero(means >= threshold)
+    if not len(reached):
+        return Course(math.inf, math.nan, 0, 0.0)
+    after = np.diff(steps[reached[0] :])
+    above = (means[reached[0] : -1] >= threshold) @ after / after.sum() if len(after) else math.nan
+    return Course(float(steps[reached[0]]), float(above), collapses, float(healthy_steps))
+
+
+def end_of_running_mean(run: Run) -> Floats:
+    """float64 [100 or fewer]: the running mean of 100 episodes at each of the last 100 episodes."""
+    return running_mean(run.returns)[-RETURN_WINDOW:]
+
+
+def squared_gap_of_means(run: Run) -> float:
+    """The squared difference of the two networks' mean Q-values, each over the last 100 episodes."""
+    one, other = (float(values[-RETURN_WINDOW:].mean()) for values in (run.q1_means, run.q2_means))
+    return (one - other) ** 2
+
+
+def over_seeds(values: Sequence[float] | Floats) -> Estimate:
+    """The mean over seeds, and its interval by resampling them."""
+    sample = np.asarray(values, np.float64)
+    if len(sample) < 2:
+        return Estimate(float(sample.mean()) if len(sample) else math.nan, math.nan, math.nan)
+    drawn = np.random.default_rng(0).integers(0, len(sample), (REPS, len(sample)))
+    low, high = np.quantile(sample[drawn].mean(axis=1), [0.025, 0.975])
+    return Estimate(float(sample.mean()), float(low), float(high))
+
+
+def by_seed(study: Study, measure: Callable[[Run], float]) -> pd.DataFrame:
+    """A measure of every run: a row for each seed, columns (method, setting's place); nan where there is no run."""
+    measured = study.frame.assign(value=study.frame["run"].map(measure))
+    return measured.pivot_table("value", "seed", ["method", "setting"], aggfunc="last")
+
+
+def differences(values: pd.DataFrame, x: str, y: str) -> pd.DataFrame:
+    """What x has above y: a row for each seed, a column for each setting, those that both methods have."""
+    return (values[x] - values[y]).dropna(axis="columns", how="all").dropna()
