@@ -17,11 +17,11 @@ from torch import Tensor, nn
 
 from common.envs.make import env_spec
 from common.networks.network import FlatNetwork, preprocess
+from common.process.run_ids import read_run_id
 from common.process.threads import use_threads
 from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
 from learner.records.epochs import load_learner, newest_epoch
-from learner.records.run_directory import read_run_id
 from replay.core import ReplayCore
 from replay.persistence.storage import load_snapshot
 

@@ -38,6 +38,7 @@ from learner.agent import Agent
 from learner.broadcast import Broadcaster
 from learner.reception import Reception
 from learner.roster import Roster
+from learner.shared_epochs import SharedEpochs
 
 EPSILON = 0.1
 RUN = "bench"
@@ -122,7 +123,8 @@ class Topology:
         session = open_session((head,), (replay,))
         self._node = stack.enter_context(Node(session, RUN, "learner", new_incarnation()))
         agent = Agent(config, spec)
-        Reception(self._node, config, spec, agent.networks[0].layout_digest(), 0, lambda: 0, Roster())
+        digest, epochs = agent.networks[0].layout_digest(), SharedEpochs([], "benchmark")
+        Reception(self._node, config, spec, digest, 0, epochs, Roster())
         Broadcaster(self._node, agent)
         joining = ["--run", RUN, "--connect", head]
         service = command("coop-replay", *joining, "--listen", replay, "--run-dir", str(folder))

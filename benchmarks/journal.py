@@ -29,6 +29,7 @@ from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.tables import validated
 from learner.reception import Reception
 from learner.roster import Roster
+from learner.shared_epochs import SharedEpochs
 
 STEPS, WINDOW, CAPACITY = 64, 16, 5000
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -49,7 +50,7 @@ class Service:
         )
         head, at = free_endpoint(), free_endpoint()
         learner = stack.enter_context(Node(open_session((head,)), run, "learner", new_incarnation()))
-        Reception(learner, config, ATARI, "", run_id=0, newest_epoch=lambda: 0, roster=Roster())
+        Reception(learner, config, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster())
         flags = ("--run", run, "--connect", head, "--listen", at, "--run-dir", str(folder))
         self._process = ChildProcess("replay", command("coop-replay", *flags), folder.with_suffix(".log"))
         self._process.start()

@@ -35,6 +35,7 @@ from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.tables import validated
 from learner.reception import Reception
 from learner.roster import Roster
+from learner.shared_epochs import SharedEpochs
 
 BATCH, PREFETCH, STEPS = 32, 4, 32
 CAPACITY = 50_000
@@ -167,7 +168,7 @@ class Bench:
         incarnation = new_incarnation()
         session = open_session((head,), (bare,), shared_memory=shared_memory)
         node = stack.enter_context(Node(session, RUN, "learner", incarnation))
-        Reception(node, CONFIG, ATARI, "", run_id=0, newest_epoch=lambda: 0, roster=Roster())
+        Reception(node, CONFIG, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster())
         flags = ["--run", RUN, "--connect", head, "--listen", replay, "--run-dir", str(folder)]
         service = ChildProcess(
             "replay", command("coop-replay", *flags, *["--shared-memory"] * shared_memory), folder / "log"

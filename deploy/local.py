@@ -11,10 +11,11 @@ from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
 from common.process.files import write_whole
 from common.process.lifecycle import Stop, run_main
+from common.process.locks import RunLock
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.capacity import check_memory, check_messages
 from common.settings.config import RunConfig, check_distributed
-from common.settings.options import RunOptions, parse_run
+from common.settings.options import RunOptions, beginning, holds_run, parse_run
 from common.settings.tables import to_toml
 from deploy.status import Display, RunStatus
 from deploy.supervisor import RESTARTS, RestartPolicy
@@ -30,6 +31,8 @@ class LocalOptions(RunOptions):
 
     actors: int = 1
     """Actor processes."""
+    restart: bool = False
+    """With --resume: begin the training anew where learner and replay service hold no epoch in common."""
     listen: str | None = None
     """Endpoint of the learner, so that actors elsewhere can join; a free port on loopback if not given."""
 
@@ -39,9 +42,10 @@ class Topology:
 
     Args:
         directory: run directory; the roles' logs go to its logs/.
+        locks: descriptors of its locks, which learner and replay service hold too.
     """
 
-    def __init__(self, options: LocalOptions, config: RunConfig, directory: Path) -> None:
+    def __init__(self, options: LocalOptions, config: RunConfig, directory: Path, locks: tuple[int, ...]) -> None:
         logs = directory / "logs"
         try:
             logs.mkdir(parents=True, exist_ok=True)
@@ -56,9 +60,10 @@ class Topology:
         # --resume, also at the first start: one that is started again goes on from the newest epoch.
         files = [f"--run-dir={directory}", "--resume", *common]
         learning = [f"--config={resolved}", "--listen", self.endpoint, *files]
+        learning += ["--restart"] if options.restart else []
         serving = [*joining, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}", "--resume"]
-        self.learner = ChildProcess("learner", command("coop-learner", *learning), logs / "learner.log")
-        self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log")]
+        self.learner = ChildProcess("learner", command("coop-learner", *learning), logs / "learner.log", locks)
+        self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]
         self._others += [
             ChildProcess(f"actor {number}", command("coop-actor", *joining), logs / f"actor-{number}.log")
             for number in range(1, options.actors + 1)
@@ -139,7 +144,14 @@ def _run() -> None:
     directory = options.directory()
     stop = Stop()
     stop.on_signals()
-    topology = Topology(options, config, directory)
+    with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
+        if options.resume:
+            print(f"goes on with the run in {directory}" if holds_run(directory) else beginning(directory), flush=True)
+        _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop)
+
+
+def _supervise(topology: Topology, options: LocalOptions, config: RunConfig, directory: Path, stop: Stop) -> None:
+    """Run the processes to the end of the run."""
     topology.start()
     status = RunStatus(config.run, topology.endpoint, new_incarnation(), options.zenoh_config)
     title = f"{config.env.id}, {config.method}, seed {config.seed}: {directory}"

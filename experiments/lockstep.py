@@ -20,12 +20,13 @@ from common.envs.make import make_vector_env
 from common.errors import UsageError
 from common.messaging.messages.sample import EpisodeRecord
 from common.process.randomness import generator_state, set_generator_state
+from common.process.run_ids import read_run_id
 from common.settings import schedules
 from common.settings.config import RunConfig
 from experiments import old_checkpoints
 from learner.agent import Agent
 from learner.records.epochs import load_learner, save_epoch
-from learner.records.run_directory import RunDirectory, read_run_id
+from learner.records.run_directory import RunDirectory
 from learner.trainer import Effects, Trainer
 from replay.core import ReplayCore
 from replay.persistence.storage import Mark, load_snapshot, save_snapshot

@@ -7,8 +7,9 @@ import time
 
 from common.errors import RunError
 from common.process.lifecycle import Stop, run_main
+from common.process.locks import RunLock
 from common.process.threads import use_threads
-from common.settings.options import RunOptions, parse_run
+from common.settings.options import RunOptions, beginning, parse_run
 from experiments.lockstep import Lockstep
 from learner.records.curve import draw_learning_curve
 from learner.records.epochs import newest_epoch
@@ -32,10 +33,13 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     run = Lockstep(config)
-    epoch = newest_epoch(path) if options.resume else None
-    sizes = None if epoch is None else run.restore(epoch)
-    with RunDirectory(path, config, sizes) as directory:
-        summary = run_lockstep(run, directory, stop)
+    with RunLock(path, "coop-lockstep", ("learner", "replay")):
+        epoch = newest_epoch(path) if options.resume else None
+        if options.resume:
+            print(beginning(path) if epoch is None else f"goes on from epoch {epoch.name}", flush=True)
+        sizes = None if epoch is None else run.restore(epoch)
+        with RunDirectory(path, config, sizes) as directory:
+            summary = run_lockstep(run, directory, stop)
     run.env.close()
     print(f"{summary}; {path}")
     if run.trainer.diverged:

@@ -14,12 +14,12 @@ import torch
 from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.messaging.messages.sample import DrawRequest
+from common.process.run_ids import read_run_id
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
 from learner.records.epochs import complete_epochs, load_learner, newest_epoch
-from learner.records.run_directory import read_run_id
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
 from replay.persistence.journal import DRAW, TornFile, journal_files, read_draw, read_file

@@ -16,6 +16,7 @@ from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.transport import NoAnswer, Node
 from common.messaging.wire import Message
 from learner.records.epochs import complete_epochs, save_epoch
+from learner.shared_epochs import SharedEpochs
 
 PATIENCE = 5.0  # seconds that the replay service may take to answer
 PAUSE = 0.05  # seconds between questions
@@ -26,15 +27,15 @@ class Checkpoints:
 
     An epoch that can't be saved is given up, with one printed line, and the run goes on to the next.
 
-    Attributes:
-        newest: number of the newest epoch that is finished; 0 if there is none.
+    Args:
+        epochs: are told of those that are finished.
     """
 
-    def __init__(self, node: Node, run_dir: Path, samples: SampleClient) -> None:
-        self.newest = max(complete_epochs(run_dir), default=0)
+    def __init__(self, node: Node, run_dir: Path, samples: SampleClient, epochs: SharedEpochs) -> None:
         self._node = node
         self._run_dir = run_dir
         self._samples = samples
+        self._epochs = epochs
         self._writer: threading.Thread | None = None
 
     def begin(self, state: Callable[[], dict[str, Any]]) -> bool:
@@ -81,7 +82,7 @@ class Checkpoints:
             raise RunError(f"epoch {number} in {self._run_dir}: {error.strerror or error}") from error
         except CoopError as error:
             raise RunError(f"epoch {number}: {error}") from error
-        self.newest = number
+        self._epochs.finished(number)
 
     def _wait_for(self, question: bytearray) -> None:
         while self._ask(question).kind == Retry.kind:

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 from common.envs.make import env_spec
-from common.errors import RunError
+from common.errors import RunError, UsageError
 from common.messaging.clients import SampleClient
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process.lifecycle import Stop, run_main
+from common.process.locks import RunLock
 from common.process.threads import use_threads
 from common.settings.capacity import check_messages
-from common.settings.config import check_distributed
-from common.settings.options import RunOptions, parse_run
+from common.settings.config import RunConfig, check_distributed
+from common.settings.options import RunOptions, beginning, parse_run
+from common.types import EnvSpec
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
 from learner.reception import Reception
-from learner.records.epochs import go_back
-from learner.records.run_directory import RunDirectory
+from learner.records.epochs import go_back, whole_epochs
+from learner.records.run_directory import RunDirectory, settle
 from learner.roster import Roster
 from learner.service import LearnerService
+from learner.shared_epochs import SharedEpochs
 from learner.trainer import Trainer
 
 
@@ -30,6 +34,8 @@ class LearnerOptions(RunOptions):
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints to listen on; tcp/0.0.0.0:7447 opens the run to other machines."""
+    restart: bool = False
+    """With --resume: begin the training anew where learner and replay service hold no epoch in common."""
 
 
 def main() -> None:
@@ -41,6 +47,8 @@ def _run() -> None:
     options = parse_run(
         LearnerOptions, "coop-learner", "Train the networks of a run; everybody else asks this process."
     )
+    if options.restart and not options.resume:
+        raise UsageError("--restart: says what --resume does where it finds no epoch to go on from; give both")
     config = options.run_config()
     check_distributed(config)
     spec = env_spec(config.env)
@@ -50,27 +58,43 @@ def _run() -> None:
     stop.on_signals()
     stop.on_thread_failures()
     path = options.directory()
+    with RunLock(path, "coop-learner", ("learner",)):
+        _train(options, config, spec, path, stop)
+
+
+def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path, stop: Stop) -> None:
+    """One run from its beginning, or from an epoch, to its end."""
+    held = whole_epochs(path) if options.resume else []
+    if options.resume and not held:
+        print(beginning(path), flush=True)
     trainer = Trainer(Agent(config, spec), time.monotonic())
     agent = trainer.agent
-    state = go_back(path) if options.resume else None
-    if state is not None:
-        trainer.load_state(state, time.monotonic())
+    epochs = SharedEpochs(held, str(path), restart=options.restart)
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory)
-    sizes = None if state is None else state["sizes"]
-    with Node(session, config.run, "learner", incarnation) as node, RunDirectory(path, config, sizes) as directory:
+    with Node(session, config.run, "learner", incarnation) as node:
+        run_id = settle(path, config)
+        roster = Roster(path, time.monotonic())
+        Reception(node, config, spec, agent.networks[0].layout_digest(), run_id, epochs, roster)
+        print(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}", flush=True)
+        if held:
+            print("waiting for the replay service to tell which epochs it holds", flush=True)
+        number = epochs.wait(stop)
+        if number is None:
+            return
+        state = go_back(path, number)
+        if state is not None:
+            trainer.load_state(state, time.monotonic())
+            print(f"goes on from epoch {number}", flush=True)
+        elif held:
+            print("begins anew: no epoch is held by both", flush=True)
         settings, told = config.learner, 0 if state is None else state["told"]
         samples = SampleClient(
             node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, told
         )
-        checkpoints = Checkpoints(node, path, samples)
-        run_id = directory.run_id()
-        roster = Roster(path, time.monotonic())
-        Reception(node, config, spec, agent.networks[0].layout_digest(), run_id, lambda: checkpoints.newest, roster)
-        print(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}", flush=True)
-        if state is not None:
-            print(f"goes on from epoch {agent.updates}", flush=True)
-        summary = LearnerService(node, stop, trainer, directory, samples, checkpoints).run()
+        checkpoints = Checkpoints(node, path, samples, epochs)
+        with RunDirectory(path, config, None if state is None else state["sizes"]) as directory:
+            summary = LearnerService(node, stop, trainer, directory, samples, checkpoints).run()
     print(summary, flush=True)
     if trainer.diverged:
         raise RunError(trainer.diverged)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
 
 from common.errors import BadMessage
@@ -16,13 +15,14 @@ from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.types import EnvSpec
 from learner.roster import Occupied, Roster
+from learner.shared_epochs import SharedEpochs
 
 
 class Reception:
     """Answers join requests and remembers where the replay service listens.
 
     Args:
-        newest_epoch: gives the number of the newest epoch that is finished.
+        epochs: tell which epoch the run goes on from.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class Reception:
         spec: EnvSpec,
         layout: str,
         run_id: int,
-        newest_epoch: Callable[[], int],
+        epochs: SharedEpochs,
         roster: Roster,
     ) -> None:
         self._node = node
@@ -40,7 +40,7 @@ class Reception:
         self._spec = spec
         self._layout = layout
         self._run_id = run_id
-        self._newest_epoch = newest_epoch
+        self._epochs = epochs
         self._roster = roster
         self._replay_endpoints: list[str] = []
         self._replay: Origin | None = None
@@ -51,8 +51,13 @@ class Reception:
         request = Join.decode(message)
         if request.role != role:
             raise BadMessage("fields.role", f"{request.role!r}; this key is for {role!r}")
+        epoch, anew, index = self._epochs.newest, False, 0
         try:
-            index = self._roster.actor(request) if role == "actor" else self._admit(request)
+            if role == "actor":
+                index = self._roster.actor(request)
+            elif request.endpoints:  # one without them only asks which run this is
+                index = self._admit(request)
+                epoch, anew = self._epochs.offered(request)
         except Occupied as other:
             return Retry(str(other)).encode(self._node.run)
         joined = Joined(
@@ -62,7 +67,8 @@ class Reception:
             index,
             self._replay_endpoints,
             self._run_id,
-            self._newest_epoch(),
+            epoch,
+            anew,
             replay=self._replay,
         )
         return joined.answer()

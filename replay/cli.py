@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from common.errors import PeerLost, RunError, UsageError
+from common.errors import PeerLost, RunError
 from common.messaging.joining import Membership, join
-from common.messaging.messages.join import Join, Joined
+from common.messaging.messages.join import MOST_EPOCHS, Join, Joined
 from common.messaging.presence import LEASE
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process import cli
@@ -16,7 +17,8 @@ from common.process.memory import keep_freed_memory
 from common.settings.options import RoleOptions
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
-from replay.persistence.journal import Journal, journal_files
+from replay.persistence.folder import ReplayFolder
+from replay.persistence.journal import Journal, drop_journal
 from replay.persistence.recovery import recover
 from replay.service import ReplayService
 
@@ -27,10 +29,11 @@ class ReplayOptions(RoleOptions):
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
     """Endpoints to listen on; port 0 takes a free one."""
-    run_dir: Path = Path("runs/replay")
-    """Where this service's part of the epochs is written, under checkpoints/."""
+    run_dir: Path | None = None
+    """Where this service's part of the epochs is written, under checkpoints/; runs/RUN-replay-ID if not given, with
+    the run's name and id."""
     resume: bool = False
-    """Go on from what is in --run-dir, if anything is."""
+    """Go on from what is in --run-dir; start where there is nothing of this run yet."""
 
 
 def main() -> None:
@@ -50,44 +53,60 @@ def _run() -> None:
     session = open_session(options.listen, options.connect, options.zenoh_config, options.shared_memory)
     with Node(session, options.run, "replay", incarnation) as node:
         node.follow_stop(stop)
-        request = Join("replay", incarnation, locators(session))
-        joined = join(node, stop, request, options.connect, options.join_timeout)
-        if joined is not None:
-            service = _service(node, joined, options)
-
-            def learned(_: Joined, asked: float) -> None:
-                service.confirm(asked + LEASE)
-
-            with Membership(node, stop, request, joined, options.patience, learned):
-                service.start()
-                service.run(stop)
+        joining = partial(join, node, stop, connect=options.connect, timeout=options.join_timeout)
+        known = joining(Join("replay", incarnation, []))
+        if known is not None:
+            folder = ReplayFolder(options.run_dir or _named(options.run, known.run_id), known.run_id)
+            print(folder.check(resume=options.resume), flush=True)
+            with folder.lock():
+                held = ReplayEpochs(folder.path, known.run_id).whole()
+                request = Join("replay", incarnation, locators(session), epochs=held[-MOST_EPOCHS:])
+                joined = joining(request)
+                if joined is not None:
+                    _serve(node, stop, options, folder, request, joined)
     if stop.failed:
         raise PeerLost(stop.reason)
 
 
-def _service(node: Node, joined: Joined, options: ReplayOptions) -> ReplayService:
-    """A service that goes on where --run-dir says, or that begins.
+def _named(run: str, run_id: int) -> Path:
+    return Path("runs") / f"{run}-replay-{run_id:x}"
+
+
+def _serve(node: Node, stop: Stop, options: ReplayOptions, folder: ReplayFolder, request: Join, joined: Joined) -> None:
+    """Serve a run that this process has joined, until the stop."""
+    service = _service(node, joined, folder)
+
+    def learned(_: Joined, asked: float) -> None:
+        service.confirm(asked + LEASE)
+
+    with Membership(node, stop, replace(request, serving=True), joined, options.patience, learned):
+        service.start()
+        service.run(stop)
+
+
+def _service(node: Node, joined: Joined, folder: ReplayFolder) -> ReplayService:
+    """A service whose table is as the folder has it, at the learner's epoch or, where there is a journal, later.
 
     Raises:
-        UsageError: there is a run in --run-dir and --resume was not given, or it is another run.
-        RunError: the journal can't be read or written.
+        RunError: the folder is another run's, or the journal can't be read or written.
+        UsageError: the folder is of a table with other settings.
     """
+    if joined.run_id != folder.run_id:
+        raise RunError(f"another learner of run {node.run!r} has begun while this one joined")
     core = ReplayCore(joined.config, joined.spec)
-    folder = options.run_dir / "journal"
-    epochs = ReplayEpochs(options.run_dir, joined.run_id)
-    first, found = 1, "begins with an empty table"
-    if options.resume:
-        first, found = epochs.restore(core, joined.epoch)
-    elif epochs.any() or journal_files(folder):
-        raise UsageError(f"--run-dir {options.run_dir}: holds a run already; give another, or --resume")
+    epochs = ReplayEpochs(folder.path, folder.run_id)
+    if joined.anew:
+        epochs.clear()
+        drop_journal(folder.journal)
+    first, found = epochs.restore(core, joined.epoch)
     if joined.config.replay.journal:
-        number, carried_out = recover(core, folder, first, joined.run_id)
+        number, carried_out = recover(core, folder.journal, first, folder.run_id)
         found = f"{found}; {carried_out}"
         try:
-            journal = Journal(folder, joined.run_id, number, keep=joined.config.replay.journal_keep)
+            journal = Journal(folder.journal, folder.run_id, number, keep=joined.config.replay.journal_keep)
         except OSError as error:
-            raise RunError(f"journal in {folder}: {error.strerror or error}") from error
+            raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
         core.recorder = journal
-        epochs = ReplayEpochs(options.run_dir, joined.run_id, journal)
+        epochs = ReplayEpochs(folder.path, folder.run_id, journal)
     print(found, flush=True)
     return ReplayService(node, core, epochs, confirmed=0.0)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple, Protocol
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,8 +13,9 @@ from common.errors import RunError
 from common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
 from common.settings.capacity import check_memory
 from common.settings.config import RunConfig
-from common.types import Array, Batch, EnvSpec, EpisodeEnd, Segment
+from common.types import Array, Batch, EnvSpec, Segment
 from replay.dedup import SeenWindow
+from replay.episodes import EpisodeLog
 from replay.limiter import RateLimiter
 from replay.table.table import PinnedBatch, Table, TableSnapshot
 
@@ -62,10 +62,12 @@ class Unrecorded:
 class CoreSnapshot(NamedTuple):
     """A core's state at one moment; `table` must be released.
 
-    books: everything but the table, msgpack-able. replies: the draws that the learner may ask for again.
+    books: everything but table and episodes, msgpack-able. episodes: those that may be asked for again; plain, for
+    packing them takes longer than the others may wait. replies: the draws that may be asked for again.
     """
 
     books: dict[str, Any]
+    episodes: tuple[EpisodeRecord, ...]
     table: TableSnapshot
     replies: list[tuple[Batch, Drawn]]
 
@@ -106,8 +108,8 @@ class ReplayCore:
         self.inserts_wait_for = ""
         self.samples_wait_for = ""
         self._seen = SeenWindow()
-        self._first_episode = 0  # number of the first episode booked; not 0 where older books were lost
-        self._episodes: list[EpisodeRecord] = []
+        self._episodes = EpisodeLog()
+        self._asked_from = 0  # the episode from which on the last draw asked
         self._accounts: dict[int, _Account] = {}
         self._learners: list[int] = []  # the last one is served
         self._replies: dict[int, Reply] = {}
@@ -125,7 +127,7 @@ class ReplayCore:
     @property
     def episodes_booked(self) -> int:
         """Episodes that ended so far."""
-        return self._first_episode + len(self._episodes)
+        return self._episodes.total
 
     def insert(self, segment: Segment, payload: bytes = b"") -> int | Wait:
         """Take a segment, unless an earlier delivery was taken; the count of transitions accepted, or the reason.
@@ -155,7 +157,7 @@ class ReplayCore:
         account = self._accounts.setdefault(segment.incarnation, _Account())
         account.accepted += segment.steps
         account.acked = max(account.acked, segment.acked)
-        self._episodes.extend(
+        self._episodes.add(
             EpisodeRecord(self.table.inserted + end.step_in_segment + 1, segment.incarnation, segment.stream, end)
             for end in segment.episodes
         )
@@ -192,8 +194,8 @@ class ReplayCore:
             table.update_priorities(np.array(numbers, np.int64), np.array(priorities))
         batch = table.sample_pinned(request.batch_size)
         self.drawn = max(self.drawn, request.sequence + 1)
-        first = max(request.episodes_from, self._first_episode)
-        start = first - self._first_episode
+        self._asked_from = request.episodes_from
+        first, episodes = self._episodes.since(request.episodes_from, MAX_EPISODES)
         drawn = Drawn(
             sequence=request.sequence,
             inserted=table.inserted,
@@ -201,7 +203,7 @@ class ReplayCore:
             evicted=table.evicted,
             evicted_unsampled=table.evicted_unsampled,
             first_episode=first,
-            episodes=tuple(self._episodes[start : start + MAX_EPISODES]),
+            episodes=episodes,
             planned=self.limiter.draws_total or 0,
         )
         self._forget([request.sequence])
@@ -213,19 +215,24 @@ class ReplayCore:
         self.recorder.limit(limiter)
         self.limiter = limiter
 
-    def snapshot(self, base: int) -> CoreSnapshot:
-        """Everything as it is now; a learner that is back at `base` updates can be served from it."""
+    def snapshot(self, base: int, keep: Sequence[int] = ()) -> CoreSnapshot:
+        """Everything as it is now; a learner that is back at `base` updates can be served from it.
+
+        keep: the older epochs that a learner may go back to. Episodes that none of them asks for again are dropped.
+        """
+        again = (drawn.first_episode for _, drawn in self._replies.values() if drawn.sequence >= base)
+        self._episodes.mark(base, min(again, default=self._asked_from), keep)
         books = {
             "drawn": self.drawn,
             "duplicates": self.duplicates,
             "seen": self._seen.state(),
-            "first_episode": self._first_episode,
-            "episodes": msgspec.to_builtins(self._episodes),
+            "first_episode": self._episodes.first,
+            "floors": list(self._episodes.floors.items()),
             "accounts": [[actor, account.accepted, account.acked] for actor, account in self._accounts.items()],
             "learners": list(self._learners),
             "limiter": asdict(self.limiter),
         }
-        return CoreSnapshot(books, self.table.snapshot(), self.repeatable(base))
+        return CoreSnapshot(books, self._episodes.copy(), self.table.snapshot(), self.repeatable(base))
 
     def repeatable(self, base: int = 0) -> list[tuple[Batch, Drawn]]:
         """The draws from number `base` on that the learner may ask for again."""
@@ -234,6 +241,7 @@ class ReplayCore:
     def restore(
         self,
         books: Mapping[str, Any],
+        episodes: Iterable[EpisodeRecord],
         meta: dict[str, Any],
         arrays: dict[str, Array],
         replies: Iterable[tuple[Batch, Drawn]],
@@ -243,10 +251,7 @@ class ReplayCore:
         self.drawn = books["drawn"]
         self.duplicates = books["duplicates"]
         self._seen.load_state(books["seen"])
-        self._first_episode = books["first_episode"]
-        self._episodes = [
-            EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in books["episodes"]
-        ]
+        self._episodes.load(books["first_episode"], episodes, dict(books.get("floors", [])))
         self._accounts = {actor: _Account(accepted, acked) for actor, accepted, acked in books["accounts"]}
         self._learners = list(books["learners"])
         self.limiter = RateLimiter.from_table(books["limiter"])
@@ -262,7 +267,7 @@ class ReplayCore:
             self._forget(list(self._replies))
         if not known or request.base > self.drawn:
             self.drawn = request.base
-            self._first_episode = max(self._first_episode, request.episodes_from - len(self._episodes))
+            self._episodes.known_to_end_at(request.episodes_from)
         # Keeping more than can be asked for again costs memory and the processor's caches.
         self._forget([sequence for sequence in self._replies if sequence < request.base])
 

@@ -68,3 +68,9 @@ def test_streams_used_least_recently_are_forgotten() -> None:
     assert window.accept(5, 0, 0)  # drops stream 1, and its missing 0 is lost
     assert window.missing() == 1
     assert len(window.state()["streams"]) == 2
+    twin = SeenWindow(max_streams=2)
+    twin.load_state(msgpack.unpackb(msgpack.packb(window.state())))
+    for one in (window, twin):
+        for incarnation, sequence in ((1, 1), (2, 0), (3, 0), (1, 0), (1, 2)):
+            assert one.seen(incarnation, 0, sequence)
+            assert not one.accept(incarnation, 0, sequence), "a stream that was forgotten is not taken for a new one"

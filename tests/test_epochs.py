@@ -9,12 +9,13 @@ import torch
 from samples import make_segment
 from table_reference import check_references
 
-from common.errors import RunError, UsageError
-from common.messaging.messages.sample import DrawRequest
+from common.errors import RunError
+from common.messaging.messages.sample import DrawRequest, EpisodeRecord
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec
-from learner.records.epochs import complete_epochs, go_back, load_learner, newest_epoch, save_epoch
+from learner.records.epochs import complete_epochs, go_back, load_learner, newest_epoch, save_epoch, whole_epochs
 from replay.core import ReplayCore, Wait
+from replay.episodes import MOST, EpisodeLog
 from replay.persistence.epochs import ReplayEpochs
 
 CONFIG = RunConfig(
@@ -89,8 +90,64 @@ def test_torn_parts_are_passed_over_and_old_ones_go(spec: EnvSpec, tmp_path: Pat
     (parts[20] / "state.msgpack").write_bytes(b"")
     assert "no epoch to restore" in epochs.restore(ReplayCore(CONFIG, spec), 20)[1]
     (parts[30] / "rewards.npy").unlink()
-    with pytest.raises(UsageError, match="belongs to the run with id 5, the learner's has 6"):
+    with pytest.raises(RunError, match="belongs to the run with id 5, the learner's has 6"):
         ReplayEpochs(tmp_path, 6).restore(ReplayCore(CONFIG, spec), 30)
+
+
+def test_a_writer_that_dies_of_anything_has_written_nothing(
+    spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    epochs = ReplayEpochs(tmp_path, 2**70)  # more than msgpack can write down
+    monkeypatch.setattr(threading, "excepthook", lambda args: None)
+    epochs.begin(_used_core(spec), threading.Condition(), 10, [])
+    with pytest.raises(RunError, match="10/replay: OverflowError: "):
+        epochs.written(10, 10)
+
+
+def test_old_folders_go_where_nothing_else_is_in_them(spec: EnvSpec, tmp_path: Path) -> None:
+    core, epochs = _used_core(spec), ReplayEpochs(tmp_path, 5)
+    (tmp_path / "checkpoints" / "20").mkdir(parents=True)
+    (tmp_path / "checkpoints" / "20" / "learner.pt").write_bytes(b"the learner's")
+    for number in (10, 20, 30):
+        save(core, epochs, number)
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["20", "30"]
+
+
+def test_episodes_are_kept_as_long_as_they_may_be_asked_for(spec: EnvSpec, tmp_path: Path) -> None:
+    core, epochs, sequence = ReplayCore(CONFIG, spec), ReplayEpochs(tmp_path, 5), 0
+    told: dict[int, int] = {}
+    for turn in range(1, 6):
+        for _ in range(10):
+            core.insert(make_segment(spec, sequence))  # an episode each
+            sequence += 1
+            while not isinstance(reply := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, sequence - 1)), Wait):
+                last = reply
+        told[core.drawn] = last.drawn.first_episode
+        save(core, epochs, core.drawn, *list(told)[-3:-1])
+        kept = core.snapshot(core.drawn, list(told)[-3:-1])
+        assert kept.books["first_episode"] <= told[list(told)[max(0, turn - 3)]]
+        assert len(kept.episodes) <= 31
+        kept.table.frames.release()
+    twin = ReplayCore(CONFIG, spec)
+    back = list(told)[-2]
+    ReplayEpochs(tmp_path, 5).restore(twin, back)
+    for number in range(twin.table.inserted // 4, twin.table.inserted // 4 + 2):
+        assert not isinstance(twin.insert(make_segment(spec, number)), Wait)
+    for one in (core, twin):
+        reply = one.draw(DrawRequest(2, back, back, 4, told[back]))
+        assert not isinstance(reply, Wait)
+        assert reply.drawn.first_episode == told[back]
+        steps = [record.env_step for record in reply.drawn.episodes]
+        assert steps == [4 * (number + 1) for number in range(told[back], one.episodes_booked)]
+
+
+def test_a_run_without_epochs_keeps_a_bounded_number_of_episodes(spec: EnvSpec) -> None:
+    log = EpisodeLog()
+    (end,) = make_segment(spec).episodes
+    for number in range(3):
+        log.add([EpisodeRecord(number, 1, 0, end)] * MOST)
+    assert (log.total, log.first) == (3 * MOST, 2 * MOST)
+    assert log.since(0, 2)[0] == 2 * MOST
 
 
 def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
@@ -120,7 +177,7 @@ def test_learner_epochs(tmp_path: Path) -> None:
     assert newest is not None
     assert load_learner(newest)["flat"].tolist() == [300.0] * 3
     (newest / "learner.pt").write_bytes((newest / "learner.pt").read_bytes()[:-9])
-    state = go_back(tmp_path)
+    state = go_back(tmp_path, whole_epochs(tmp_path)[-1])
     assert state is not None
     assert state["flat"].tolist() == [200.0] * 3
     assert complete_epochs(tmp_path) == [200], "the torn one is gone, and does not count as one of two to keep"

@@ -23,6 +23,7 @@ from common.types import EnvSpec
 from deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
 from learner.reception import Reception
 from learner.roster import Roster
+from learner.shared_epochs import SharedEpochs
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
 from replay.service import ReplayService
@@ -31,7 +32,7 @@ REQUEST = Join("actor", 3, [])
 
 
 def _receive(node: Node, spec: EnvSpec) -> None:
-    Reception(node, RunConfig(run="test"), spec, "layout", run_id=9, newest_epoch=lambda: 0, roster=Roster())
+    Reception(node, RunConfig(run="test"), spec, "layout", run_id=9, epochs=SharedEpochs([], "run"), roster=Roster())
 
 
 def test_another_protocol_is_refused_with_both_versions(

@@ -11,7 +11,7 @@ import pytest
 from samples import make_segment
 from test_epochs import CONFIG, save
 
-from common.errors import RunError, UsageError
+from common.errors import RunError
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import DrawRequest
 from common.process.files import LineFile
@@ -41,6 +41,7 @@ def _use(core: ReplayCore, spec: EnvSpec, sequences: range) -> None:
 def _assert_alike(core: ReplayCore, twin: ReplayCore) -> None:
     first, second = core.snapshot(0), twin.snapshot(0)
     assert first.books == second.books
+    assert first.episodes == second.episodes
     assert first.table.meta == second.table.meta
     for name, array in first.table.arrays.items():
         np.testing.assert_array_equal(array, second.table.arrays[name])
@@ -63,7 +64,7 @@ def test_a_kill_loses_nothing(spec: EnvSpec, tmp_path: Path) -> None:
     third = ReplayCore(CONFIG, spec)
     assert recover(third, tmp_path, 1, 5)[0] == 3, "the torn end was cut, and what follows is found"
     _assert_alike(twin, third)
-    with pytest.raises(UsageError, match="belongs to the run with id 5, the learner's has 6"):
+    with pytest.raises(RunError, match="belongs to the run with id 5, the learner's has 6"):
         recover(ReplayCore(CONFIG, spec), tmp_path, 1, 6)
     content = bytearray((tmp_path / "00000001.log").read_bytes())
     content[len(content) // 2] ^= 1

@@ -64,13 +64,23 @@ def test_a_run_without_an_ended_episode_says_so(tmp_path: Path) -> None:
     assert not (tmp_path / "run" / "learning_curve.png").exists()
 
 
-def test_resuming_something_else_is_refused(tmp_path: Path) -> None:
-    _run(tmp_path / "a", "coop", 5)
-    for flags in (["--run-dir", str(tmp_path / "none")], ["--run-dir", str(tmp_path / "a"), "--seed", "9"]):
-        done = subprocess.run([COMMAND, "--resume", *flags], capture_output=True, text=True, check=False)
-        assert done.returncode == 2
-        assert done.stderr.count("\n") == 1
-        assert "--resume" in done.stderr
+def test_resume_starts_goes_on_or_refuses(tmp_path: Path) -> None:
+    def resume(*flags: str) -> tuple[int, str, str]:
+        command = [COMMAND, "--resume", "--run-dir", str(tmp_path / "a"), *flags]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return done.returncode, done.stdout, done.stderr
+
+    short = ("--total-steps", "300", "--replay.start", "40")
+    status, out, _ = resume(*short)
+    assert (status, out.splitlines()[0]) == (0, f"starts in {tmp_path / 'a'}: there is no run there yet")
+    status, out, _ = resume(*short)
+    assert (status, out.splitlines()[0]) == (0, "goes on from epoch 260")
+    status, _, err = resume(*short, "--seed", "9")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "another run's, whose seed is 0; here it is 9" in err
+    status, _, err = resume(*short, "--learner.gamma", "0.5")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "--resume: learner.gamma = 0.5, but 0.99" in err
 
 
 def test_roles_swap_by_steps_and_start_anew_with_each_episode(tmp_path: Path) -> None:

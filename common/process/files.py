@@ -8,6 +8,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from common.errors import RunError
+
 PIECE = 1 << 24  # bytes read at once
 
 
@@ -86,6 +88,19 @@ def write_whole(path: Path, data: bytes) -> int:
         part.unlink(missing_ok=True)
         raise
     return file.checksum
+
+
+def cut_back(path: Path, size: int) -> None:
+    """Shorten a file to `size` bytes.
+
+    Raises:
+        RunError: it is shorter already: what should be there has been lost, and nothing can stand in for it.
+        OSError: it can't be written.
+    """
+    there = path.stat().st_size
+    if there < size:
+        raise RunError(f"{path}: has {there:,} bytes, and should have at least {size:,}")
+    os.truncate(path, size)
 
 
 def measure(path: Path) -> tuple[int, int]:

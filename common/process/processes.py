@@ -12,6 +12,7 @@ from pathlib import Path
 
 from common.errors import RunError
 from common.process.lifecycle import INTERRUPTED, SUPERVISED
+from common.process.locks import INHERITED
 
 LAST_WORDS = 400  # characters of a log's last line
 
@@ -21,7 +22,7 @@ class ChildProcess:
 
     Args:
         name: for people, for example "actor 2".
-        inherit: file descriptors that it gets too.
+        inherit: file descriptors of locks that it holds with this process.
     """
 
     def __init__(self, name: str, command: list[str], log: Path, inherit: tuple[int, ...] = ()) -> None:
@@ -41,7 +42,11 @@ class ChildProcess:
                 stderr=subprocess.STDOUT,
                 pass_fds=self._inherit,
                 start_new_session=True,  # a Ctrl-C at the terminal reaches the supervisor alone
-                env={**os.environ, SUPERVISED: str(os.getpid())},
+                env={
+                    **os.environ,
+                    SUPERVISED: str(os.getpid()),
+                    INHERITED: ",".join(map(str, self._inherit)),
+                },
             )
 
     @property

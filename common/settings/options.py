@@ -9,9 +9,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TypeVar
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.process import cli
 from common.process.notices import note_renamed, warn
+from common.process.run_ids import has_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.effects import without_effect
 from common.settings.renamed import current_flags
@@ -49,7 +50,7 @@ class RunOptions(RunConfig):
     run_dir: Path | None = None
     """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
     resume: bool = False
-    """Go on with the run in --run-dir and its config, from its newest epoch."""
+    """Go on with the run in --run-dir and its config, from its newest epoch; start it where there is none yet."""
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
     shared_memory: bool = False
@@ -63,24 +64,39 @@ class RunOptions(RunConfig):
         """The run directory.
 
         Raises:
-            UsageError: there is a run in it already; or, with --resume, none, or one with another config.
+            UsageError: there is a run in it already; or, with --resume, flags that contradict its config.
+            RunError: it is another run's.
         """
         if self.resume:
             return self._resumed()
         game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
         named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         path = self.run_dir or Path("runs") / named
-        if (path / "episodes.csv").exists():
+        if holds_run(path):
             raise UsageError(f"--run-dir {path}: holds a run already; give another folder, or --resume to go on")
         return path
 
     def _resumed(self) -> Path:
         path = self.run_dir
-        if path is None or not (path / "config.toml").exists():
-            raise UsageError(f"--resume: no run in --run-dir {path}")
+        if path is None:
+            raise UsageError("--resume: give the run's folder too, --run-dir")
         file = path / "config.toml"
-        check_resumed(self.run_config(), resolve(load_tables(None, file)), file)
+        if file.exists():
+            check_resumed(self.run_config(), resolve(load_tables(None, file)), file)
+        elif has_run_id(path):
+            raise RunError(f"run directory {path}: a replay service's, of the run with id {read_run_id(path)}")
         return path
+
+
+def holds_run(path: Path) -> bool:
+    """True where a run has begun in a folder."""
+    return has_run_id(path) or (path / "episodes.csv").exists()
+
+
+def beginning(path: Path) -> str:
+    """What to say where --resume finds no epoch in a run directory."""
+    there = "the run there has no epoch yet" if holds_run(path) else "there is no run there yet"
+    return f"starts in {path}: {there}"
 
 
 OptionsT = TypeVar("OptionsT", bound=RunOptions)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.settings.config import RunConfig
 from common.settings.methods import leaves
 from common.settings.tables import to_tables
 
 _FREE = ("checkpoint_every", "target_return")
+_TELLS_APART = (("run",), ("method",), ("seed",), ("env", "id"))
 _LIMITS = ("total_updates", "total_episodes")  # 0: none
 
 
@@ -25,9 +26,16 @@ def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
         config: what the command line asks for. saved: what the run has been so far. source: the file that says so.
 
     Raises:
-        UsageError: names every field that must stay as it is, with both values.
+        RunError: it is another run, of another name, method, seed or environment.
+        UsageError: names every other field that must stay as it is, with both values.
     """
     here, there = (dict(leaves(to_tables(each))) for each in (config, saved))
+    for path in _TELLS_APART:
+        if here[path] != there[path]:
+            name, folder = ".".join(path), source.parent
+            raise RunError(
+                f"run directory {folder}: another run's, whose {name} is {there[path]}; here it is {here[path]}"
+            )
     refused = [
         f"{'.'.join(path)} = {here.get(path)}, but {there.get(path)}{_allowed(path)}"
         for path in {**here, **there}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import fcntl
 import io
 import json
 import os
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common.errors import UsageError
+from common.process.locks import FileLock
 from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, resolve, to_toml
 from experiments.sweep.grid import Cell
@@ -67,11 +67,13 @@ class CellFolder:
     def locked(self) -> Iterator[int | None]:
         """Hold the cell's lock; None if another process has it. A child that inherits the descriptor keeps the lock."""
         self.path.mkdir(exist_ok=True)
-        descriptor = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            yield descriptor if _lock(descriptor) else None
-        finally:
-            os.close(descriptor)
+            lock = FileLock(self.path / "lock")
+        except BlockingIOError:
+            yield None
+            return
+        with lock:
+            yield lock.descriptor
 
     def prepare(self) -> None:
         """Write the config that the run starts from, or goes on with."""
@@ -91,11 +93,3 @@ class CellFolder:
         if not rows:
             return Progress(0, 0.0)
         return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
-
-
-def _lock(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

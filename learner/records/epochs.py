@@ -54,28 +54,34 @@ def complete_epochs(run_dir: Path) -> list[int]:
     return sorted(int(path.parent.name) for path in (run_dir / "checkpoints").glob(f"*/{DONE}"))
 
 
+def whole_epochs(run_dir: Path) -> list[int]:
+    """Numbers of the epochs that were finished and whose learner.pt is as it was written, in ascending order."""
+    return [number for number in complete_epochs(run_dir) if _is_whole(run_dir / "checkpoints" / str(number))]
+
+
 def newest_epoch(run_dir: Path) -> Path | None:
-    """The newest epoch that was finished and whose learner.pt is as it was written; None if there is none."""
-    for number in reversed(complete_epochs(run_dir)):
-        path = run_dir / "checkpoints" / str(number)
-        try:
-            if json.loads((path / DONE).read_text(encoding="utf-8")) == {LEARNER: list(measure(path / LEARNER))}:
-                return path
-        except (OSError, ValueError):
-            continue
-    return None
+    """The newest whole epoch; None if there is none."""
+    whole = whole_epochs(run_dir)
+    return run_dir / "checkpoints" / str(whole[-1]) if whole else None
 
 
-def go_back(run_dir: Path) -> dict[str, Any] | None:
-    """The learner's state of the newest epoch, if there is one; what is newer is torn, and dropped."""
-    path = newest_epoch(run_dir)
-    for number in complete_epochs(run_dir):
-        if path is None or number > int(path.name):
-            shutil.rmtree(run_dir / "checkpoints" / str(number), ignore_errors=True)
-    return None if path is None else load_learner(path)
+def go_back(run_dir: Path, number: int) -> dict[str, Any] | None:
+    """The learner's state of epoch `number`, None for a beginning (0); what is newer is dropped."""
+    for newer in complete_epochs(run_dir):
+        if newer > number:
+            shutil.rmtree(run_dir / "checkpoints" / str(newer), ignore_errors=True)
+    return load_learner(run_dir / "checkpoints" / str(number)) if number else None
 
 
 def load_learner(path: Path) -> dict[str, Any]:
     """Read learner.pt of an epoch's folder; executes nothing that it holds."""
     state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
     return state
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        told = json.loads((path / DONE).read_text(encoding="utf-8"))
+        return bool(told == {LEARNER: list(measure(path / LEARNER))})
+    except (OSError, ValueError):
+        return False

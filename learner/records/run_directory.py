@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import secrets
 import time
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -14,7 +12,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from common.errors import RunError
-from common.process.files import LineFile, write_whole
+from common.process.files import LineFile, cut_back, write_whole
+from common.process.run_ids import draw_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.tables import to_toml
 from learner.records.board import Board
@@ -25,7 +24,6 @@ EPISODE_FIELDS = (
     "episode", "env_step", "update", "actor", "stream", "return", "length",
     "epsilon", "s", "q1_mean", "q2_mean", "param_version",
 )  # fmt: skip
-RUN_ID = "run-id"
 
 
 class RunDirectory:
@@ -35,10 +33,9 @@ class RunDirectory:
         """Begin a run's files, or go on with those cut back to `sizes` in bytes; RunError where that can't be."""
         self.path = path
         try:
-            path.mkdir(parents=True, exist_ok=True)
-            write_whole(path / "config.toml", to_toml(config).encode())
+            settle(path, config)
             for name, size in (sizes or {}).items():
-                os.truncate(path / name, size)
+                cut_back(path / name, size)
             self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
             self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
             self._board = Board(path / "tb")
@@ -50,13 +47,7 @@ class RunDirectory:
         self._problem = ""
 
     def run_id(self) -> int:
-        """The random id of this run, drawn when it began, which tells it from others of its name; raises RunError."""
-        path = self.path / RUN_ID
-        try:
-            if not path.exists():
-                write_whole(path, f"{secrets.randbits(63)}\n".encode())
-        except OSError as error:
-            raise RunError(f"{path}: {error}") from error
+        """The random id of this run, which tells it from others of its name; raises RunError."""
         return read_run_id(self.path)
 
     def record(self, episodes: Iterable[EpisodeRow], metrics: dict[str, Any] | None) -> None:
@@ -111,10 +102,15 @@ class RunDirectory:
         self.close()
 
 
-def read_run_id(run_dir: Path) -> int:
-    """The id of the run in a directory; raises RunError."""
-    path = run_dir / RUN_ID
+def settle(path: Path, config: RunConfig) -> int:
+    """Make a directory this run's, or see that it is: its config and its id, which is returned.
+
+    Raises:
+        RunError: it can't be written.
+    """
     try:
-        return int(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path}: {error}") from error
+        path.mkdir(parents=True, exist_ok=True)
+        write_whole(path / "config.toml", to_toml(config).encode())  # first: an id alone is a replay service's folder
+    except OSError as error:
+        raise RunError(f"run directory {path}: {error.strerror or error}") from error
+    return draw_run_id(path)

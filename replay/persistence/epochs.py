@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import threading
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 from common.errors import RunError
 from replay.core import ReplayCore
 from replay.persistence.journal import Journal
-from replay.persistence.storage import Mark, TornSnapshot, load_snapshot, read_mark, save_snapshot
+from replay.persistence.storage import Mark, TornSnapshot, is_whole, load_snapshot, read_mark, save_snapshot
 
 PART = "replay"
 
@@ -18,11 +19,12 @@ class ReplayEpochs:
     """Parts of epochs under `checkpoints/` of a folder, written one at a time in a thread of their own."""
 
     def __init__(self, folder: Path, run_id: int, journal: Journal | None = None) -> None:
-        self._folder = folder / "checkpoints"
+        self._folder = folder
         self._run_id = run_id
         self._journal = journal
         self._writer: threading.Thread | None = None
         self._number = -1
+        self._on_disk = False
         self._problem = ""
 
     def begin(self, core: ReplayCore, lock: threading.Condition, number: int, keep: list[int]) -> None:
@@ -37,22 +39,26 @@ class ReplayEpochs:
             if number == self._number:
                 return
             raise RunError(f"epoch {number}: epoch {self._number} is still being written")
-        path = self._folder / str(number) / PART
+        path = part_path(self._folder, number)
         with lock:
             try:
                 mark = Mark(self._run_id, 0 if self._journal is None else self._journal.roll())
             except OSError as error:
                 raise RunError(f"the journal can't be written: {error.strerror or error}") from error
-            snapshot = core.snapshot(number)
+            snapshot = core.snapshot(number, keep)
 
         def write() -> None:
             try:
                 save_snapshot(snapshot, lock, path, mark)
-                self._drop({number, *keep})
+                self._drop({number, *keep}, covered=keep)
+                self._on_disk = True
             except OSError as error:
                 self._problem = f"{path}: {error.strerror or error}"
+            except Exception as error:  # whatever it is, who asks must not take the part for written
+                self._problem = f"{path}: {type(error).__name__}: {error}"
+                raise
 
-        self._number, self._problem = number, ""
+        self._number, self._on_disk, self._problem = number, False, ""
         self._writer = threading.Thread(target=write, name=f"epoch {number}")
         self._writer.start()
 
@@ -67,9 +73,13 @@ class ReplayEpochs:
         self._writer.join(seconds)
         if self._writer.is_alive():
             return False
-        if self._problem:
-            raise RunError(self._problem)
+        if not self._on_disk:
+            raise RunError(self._problem or f"{part_path(self._folder, number)}: the writer has ended without a word")
         return True
+
+    def whole(self) -> list[int]:
+        """Numbers of the parts that are as they were written, in ascending order."""
+        return [number for number in part_numbers(self._folder) if is_whole(part_path(self._folder, number))]
 
     def restore(self, core: ReplayCore, number: int) -> tuple[int, str]:
         """Let a new core go on from the newest whole part up to epoch `number`, if there is one.
@@ -78,12 +88,13 @@ class ReplayEpochs:
             The first file of the journal that continues it, and what was found, in words.
 
         Raises:
-            UsageError: it belongs to another run, or to a table with other settings.
+            RunError: it belongs to another run.
+            UsageError: it belongs to a table with other settings.
         """
         torn = ""
-        for found in sorted((n for n in self._numbers() if n <= number), reverse=True):
+        for found in reversed([n for n in part_numbers(self._folder) if n <= number]):
             try:
-                mark = load_snapshot(core, self._folder / str(found) / PART, self._run_id)
+                mark = load_snapshot(core, part_path(self._folder, found), self._run_id)
             except TornSnapshot as error:
                 torn += f"passed over a torn snapshot, {error}; "
                 continue
@@ -91,22 +102,40 @@ class ReplayEpochs:
             return mark.journal, torn + text
         return 1, f"{torn}no epoch to restore"
 
-    def any(self) -> bool:
-        """True where the folder holds parts of epochs."""
-        return bool(self._numbers())
+    def clear(self) -> None:
+        """Drop every part."""
+        for number in part_numbers(self._folder):
+            self._remove(number)
 
     def close(self) -> None:
         """Wait for what is being written."""
         if self._writer is not None:
             self._writer.join()
 
-    def _numbers(self) -> list[int]:
-        return [int(path.parent.name) for path in self._folder.glob(f"*/{PART}") if path.parent.name.isdigit()]
+    def _drop(self, keep: set[int], covered: list[int]) -> None:
+        """Drop the other parts, and the journal that none of those that the learner has finished needs.
 
-    def _drop(self, keep: set[int]) -> None:
-        """Drop the other parts, and the journal that none of those kept needs."""
-        for number in set(self._numbers()) - keep:
-            shutil.rmtree(self._folder / str(number) / PART, ignore_errors=True)
-        if self._journal is not None:
-            marks = (read_mark(self._folder / str(number) / PART) for number in self._numbers())
+        covered: their numbers. While there are none, a learner that comes back begins with the journal's first file.
+        """
+        for number in set(part_numbers(self._folder)) - keep:
+            self._remove(number)
+        if self._journal is not None and covered:
+            marks = (read_mark(part_path(self._folder, number)) for number in part_numbers(self._folder))
             self._journal.drop(min(mark.journal for mark in marks if mark is not None))
+
+    def _remove(self, number: int) -> None:
+        path = part_path(self._folder, number)
+        shutil.rmtree(path, ignore_errors=True)
+        with contextlib.suppress(OSError):  # the learner's part may be there too
+            path.parent.rmdir()
+
+
+def part_path(folder: Path, number: int) -> Path:
+    """Where the replay service's part of an epoch is in a folder."""
+    return folder / "checkpoints" / str(number) / PART
+
+
+def part_numbers(folder: Path) -> list[int]:
+    """Numbers of the epochs that a folder holds parts of, in ascending order."""
+    found = (path.parent.name for path in (folder / "checkpoints").glob(f"*/{PART}"))
+    return sorted(int(name) for name in found if name.isdigit())

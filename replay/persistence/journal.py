@@ -25,10 +25,12 @@ from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
 from common.messaging.messages.sample import DrawRequest
+from common.process.run_ids import check_owner
 from replay.limiter import RateLimiter
 
 FORMAT = 1
 BEGIN, SEGMENT, DRAW, LIMITER, END = range(5)
+BEGIN_BYTES = 64  # more than the record that names a file holds
 ROLL_AT = 1 << 28  # bytes after which a new file is begun
 
 _HEADER = struct.Struct("<IIQQ")
@@ -160,13 +162,19 @@ def journal_files(folder: Path) -> list[int]:
     return sorted(int(path.stem) for path in folder.glob("*.log"))
 
 
+def drop_journal(folder: Path) -> None:
+    """Drop every file of a journal; raises OSError."""
+    for number in journal_files(folder):
+        _path(folder, number).unlink()
+
+
 def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record]:
     """The records of one file, but for the one that names it.
 
     Raises:
-        UsageError: the file belongs to another run.
+        UsageError: the file is of another format.
         TornFile: what follows the records given is no whole one.
-        RunError: it can't be read.
+        RunError: it can't be read, or belongs to another run.
     """
     path = _path(folder, number)
     try:
@@ -192,12 +200,25 @@ def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record]:
         raise RunError(f"{path}: {error.strerror or error}") from error
 
 
+def read_owner(folder: Path, number: int) -> int | None:
+    """The id of the run that a file belongs to; None where the file is torn before it tells."""
+    try:
+        with _path(folder, number).open("rb") as file:
+            header = file.read(_HEADER.size)
+            checksum, kind, place, length = _HEADER.unpack(header.ljust(_HEADER.size))
+            payload = file.read(min(length, BEGIN_BYTES))
+    except OSError as error:
+        raise RunError(f"{_path(folder, number)}: {error.strerror or error}") from error
+    if kind != BEGIN or _checksum(kind, number, place, payload) != checksum:
+        return None
+    return int(msgpack.unpackb(payload)[1])
+
+
 def _check_begin(path: Path, payload: bytes, run_id: int) -> None:
     version, found, _ = msgpack.unpackb(payload)
     if version != FORMAT:
         raise UsageError(f"{path}: format {version} of the journal, this program reads {FORMAT}")
-    if found != run_id:
-        raise UsageError(f"{path}: belongs to the run with id {found}, the learner's has {run_id}")
+    check_owner(path, found, run_id)
 
 
 def read_draw(payload: bytes) -> tuple[DrawRequest, NDArray[np.int64]]:

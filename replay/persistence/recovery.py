@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from common.errors import RunError
 from common.messaging import wire
 from common.messaging.messages.insert import SegmentReader
 from common.messaging.messages.sample import DrawRequest
+from common.process.files import cut_back
 from replay.core import ReplayCore
 from replay.persistence.journal import (
     DRAW,
@@ -32,8 +32,8 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
     A file that ends in a torn record, as a kill leaves it, is cut there.
 
     Raises:
-        UsageError: the journal belongs to another run.
-        RunError: files are missing, or carrying out gives something else than was taken down.
+        RunError: the journal belongs to another run, files are missing or too short, or carrying out gives something
+            else than was taken down.
     """
     before, draws = core.table.inserted, 0
     numbers = following_files(folder, first)
@@ -44,7 +44,7 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
         except TornFile as torn:
             if number != numbers[-1]:
                 raise
-            os.truncate(torn.path, torn.end)
+            cut_back(torn.path, torn.end)
     taken = core.table.inserted - before
     return first + len(numbers), f"{taken:,} transitions and {draws:,} batches from the journal"
 

@@ -14,13 +14,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgpack
+import msgspec
 import numpy as np
 
-from common.errors import BadMessage, UsageError
+from common.errors import BadMessage
 from common.messaging import wire
-from common.messaging.messages.sample import BatchReader, encode_batch
+from common.messaging.messages.sample import BatchReader, EpisodeRecord, encode_batch
 from common.process.files import PIECE, SyncedFile, measure, sync_folder, write_whole
-from common.types import Array
+from common.process.run_ids import check_owner
+from common.types import Array, EpisodeEnd
 from replay.core import CoreSnapshot, ReplayCore
 
 FRAMES_AT_ONCE = 256
@@ -80,7 +82,14 @@ def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path, mark: 
             file.write(piece.tobytes())
     files["frames"] = file.size, file.checksum
     replies = [bytes(encode_batch("", batch.frames, batch.columns(), drawn)) for batch, drawn in snapshot.replies]
-    state = {"books": snapshot.books, "table": meta, "replies": replies, "mark": mark, "files": files}
+    state = {
+        "books": snapshot.books,
+        "episodes": msgspec.to_builtins(snapshot.episodes),
+        "table": meta,
+        "replies": replies,
+        "mark": mark,
+        "files": files,
+    }
     packed = msgpack.packb(state)
     write_whole(part / STATE, zlib.crc32(packed).to_bytes(4, "little") + packed)
 
@@ -90,18 +99,20 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int) -> Mark:
 
     Raises:
         TornSnapshot: the folder is not a whole snapshot; the core is as before.
-        UsageError: it is a snapshot of another run, or of a table with other settings.
+        RunError: it is a snapshot of another run.
+        UsageError: it is one of a table with other settings.
     """
     state = _read_state(path / STATE)
-    if state["mark"][0] != run_id:
-        raise UsageError(f"{path}: belongs to the run with id {state['mark'][0]}, the learner's has {run_id}")
+    check_owner(path, state["mark"][0], run_id)
     arrays = {name: _read_array(path / f"{name}.npy", tuple(written)) for name, written in state["files"].items()}
     read = BatchReader(core.table.spec)
     try:
         replies = [read(wire.decode(payload, wire.ON_DISK)) for payload in state["replies"]]
     except BadMessage as error:
         raise TornSnapshot(f"{path / STATE}: {error}") from error
-    core.restore(state["books"], state["table"], arrays, replies)
+    listed = state["episodes"] if "episodes" in state else state["books"]["episodes"]  # where older versions have them
+    episodes = [EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in listed]
+    core.restore(state["books"], episodes, state["table"], arrays, replies)
     return Mark(*state["mark"])
 
 
@@ -111,6 +122,15 @@ def read_mark(path: Path) -> Mark | None:
         return Mark(*_read_state(path / STATE)["mark"])
     except TornSnapshot:
         return None
+
+
+def is_whole(path: Path) -> bool:
+    """True where the snapshot in `path` is as it was written; reads all of it."""
+    try:
+        state = _read_state(path / STATE)
+        return all(measure(path / f"{name}.npy") == tuple(written) for name, written in state["files"].items())
+    except (TornSnapshot, OSError):
+        return False
 
 
 def _read_state(path: Path) -> dict[str, Any]:

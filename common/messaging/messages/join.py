@@ -19,7 +19,8 @@ from common.settings.tables import to_tables, validated
 from common.types import EnvSpec
 
 Endpoints = Annotated[list[Name], Meta(max_length=16)]
-Epochs = Annotated[list[Updates], Meta(max_length=16)]
+MOST_EPOCHS = 16  # that are told of at once
+Epochs = Annotated[list[Updates], Meta(max_length=MOST_EPOCHS)]
 
 
 class Join(Body, frozen=True):

@@ -1,0 +1,326 @@
+"""Whose a run directory is, who works in it, and which epoch a run goes on from."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from samples import make_segment
+from test_epochs import CONFIG, save
+
+from common.errors import RunError, UsageError
+from common.messaging.joining import join
+from common.messaging.messages.join import Join
+from common.messaging.transport import Node, new_incarnation, open_session
+from common.process.files import cut_back
+from common.process.lifecycle import Stop
+from common.process.locks import INHERITED, RunLock
+from common.process.run_ids import RUN_ID, claim, draw_run_id, read_run_id
+from common.settings.options import RunOptions
+from common.types import EnvSpec
+from learner.reception import Reception
+from learner.records.epochs import go_back, save_epoch, whole_epochs
+from learner.records.run_directory import RunDirectory
+from learner.roster import Roster
+from learner.shared_epochs import SharedEpochs
+from replay.core import ReplayCore
+from replay.persistence.epochs import ReplayEpochs, part_path
+from replay.persistence.folder import ReplayFolder
+from replay.persistence.journal import Journal, journal_files
+
+SCRIPTS = Path(sysconfig.get_path("scripts"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def a_replay_folder(folder: Path, spec: EnvSpec, run_id: int = 5, epochs: tuple[int, ...] = (500, 1000)) -> None:
+    """What a replay service of the run leaves: parts of epochs and a journal."""
+    core = ReplayCore(CONFIG, spec, Journal(folder / "journal", run_id, 1, keep=True))
+    written = ReplayEpochs(folder, run_id)
+    for number in epochs:
+        core.insert(make_segment(spec, number))
+        save(core, written, number, *epochs)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_another_run_s_folder_is_refused_and_stays_as_it_is(named: bool, spec: EnvSpec, tmp_path: Path) -> None:
+    a_replay_folder(tmp_path, spec, run_id=5)
+    if named:
+        claim(tmp_path, 5)
+    before = contents(tmp_path)
+    for resume in (False, True):
+        with pytest.raises(RunError, match="belongs to the run with id 5, the learner's has 6"):
+            ReplayFolder(tmp_path, 6).check(resume=resume)
+    assert contents(tmp_path) == before
+    with pytest.raises(UsageError, match="holds a run already"):
+        ReplayFolder(tmp_path, 5).check(resume=False)
+    assert ReplayFolder(tmp_path, 5).check(resume=True) == f"goes on in {tmp_path}"
+
+
+def test_a_journal_alone_tells_whose_it_is(spec: EnvSpec, tmp_path: Path) -> None:
+    a_replay_folder(tmp_path, spec, run_id=5, epochs=())
+    with pytest.raises(RunError, match="journal: belongs to the run with id 5"):
+        ReplayFolder(tmp_path, 6).check(resume=True)
+
+
+def test_parts_of_an_unknown_run_are_refused(tmp_path: Path) -> None:
+    part_path(tmp_path, 500).mkdir(parents=True)
+    with pytest.raises(RunError, match="do not tell which run"):
+        ReplayFolder(tmp_path, 5).check(resume=True)
+
+
+def test_a_new_folder_is_the_run_s_from_its_first_write(tmp_path: Path) -> None:
+    folder = ReplayFolder(tmp_path / "new", 5)
+    assert folder.check(resume=True).startswith("starts: ")
+    assert not folder.path.exists()
+    with folder.lock():
+        assert read_run_id(folder.path) == 5
+        with pytest.raises(RunError, match=rf"in use by coop-replay on .* \(pid {os.getpid()}\)"):
+            folder.lock()
+    with pytest.raises(RunError, match="belongs to the run with id 5"):
+        ReplayFolder(folder.path, 6).lock()
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from common.process.locks import RunLock
+with RunLock(Path(sys.argv[1]), "coop-lockstep", ("learner", "replay")):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_live_run_directory_is_locked_and_free_at_death(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        before = contents(tmp_path)
+        for roles in (("learner",), ("replay",), ("learner", "replay")):
+            with pytest.raises(RunError) as refused:
+                RunLock(tmp_path, "coop-learner", roles)
+            text = str(refused.value)
+            assert text.startswith(f"run directory {tmp_path}: in use by coop-lockstep on ")
+            assert text.endswith(f" (pid {holder.pid})")
+        assert contents(tmp_path) == before
+        holder.send_signal(signal.SIGKILL)
+        holder.wait(20)
+    with (
+        RunLock(tmp_path, "coop-learner", ("learner",)),
+        RunLock(tmp_path, "coop-replay", ("replay",)),
+        pytest.raises(RunError, match="in use by coop-replay"),
+    ):
+        RunLock(tmp_path, "coop-local", ("replay", "learner"))
+
+
+def test_a_supervisor_s_locks_are_its_children_s_too(tmp_path: Path) -> None:
+    code = HOLD.replace("time.sleep(600)", "")
+    with RunLock(tmp_path, "coop-local", ("learner", "replay")) as lock:
+        command = [sys.executable, "-c", code, str(tmp_path)]
+        told = {**os.environ, INHERITED: ",".join(map(str, lock.descriptors))}
+        child = subprocess.run(
+            command, pass_fds=lock.descriptors, env=told, capture_output=True, text=True, check=False
+        )
+        assert (child.returncode, child.stdout) == (0, "held\n"), child.stderr
+        stranger = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert f"in use by coop-local on {os.uname().nodename} (pid {os.getpid()})" in stranger.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "flags"),
+    [
+        ("coop-learner", ["--listen", "tcp/127.0.0.1:0"]),
+        ("coop-local", []),
+        ("coop-lockstep", []),
+    ],
+)
+def test_commands_respect_the_lock(name: str, flags: list[str], tmp_path: Path) -> None:
+    with RunLock(tmp_path, "coop-learner", ("learner",)):
+        before = contents(tmp_path)
+        command = [str(SCRIPTS / name), "--run-dir", str(tmp_path), "--resume", *flags]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+        place = f"coop-learner on {os.uname().nodename} (pid {os.getpid()})"
+        assert done.stderr == f"{name}: error: run directory {tmp_path}: in use by {place}\n"
+        assert done.returncode == 1
+        assert contents(tmp_path) == before
+
+
+def test_a_run_id_is_drawn_once(tmp_path: Path) -> None:
+    first = draw_run_id(tmp_path)
+    assert draw_run_id(tmp_path) == first
+    claim(tmp_path, first)
+    with pytest.raises(RunError, match="belongs to the run with id"):
+        claim(tmp_path, first + 1)
+
+
+def test_resume_without_a_run_starts_and_another_run_is_refused(tmp_path: Path) -> None:
+    options = RunOptions(resume=True, run_dir=tmp_path / "run")
+    assert options.directory() == tmp_path / "run"
+    RunDirectory(tmp_path / "run", options.run_config()).close()
+    assert options.directory() == tmp_path / "run"
+    for other, words in (
+        (replace(options, seed=1), "whose seed is 0"),
+        (replace(options, run="b"), "whose run is coop"),
+    ):
+        with pytest.raises(RunError, match=words):
+            other.directory()
+    with pytest.raises(UsageError, match="total_steps = 7"):
+        replace(options, total_steps=7000, replay=replace(options.replay, start=7)).directory()
+    claim(tmp_path / "theirs", 5)
+    with pytest.raises(RunError, match="a replay service's, of the run with id 5"):
+        replace(options, run_dir=tmp_path / "theirs").directory()
+    with pytest.raises(UsageError, match="holds a run already"):
+        replace(options, resume=False).directory()
+
+
+def offer(*epochs: int, serving: bool = False, incarnation: int = 3) -> Join:
+    return Join("replay", incarnation, ["tcp/h:1"], epochs=list(epochs), serving=serving)
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "number"),
+    [
+        ((500, 1000), offer(500, 1000), 1000),
+        ((500, 1000), offer(0, 500, 1500), 500),
+        ((500, 1000), offer(serving=True), 1000),
+        ((), offer(), 0),
+        ((), offer(500), 0),
+    ],
+)
+def test_the_newest_epoch_that_both_hold(mine: tuple[int, ...], theirs: Join, number: int) -> None:
+    epochs = SharedEpochs(mine, "run")
+    assert epochs.offered(theirs) == (number, False)
+    assert epochs.wait(Stop()) == number
+    epochs.finished(2000)
+    assert epochs.offered(offer(500, 2000)) == (2000, False), "one that comes back in the middle of the run"
+
+
+def test_no_epoch_in_common() -> None:
+    epochs = SharedEpochs((500, 1000), "runs/a")
+    words = (
+        rf"runs/a holds epochs 500, 1000, the replay service on \S+ \(pid {os.getpid()}\) holds none; "
+        "with --restart the training begins anew"
+    )
+    with pytest.raises(RunError, match=words):
+        epochs.offered(offer())
+    with pytest.raises(RunError, match=words):
+        epochs.wait(Stop())
+    restarted = SharedEpochs((500, 1000), "runs/a", restart=True)
+    assert restarted.offered(offer(1500)) == (0, True)
+    assert restarted.wait(Stop()) == 0
+    assert restarted.offered(offer(incarnation=4)) == (0, False), "one that comes later begins with what it holds"
+    stop = Stop()
+    stop.set("interrupted")
+    assert SharedEpochs((500,), "runs/a").wait(stop) is None
+
+
+def test_the_learner_goes_back_to_the_epoch_that_is_chosen(tmp_path: Path) -> None:
+    for number in (500, 1000):
+        save_epoch(tmp_path, number, {"updates": number}, lambda _: None)
+    (tmp_path / "checkpoints" / "1000" / "learner.pt").write_bytes(b"torn")
+    assert whole_epochs(tmp_path) == [500]
+    assert go_back(tmp_path, 500) == {"updates": 500}
+    assert not (tmp_path / "checkpoints" / "1000").exists()
+    assert go_back(tmp_path, 0) is None
+    assert not list((tmp_path / "checkpoints").iterdir())
+
+
+def serve_replay(endpoint: str, folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    """`coop-replay` in a folder, until it ends by itself or has said that it serves, when it is interrupted."""
+    command = [str(SCRIPTS / "coop-replay"), "--run", "test", "--connect", endpoint, "--run-dir", str(folder), *flags]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        timer = threading.Timer(60, process.kill)
+        timer.start()
+        assert process.stdout is not None
+        out = []
+        for line in process.stdout:
+            out.append(line)
+            if "epoch" in line:
+                process.send_signal(signal.SIGINT)
+        assert process.stderr is not None
+        err = process.stderr.read()
+        process.wait()
+        timer.cancel()
+    return subprocess.CompletedProcess(command, process.returncode, "".join(out), err)
+
+
+@pytest.fixture
+def learner(endpoint: str, spec: EnvSpec) -> Callable[..., SharedEpochs]:
+    """Makes the reception of a learner that holds the given epochs."""
+
+    def receive(node: Node, *held: int, restart: bool = False) -> SharedEpochs:
+        epochs = SharedEpochs(held, "runs/a", restart=restart)
+        Reception(node, CONFIG, spec, "layout", 5, epochs, Roster())
+        return epochs
+
+    return receive
+
+
+def test_a_replay_service_refuses_restores_and_begins_anew(
+    endpoint: str, spec: EnvSpec, tmp_path: Path, learner: Callable[..., SharedEpochs]
+) -> None:
+    theirs, ours = tmp_path / "theirs", tmp_path / "ours"
+    a_replay_folder(theirs, spec, run_id=6)
+    a_replay_folder(ours, spec, run_id=5)
+    before = contents(theirs)
+    with Node(open_session((endpoint,)), "test", "learner", new_incarnation()) as node:
+        learner(node, 500, 1000, 1500)
+        refused = serve_replay(endpoint, theirs, "--resume")
+        assert refused.returncode == 1
+        assert "belongs to the run with id 6, the learner's has 5" in refused.stderr
+        assert contents(theirs) == before
+        done = serve_replay(endpoint, ours, "--resume")
+        assert "restored epoch 1000" in done.stdout, done.stderr
+        assert (ours / RUN_ID).read_text() == "5\n"
+    shutil.rmtree(part_path(ours, 1000).parent)
+    for restart in (False, True):
+        with Node(open_session((endpoint,)), "test", "learner", new_incarnation()) as node:
+            learner(node, 1000, restart=restart)
+            done = serve_replay(endpoint, ours, "--resume")
+            if restart:
+                assert "no epoch to restore" in done.stdout, done.stderr
+                assert not list((ours / "checkpoints").iterdir())
+                assert not journal_files(ours / "journal")
+            else:
+                assert done.returncode == 1
+                assert "no epoch to go on from: runs/a holds epochs 1000, the replay service on " in done.stderr
+                assert "holds epochs 500; with --restart" in done.stderr
+                assert part_path(ours, 500).exists()
+
+
+def test_who_only_asks_takes_nobody_s_place(nodes: tuple[Node, Node], learner: Callable[..., SharedEpochs]) -> None:
+    node, other = nodes
+    epochs = learner(node, 500)
+    assert join(other, Stop(), Join("replay", 1, []), (), 5) is not None
+    stop = Stop()
+    stop.set("enough")
+    assert epochs.wait(stop) is None, "nothing is decided by a question"
+    joined = join(other, Stop(), Join("replay", 1, ["tcp/h:1"], epochs=[500]), (), 5)
+    assert joined is not None
+    assert (joined.epoch, joined.replay_endpoints) == (500, ["tcp/h:1"])
+    again = join(other, Stop(), Join("replay", 2, []), (), 5)
+    assert again is not None
+    assert again.replay_endpoints == ["tcp/h:1"]
+
+
+def test_a_file_is_never_lengthened(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.csv"
+    path.write_bytes(b"twelve bytes")
+    with pytest.raises(RunError, match="has 12 bytes, and should have at least 13"):
+        cut_back(path, 13)
+    assert path.read_bytes() == b"twelve bytes"
+    cut_back(path, 6)
+    assert path.read_bytes() == b"twelve"
+    config = RunOptions().run_config()
+    with pytest.raises(RunError, match="has 6 bytes, and should have at least 99"):
+        RunDirectory(tmp_path, config, {"episodes.csv": 99})
+    assert path.read_bytes() == b"twelve"
