@@ -70,7 +70,7 @@ def test_resume_starts_goes_on_or_refuses(tmp_path: Path) -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         return done.returncode, done.stdout, done.stderr
 
-    short = ("--total-steps", "300", "--replay.start", "40")
+    short = ("--total-steps", "300", "--replay.learning-starts", "40")
     status, out, _ = resume(*short)
     assert (status, out.splitlines()[0]) == (0, f"starts in {tmp_path / 'a'}: there is no run there yet")
     status, out, _ = resume(*short)
