@@ -173,7 +173,7 @@ def test_resume_without_a_run_starts_and_another_run_is_refused(tmp_path: Path) 
     ):
         with pytest.raises(RunError, match=words):
             other.directory()
-    with pytest.raises(UsageError, match="learner.gamma = 0.5, but 0.99"):
+    with pytest.raises(UsageError, match=r"learner\.gamma = 0\.5, but 0\.99"):
         replace(options, learner=replace(options.learner, gamma=0.5)).directory()
     claim(tmp_path / "theirs", 5)
     with pytest.raises(RunError, match="a replay service's, of the run with id 5"):
