@@ -80,11 +80,12 @@ class Roles:
 
 
 @contextmanager
-def running(roles: Roles) -> Iterator[Roles]:
-    """Every role started; those that are left at the end are killed."""
+def running(roles: Roles, *later: str) -> Iterator[Roles]:
+    """Every role started but those that come `later`; those that are left at the end are killed."""
     try:
-        for process in roles.processes.values():
-            process.start()
+        for name, process in roles.processes.items():
+            if name not in later:
+                process.start()
         yield roles
     finally:
         for process in roles.processes.values():

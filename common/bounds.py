@@ -19,7 +19,7 @@ MAX_COUNT = 2**40  # steps that an actor played, segments of a stream, episodes:
 MAX_RATIO = 1e6  # updates per environment step; with MAX_STEPS, updates stay below 2^62
 MAX_UPDATES = 2**62
 MAX_TOLERANCE = 1e12  # environment steps
-MAX_MAGNITUDE = 1e9  # of a reward and of an observation: what is larger teaches a network nothing
+MAX_MAGNITUDE = 1e6  # of a reward and of an observation: what is larger teaches a network nothing
 MAX_FLOAT32 = 3.4028234663852886e38
 MAX_INTEGER = 2**63 - 1  # of TOML, and of the counters on the wire
 

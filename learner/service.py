@@ -119,6 +119,7 @@ class LearnerService:
             "waiting": self._samples.waiting,
             "warning": telemetry.warning(self._agent),
             "bad_messages": self._node.bad_messages,
+            "faults": self._node.faults.count,
             "connected": self._node.presence.counts(),
             "missing": self._node.presence.missing(),
         }

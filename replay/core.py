@@ -102,6 +102,7 @@ class ReplayCore:
         )
         self.recorder: Recorder = recorder or Unrecorded()
         self.batch_size = config.learner.batch_size
+        self._total_steps = config.total_steps
         self.drawn = 0
         self.duplicates = 0
         self.problem = ""
@@ -116,8 +117,12 @@ class ReplayCore:
 
     @property
     def lost(self) -> int:
-        """Transitions that actors hold a receipt for and that never came here; 0 unless something is broken."""
-        return sum(max(0, account.acked - account.accepted) for account in self._accounts.values())
+        """Transitions that actors hold a receipt for and that never came here; 0 unless something is broken.
+
+        At most those of the whole run: an actor that says more is not to be believed.
+        """
+        lost = sum(max(0, account.acked - account.accepted) for account in self._accounts.values())
+        return min(lost, self._total_steps)
 
     @property
     def holes(self) -> int:

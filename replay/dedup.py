@@ -6,7 +6,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
-from common.bounds import MAX_GAPS, MAX_STREAMS
+from common.bounds import MAX_GAPS, MAX_INTEGER, MAX_STREAMS
 
 
 @dataclass(slots=True)
@@ -65,7 +65,7 @@ class SeenWindow:
     def state(self) -> dict[str, Any]:
         """Everything seen, msgpack-able, streams in order of last use."""
         return {
-            "forgotten": self._forgotten,
+            "forgotten": min(self._forgotten, MAX_INTEGER),
             "closed": sorted(self._closed),
             "streams": [[*key, seen.highest, list(seen.gaps)] for key, seen in self._streams.items()],
         }

@@ -7,12 +7,14 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import make_segment
 
+from common.bounds import MAX_AHEAD, MAX_COUNT, MAX_FLOAT32, MAX_INTEGER, MAX_MAGNITUDE, MAX_STREAMS, MAX_UPDATES
 from common.errors import BadMessage, RunError
 from common.messaging import wire
 from common.messaging.messages.answers import Ack, Error, Retry
@@ -20,7 +22,7 @@ from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import OPTIONAL, SegmentReader, encode_segment
 from common.messaging.messages.join import Join, Joined, Leave
 from common.messaging.messages.limits import Limit, Limits
-from common.messaging.messages.sample import MAX_AHEAD, BatchReader, Drawn, DrawRequest, EpisodeRecord, encode_batch
+from common.messaging.messages.sample import BatchReader, Drawn, DrawRequest, EpisodeRecord, encode_batch
 from common.messaging.messages.stats import ReplayStats
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current, Role, Weights
@@ -132,6 +134,8 @@ FIELDS = [
     ("join", "role", "boss"),
     ("join", "role", 5),
     ("join", "incarnation", 2**63),
+    ("join", "index", -2),
+    ("join", "index", MAX_COUNT + 1),
     ("join", "endpoints", ["x"] * 17),
     ("join", "endpoints", ["x" * 257]),
     ("join", "origin", ["h", -1]),
@@ -156,6 +160,17 @@ FIELDS = [
     ("insert", "carried", 6),
     ("insert", "carried", -1),
     ("insert", "acked", 1.0),
+    ("insert", "acked", MAX_COUNT + 1),
+    ("insert", "sequence", MAX_COUNT + 1),
+    ("insert", "carried", 1025),
+    ("insert", "episodes", [[3, 1e300, *END[2:]]]),
+    ("insert", "episodes", [[*END[:2], 0, *END[3:]]]),
+    ("insert", "episodes", [[*END[:2], MAX_COUNT + 1, *END[3:]]]),
+    ("insert", "episodes", [[*END[:3], 1.5, *END[4:]]]),
+    ("insert", "episodes", [[*END[:4], 1e300, *END[5:]]]),
+    ("insert", "episodes", [[*END[:6], MAX_UPDATES + 1]]),
+    ("insert", "episodes", [END, END]),
+    ("insert", "episodes", [[2, *END[1:]], [1, *END[1:]]]),
     ("insert", "episodes", [END[:-1]]),
     ("insert", "episodes", [[4, *END[1:]]]),
     ("insert", "episodes", [[3, math.nan, *END[2:]]]),
@@ -169,6 +184,9 @@ FIELDS = [
     ("sample", "priorities", [[3]]),
     ("sample", "priorities", [[3, -0.5]]),
     ("sample", "priorities", [[3, float("inf")]]),
+    ("sample", "priorities", [[3, 1e300]]),
+    ("sample", "base", MAX_UPDATES + 1),
+    ("sample", "episodes_from", MAX_COUNT + 1),
     ("batch", "sequence", -1),
     ("batch", "episodes", [RECORD[:-1]]),
     ("batch", "episodes", [[*RECORD[:3], [3, math.inf, *END[2:]]]]),
@@ -192,6 +210,8 @@ FIELDS = [
     ("batch", "planned", -1),
     ("limit", "ratio", 0.0),
     ("limit", "ratio", math.nan),
+    ("limit", "ratio", 1e7),
+    ("limit", "tolerance", 1e13),
     ("limit", "tolerance", -1),
     ("limits", "drawn", "many"),
 ]
@@ -238,6 +258,12 @@ ARRAYS = [
     ("insert", "actions", np.array([0, 1, -1, 0], np.int32), "actions"),
     ("insert", "rewards", np.array([0, np.nan, 0, 0], np.float32), "rewards"),
     ("insert", "rewards", np.array([0, 0, 0, -np.inf], np.float32), "rewards"),
+    ("insert", "rewards", np.array([0, 0, 0, 1e7], np.float32), "rewards"),
+    ("insert", "frames", np.full((5, 4), -1e7, np.float32), "frames"),
+    ("insert", "frames", np.full((5, 4), np.nan, np.float32), "frames"),
+    ("insert", "param_version", np.array([0, 0, MAX_UPDATES + 1, 0]), "param_version"),
+    ("insert", "span", np.zeros(4, np.uint8), "span"),
+    ("batch", "weights", np.full(8, -1, np.float32), "weights"),
     ("insert", "terminated", np.array([0, 1, 2, 0], np.uint8).view(np.bool_), "terminated"),
     ("insert", "param_version", np.array([0, 0, -3, 0]), "param_version"),
     ("batch", "frames", np.zeros((5, 4), np.uint8), "frames"),
@@ -259,6 +285,31 @@ def test_a_bad_array_is_refused_by_name(kind: str, array: str, value: Any, named
     with pytest.raises(BadMessage) as caught:
         READERS[kind][1](replace(message, arrays={**message.arrays, array: value}))
     assert caught.value.field == f"arrays.{named}"
+
+
+def test_the_largest_numbers_are_taken() -> None:
+    end = EpisodeEnd(3, -1e15, MAX_COUNT, 1.0, MAX_FLOAT32, -MAX_FLOAT32, MAX_UPDATES)
+    changes = {
+        "incarnation": MAX_INTEGER,
+        "stream": MAX_STREAMS - 1,
+        "sequence": MAX_COUNT,
+        "acked": MAX_COUNT,
+        "carried": 5,
+        "rewards": np.full(4, -MAX_MAGNITUDE, np.float32),
+        "param_version": np.full(4, MAX_UPDATES),
+        "episodes": (end,),
+    }
+    segment = msgspec.structs.replace(make_segment(SPEC), **changes)
+    back = SegmentReader(SPEC)(wire.decode(bytes(encode_segment("r", segment))))
+    assert back.episodes == (end,)
+    assert (back.acked, back.sequence, back.stream) == (MAX_COUNT, MAX_COUNT, MAX_STREAMS - 1)
+
+
+def test_a_refusal_names_what_was_found() -> None:
+    message = _valid("join")
+    with pytest.raises(BadMessage) as caught:
+        Join.decode(replace(message, fields={**message.fields, "index": -2}))
+    assert str(caught.value) == "fields.index: -2; expected int >= -1"
 
 
 @pytest.mark.parametrize("kind", READERS)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from samples import make_segment
 
+from common.bounds import MAX_COUNT
 from common.errors import RunError
 from common.messaging.clients import InsertClient, SampleClient
 from common.messaging.keys import replay_key
@@ -135,6 +136,21 @@ def test_lost_counts_receipts_without_transitions(spec: EnvSpec) -> None:
     assert core.lost == 0, "4 taken then, 4 more now"
     core.insert(make_segment(spec, 3, acked=16))
     assert core.lost == 4
+
+
+def test_a_liar_can_t_make_up_more_losses_than_the_run_has_steps(
+    nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path
+) -> None:
+    server, client = nodes
+    _serve(server, ReplayCore(CONFIG, spec), tmp_path, client)
+    for incarnation in range(3):
+        payload = encode_segment("test", make_segment(spec, incarnation=incarnation, acked=MAX_COUNT))
+        client.ask(replay_key(client, "insert"), payload)
+    payload = encode_segment("test", make_segment(spec, incarnation=9, acked=2**63 - 1))
+    with pytest.raises(Refused, match="acked"):
+        client.ask(replay_key(client, "insert"), payload)
+    stats = ReplayStats.decode(client.ask(replay_key(client, "stats"), StatsQuestion().encode("test")))
+    assert stats.lost == CONFIG.total_steps
 
 
 def test_clients_survive_a_service_that_goes_away(endpoint: str, spec: EnvSpec, tmp_path: Path) -> None:
