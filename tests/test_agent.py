@@ -186,6 +186,29 @@ def test_optimizers_are_pytorchs(
             optimizer.load_state(state)
 
 
+def test_s_is_drawn_from_a_normal_distribution_of_the_falling_rate() -> None:
+    agent = Agent(replace(_config("coop"), edl=EdlSettings(rate=0.2, decay=0.5, decay_every=100, noise="normal")), SPEC)
+    drawn = np.array([agent.update(batch).s / (0.2 * 0.5 ** (k / 100)) for k, batch in enumerate(_batches(300))])
+    assert abs(drawn.mean()) < 0.2  # three standard deviations of the mean of 300
+    assert 0.85 < drawn.std() < 1.15
+    assert 100 < (drawn < 0).sum() < 200
+    constant = Agent(replace(_config("coop"), edl=EdlSettings(rate=0.2)), SPEC)
+    assert constant.update(_batches(1)[0]).s == 0.2
+
+
+def test_the_learning_rate_falls_over_the_run() -> None:
+    config = _config("g-coop", optimizer="sgd", learning_rate=1e-3, learning_rate_final=0.01, swap_every=1000)
+    config = replace(config, total_steps=140, replay=replace(config.replay, start=100, capacity=100))
+    agent, batch = Agent(config, SPEC), _batches(1)[0]
+    assert config.planned_updates == 40
+    for update in range(41):
+        before = agent.networks[0].snapshot()
+        agent.update(batch)
+        moved = before - agent.networks[0].snapshot()
+        expected = 1e-3 * 0.01 ** (update / 40) * agent.optimizers[0].gradient
+        np.testing.assert_allclose(moved, expected, rtol=1e-3, atol=1e-7)
+
+
 def test_a_restored_agent_goes_on_to_the_bit() -> None:
     config = replace(_config("coop"), edl=EdlSettings(noise="normal"))
     batches = _batches(40)

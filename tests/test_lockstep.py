@@ -1,17 +1,22 @@
 """Lockstep runs: the same bytes for a seed, also through a kill -9, for every method."""
 
 import json
+import shutil
 import subprocess
 import sysconfig
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import msgpack
+import numpy as np
 import pytest
+import torch
 
 from common.settings.config import Method
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
+from learner.records.epochs import load_learner
 from learner.records.run_directory import RunDirectory
 
 COMMAND = str(Path(sysconfig.get_path("scripts")) / "coop-lockstep")
@@ -132,3 +137,45 @@ def test_a_target_ends_the_run(flags: list[str], column: str, value: int, tmp_pa
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary[column] == value
     assert summary["exit"] == f"complete: {name} reached"
+
+
+@pytest.mark.parametrize("program", ["coop-lockstep", "coop-local"])
+def test_a_run_that_diverges_ends_and_says_so(program: str, tmp_path: Path) -> None:
+    flags = ["--total-steps", "2000", "--checkpoint-every", "100", "--learner.learning-rate", "1e30"]
+    command = [Path(COMMAND).with_name(program), *flags, "--run-dir", tmp_path / "run"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "diverged: " in done.stderr
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["exit"].startswith("diverged: ")
+    assert "not finite at update" in summary["exit"]
+    assert summary["updates"] < 200  # one interval of metrics
+    assert not list((tmp_path / "run").glob("checkpoints/*/DONE"))
+
+
+def test_an_epoch_of_the_old_format_goes_on_to_the_byte(tmp_path: Path) -> None:
+    """Until all runs shared one format, a lockstep epoch held its table as plain arrays and its actions beside them."""
+    whole, run = _run(tmp_path / "whole", "coop", 500), Lockstep(base_config(["--method", "coop"]))
+    with RunDirectory(tmp_path / "run", run.config) as directory:
+        for _ in range(300):
+            _play(run, directory)
+        run.save(directory)
+        epoch = tmp_path / "run" / "checkpoints" / str(run.agent.updates)
+        state = load_learner(epoch)
+        meta, arrays = run._table.state()
+    shutil.rmtree(epoch / "replay")
+    (epoch / "replay").mkdir()
+    played = state.pop("player")
+    old = {"agent": state["agent"], "telemetry": state["telemetry"], "step": 300, "policy": played["policy"]}
+    torch.save({**old, "sizes": state["sizes"]}, epoch / "learner.pt")
+    (epoch / "replay" / "state.msgpack").write_bytes(msgpack.packb({"table": meta}))
+    for name, array in {**arrays, "played": played["actions"].numpy()}.items():
+        np.save(epoch / "replay" / f"{name}.npy", array)
+    resumed = Lockstep(run.config)
+    sizes = resumed.restore(epoch)
+    with RunDirectory(tmp_path / "run", run.config, sizes) as directory:
+        for _ in range(200):
+            _play(resumed, directory)
+    episodes = [(tmp_path / name / "episodes.csv").read_bytes() for name in ("whole", "run")]
+    assert episodes[0] == episodes[1]
+    assert torch.equal(whole.agent.networks[0].flat, resumed.agent.networks[0].flat)

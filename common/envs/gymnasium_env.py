@@ -12,6 +12,7 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
 from common.envs import catch as _registers_catch  # noqa: F401
+from common.envs import corridor as _registers_corridor  # noqa: F401
 from common.envs.pictures import SIDE, Shrink
 from common.envs.protocol import Steps
 from common.errors import UsageError

@@ -1,0 +1,98 @@
+"""Every method finds the optimal action values of a small problem: in lockstep, and coop over the real topology."""
+
+import csv
+import json
+import subprocess
+import sysconfig
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from common.envs.corridor import CELLS, LEFT, RIGHT, optimal_values
+from common.settings import schedules
+from common.settings.config import Method, RunConfig
+from common.settings.tables import load_tables, resolve
+from experiments.lockstep import Lockstep
+from learner.agent import Agent
+from learner.records.epochs import load_learner, newest_epoch
+
+CONFIG = """
+total_steps = 1200
+[env]
+id = "coop/Corridor-v0"
+[network]
+kind = "mlp"
+hidden = [32]
+[learner]
+gamma = 0.8
+optimizer = "adam"
+learning_rate = 3e-3
+learning_rate_final = 0.03
+swap_every = 20
+publish_every = 2
+[edl]
+rate = 0.05
+decay = 0.5
+decay_every = 500
+[replay]
+capacity = 500
+start = 64
+tolerance = 16
+[actor]
+epsilon_start = 1.0
+epsilon_final = 0.5
+epsilon_steps = 1000
+segment_steps = 4
+"""
+BOUND = 0.01  # of |Q - Q*|; Q* lies between 0.26 and 1
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> RunConfig:
+    (tmp_path / "corridor.toml").write_text(CONFIG)
+    return resolve(load_tables(None, tmp_path / "corridor.toml"))
+
+
+def values(agent: Agent) -> list[NDArray[np.float32]]:
+    """What both networks say of every cell and action, float32 [cells, actions]."""
+    return [q.numpy() for q in agent.q_values(np.eye(CELLS, dtype=np.float32))]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
+def test_optimal_values_are_found_in_lockstep(method: Method, seed: int, config: RunConfig) -> None:
+    run = Lockstep(replace(config, method=method, seed=seed))
+    while not run.trainer.outcome():
+        for _ in run.play():
+            pass
+    run.env.close()
+    assert run.trainer.outcome() == "complete"
+    for q in values(run.agent):
+        np.testing.assert_allclose(q, optimal_values(config.learner.gamma), atol=BOUND)
+        assert (q[:, RIGHT] > q[:, LEFT]).all()
+
+
+def test_coop_finds_optimal_values_over_the_real_topology(config: RunConfig, tmp_path: Path) -> None:
+    command = [Path(sysconfig.get_path("scripts")) / "coop-local", "--config", tmp_path / "corridor.toml"]
+    flags = ["--method", "coop", "--actors", "2", "--run-dir", tmp_path / "run"]
+    subprocess.run([*command, *flags], capture_output=True, timeout=120, check=True)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["exit"] == "complete"
+    assert summary["transitions_lost"] == 0
+    # Both actors explore as the whole run asks for, not as their own half of the steps would.
+    with (tmp_path / "run" / "episodes.csv").open(encoding="utf-8") as file:
+        told = [(int(row["env_step"]), float(row["epsilon"])) for row in csv.DictReader(file)]
+    late = [(step, epsilon) for step, epsilon in told if step > 600]
+    assert len(late) > 20
+    for step, epsilon in late:
+        assert abs(epsilon - schedules.epsilon(config.actor, step)) < 0.04
+    epoch = newest_epoch(tmp_path / "run")
+    assert epoch is not None
+    run = Lockstep(replace(config, method="coop"))  # for a network of the right shape
+    run.agent.load_state(load_learner(epoch)["agent"])
+    run.env.close()
+    for q in values(run.agent):
+        np.testing.assert_allclose(q, optimal_values(config.learner.gamma), atol=BOUND)
