@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+
+import msgspec
 
 from common.errors import PeerLost, RunError
 from common.messaging.joining import Membership, join
@@ -79,7 +81,7 @@ def _serve(node: Node, stop: Stop, options: ReplayOptions, folder: ReplayFolder,
     def learned(_: Joined, asked: float) -> None:
         service.confirm(asked + LEASE)
 
-    with Membership(node, stop, replace(request, serving=True), joined, options.patience, learned):
+    with Membership(node, stop, msgspec.structs.replace(request, serving=True), joined, options.patience, learned):
         service.start()
         service.run(stop)
 

@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from samples import make_segment
 
-from common.messaging.experience import Drawn, EpisodeRecord
+from common.messaging.messages.sample import Drawn, EpisodeRecord
 from common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
 from common.types import Batch, EnvSpec, EpisodeEnd
 from learner.agent import Agent
@@ -126,7 +127,7 @@ def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
 def test_when_a_run_is_over(config: dict[str, float], told: Drawn, updates: int, outcome: str) -> None:
     trainer, source = Trainer(Agent(replace(CONFIG, **config), SPEC), 0.0), batches()  # type: ignore[arg-type]
     for _ in range(updates - 1):
-        trainer.train(next(source), replace(told, episodes=()), 0.0)
+        trainer.train(next(source), msgspec.structs.replace(told, episodes=()), 0.0)
     assert trainer.outcome() == ""
     trainer.train(next(source), told, 0.0)
     assert trainer.outcome() == outcome
@@ -195,7 +196,7 @@ def test_a_restored_trainer_goes_on() -> None:
     second = Trainer(Agent(replace(CONFIG, checkpoint_every=5), SPEC), 1_000.0)
     second.load_state(first.state(130.0), 1_000.0)
     assert second.seconds(1_010.0) == 40.0  # 30 before, 10 since
-    assert second.drawn == replace(drawn(300), episodes=())
+    assert second.drawn == msgspec.structs.replace(drawn(300), episodes=())
     assert not second.epoch_due()
     batch = next(source)
     for trainer in (first, second):

@@ -41,7 +41,9 @@ class Corridor(gymnasium.Env[NDArray[np.float32], np.int64]):
         return self._observation(), 0.0, False, False, {}
 
     def _observation(self) -> NDArray[np.float32]:
-        return np.eye(CELLS, dtype=np.float32)[self._cell]
+        observation = np.zeros(CELLS, np.float32)
+        observation[self._cell] = 1.0
+        return observation
 
 
 def optimal_values(gamma: float) -> NDArray[np.float64]:
