@@ -89,7 +89,7 @@ def sizes_table(study: Study) -> ResultTable:
     """The return of every method with the smaller and with the larger half of the capacities."""
     rows: list[list[Value]] = []
     values = by_seed(study, score)
-    for others in [*other_settings(study, CAPACITY), None]:
+    for others in _slices(study):
         small, large = _halves(study, others)
         for method in study.methods:
             whole = values[method].reindex(columns=[*small, *large]).dropna()
@@ -104,7 +104,7 @@ def interaction_table(study: Study) -> ResultTable:
     rows: list[list[Value]] = []
     for name, measure in MEASURES.items():
         values = by_seed(study, measure)
-        for others in [*other_settings(study, CAPACITY), None]:
+        for others in _slices(study):
             small, large = _halves(study, others)
             for x, y in pairs(study.methods):
                 apart = differences(values, x, y).reindex(columns=[*small, *large]).dropna()
@@ -182,6 +182,12 @@ def _halves(study: Study, others: Setting | None) -> tuple[list[int], list[int]]
         if others is None or setting[:place] + setting[place + 1 :] == others
     ]
     return [number for number, small in chosen if small], [number for number, small in chosen if not small]
+
+
+def _slices(study: Study) -> list[Setting | None]:
+    """The settings of the axes other than capacity, and None for all of them where they are several."""
+    others = other_settings(study, CAPACITY)
+    return [*others, None] if len(others) > 1 else [*others]
 
 
 def _words(study: Study, others: Setting | None) -> str:

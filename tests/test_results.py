@@ -1,0 +1,103 @@
+"""The numbers in results/README.md are those of the committed studies, as results/claims.toml ties them together."""
+
+import re
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from experiments.report import comparisons, results
+from experiments.report.study import Study, load_study
+
+RESULTS = Path(__file__).parent.parent / "results"
+CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]
+PAGE = " ".join((RESULTS / "README.md").read_text().split())
+TABLES = {
+    "table1": results.paper_table,
+    "settings": results.settings_table,
+    "aggregate": results.aggregate_table,
+    "improvement": results.improvement_table,
+    "breaking_points": results.breaking_table,
+    "runs": results.runs_table,
+    "learning": comparisons.learning_table,
+    "paired": comparisons.paired_table,
+    "sizes": comparisons.sizes_table,
+    "interaction": comparisons.interaction_table,
+    "common_breaking": comparisons.common_breaking_table,
+}
+
+
+@cache
+def study_of(name: str) -> Study:
+    return load_study(RESULTS / "cartpole" / f"{name}.parquet")
+
+
+@cache
+def table_of(study: str, name: str) -> pd.DataFrame:
+    table = TABLES[name](study_of(study))
+    return pd.DataFrame(table.rows, columns=list(table.columns))
+
+
+def texts(claim: dict[str, Any]) -> Iterator[str]:
+    """The claim's texts with the numbers filled in."""
+    rows = table_of(claim["study"], claim["table"])
+    if "where" in claim:
+        rows = rows.query(claim["where"])
+    by, key = claim.get("by", []), claim.get("key", [])
+    by, key = ([each] if isinstance(each, str) else each for each in (by, key))
+    if claim.get("average"):
+        groups = rows.groupby([*by, *key], sort=False)
+        spread = groups.std(numeric_only=True).add_suffix(" sd")
+        rows = pd.concat([groups.mean(numeric_only=True), spread, groups.size().rename("count")], axis=1).reset_index()
+    for at, group in rows.groupby(by, sort=False) if by else [((), rows)]:
+        names = {"at": at[0] if len(at) == 1 else at}
+        for row in group.to_dict("records"):
+            name = " ".join(str(row[each]) for each in key) or "row"
+            assert name not in names, f"two rows are called {name}"
+            names[f"n{name}" if name[:1].isdigit() else name] = row
+        templates = [claim["text"]] if isinstance(claim["text"], str) else claim["text"]
+        yield from (template.format_map(names) for template in templates)
+
+
+@pytest.mark.parametrize("study", sorted({claim["study"] for claim in CLAIMS}))
+def test_the_page_says_what_the_data_say(study: str) -> None:
+    wrong = [
+        text
+        for claim in CLAIMS
+        if claim["study"] == study
+        for text in texts(claim)
+        if re.sub(r"\s+", " ", text) not in PAGE
+    ]
+    assert not wrong
+
+
+def test_a_number_that_is_not_in_the_page_is_found() -> None:
+    claim = {
+        "study": "agree-lockstep",
+        "table": "runs",
+        "where": "seed == 0",
+        "text": "a return of {row[mean]:.3f} here",
+    }
+    (text,) = texts(claim)
+    assert re.fullmatch(r"a return of \d+\.\d{3} here", text)
+    assert text not in PAGE
+
+
+def test_studies_that_share_runs() -> None:
+    """The page says that one set of five runs is shown in three studies."""
+    shown = {
+        "buffers": "method == 'coop' and `replay.capacity` == 5000",
+        "exploration": "`edl.rate` == 0.1",
+        "choices": "`edl.noise` == 'normal' and `edl.feedback` == 'transform' and not `learner.reset_role_at_episode`",
+    }
+    returns = []
+    for study, where in shown.items():
+        names = set(table_of(study, "runs").query(where)["run"])
+        chosen = {run.config.seed: run.returns.tolist() for run in study_of(study).runs if run.name in names}
+        assert sorted(chosen) == [0, 1, 2, 3, 4]
+        returns.append(chosen)
+    assert returns[0] == returns[1] == returns[2]
