@@ -13,12 +13,13 @@ from actors.policy import Policy
 from actors.service import ActorService
 from common.envs.make import make_vector_env
 from common.errors import JoinError, PeerLost
-from common.messaging.joining import Membership, join
+from common.messaging.joining import Membership, join, take_leave
 from common.messaging.messages.join import Join, Joined
 from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.networks.network import FlatNetwork, build_network
 from common.process import cli
+from common.process.console import Console, counted
 from common.process.lifecycle import Stop, run_main
 from common.process.memory import keep_freed_memory
 from common.process.threads import use_threads
@@ -45,19 +46,24 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     stop.on_thread_failures()
-    incarnation = new_incarnation()
+    incarnation, console = new_incarnation(), Console()
     session = open_session((), options.connect, options.zenoh_config, options.shared_memory)
     with Node(session, options.run, "actor", incarnation) as node:
         node.follow_stop(stop)
         request = Join("actor", incarnation, [])
-        joined = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
-        if joined is not None:
-            _play(node, stop, options, request, joined)
+        try:
+            joined = join(
+                node, stop, request, options.connect, options.join_timeout, need_replay=True, event=console.event
+            )
+            if joined is not None:
+                _play(node, stop, options, request, joined, console)
+        finally:
+            take_leave(node, request)
     if stop.failed:
         raise PeerLost(stop.reason)
 
 
-def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined) -> None:
+def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined, console: Console) -> None:
     """Play until the stop; raises JoinError where this process plays or computes something else than the learner."""
     config = joined.config
     # A number is given once in a run, also across restarts of any role: no two processes play the same seeds.
@@ -76,8 +82,14 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
         def learned(answer: Joined, _: float) -> None:
             route.follow(answer.replay_endpoints)
 
-        with Membership(node, stop, request, joined, options.patience, learned, urgent=lambda: not route.is_up):
-            ActorService(node, route, stop, config, env, policy, request.incarnation).run()
+        console.event(
+            f"joined run {options.run!r} on {joined.learner} as actor {joined.index}; "
+            f"plays {counted(env.num_envs, 'emulator')} of {config.env.id} for the replay service on {joined.replay}"
+        )
+        service = ActorService(node, route, stop, config, env, policy, request.incarnation, console)
+        with Membership(node, stop, request, joined, options.patience, learned, console.event, lambda: route.is_up):
+            service.run()
+    console.event(f"{stop.reason}; {service.progress()}")
     env.close()
 
 

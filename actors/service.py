@@ -13,6 +13,7 @@ from common.envs.protocol import VectorEnv
 from common.messaging.clients import InsertClient
 from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node
+from common.process.console import Console
 from common.process.lifecycle import Stop
 from common.settings import schedules
 from common.settings.config import RunConfig
@@ -32,7 +33,9 @@ class ActorService:
         env: VectorEnv,
         policy: Policy,
         incarnation: int,
+        console: Console,
     ) -> None:
+        self._console = console
         self._node = node
         self._stop = stop
         settings = config.actor
@@ -85,6 +88,11 @@ class ActorService:
         self._node.publish_status(
             {"steps": self._player.steps, "acked": self._inserts.acked, "waiting": self._waiting()}
         )
+        self._console.progress(self._inserts.acked, self._waiting(), self.progress)
+
+    def progress(self) -> str:
+        """How far this actor is, in one line."""
+        return f"{self._player.steps:,} steps played, {self._inserts.acked:,} of them acknowledged"
 
     def _waiting(self) -> str:
         return self._inserts.waiting if self._weights.ready else "waiting for the learner's weights"

@@ -124,7 +124,7 @@ class Topology:
         self._node = stack.enter_context(Node(session, RUN, "learner", new_incarnation()))
         agent = Agent(config, spec)
         digest, epochs = agent.networks[0].layout_digest(), SharedEpochs([], "benchmark")
-        Reception(self._node, config, spec, digest, 0, epochs, Roster())
+        Reception(self._node, config, spec, digest, 0, epochs, Roster(), print)
         Broadcaster(self._node, agent)
         joining = ["--run", RUN, "--connect", head]
         service = command("coop-replay", *joining, "--listen", replay, "--run-dir", str(folder))

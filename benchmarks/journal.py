@@ -50,7 +50,9 @@ class Service:
         )
         head, at = free_endpoint(), free_endpoint()
         learner = stack.enter_context(Node(open_session((head,)), run, "learner", new_incarnation()))
-        Reception(learner, config, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster())
+        Reception(
+            learner, config, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster(), event=print
+        )
         flags = ("--run", run, "--connect", head, "--listen", at, "--run-dir", str(folder))
         self._process = ChildProcess("replay", command("coop-replay", *flags), folder.with_suffix(".log"))
         self._process.start()

@@ -168,7 +168,7 @@ class Bench:
         incarnation = new_incarnation()
         session = open_session((head,), (bare,), shared_memory=shared_memory)
         node = stack.enter_context(Node(session, RUN, "learner", incarnation))
-        Reception(node, CONFIG, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster())
+        Reception(node, CONFIG, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster(), event=print)
         flags = ["--run", RUN, "--connect", head, "--listen", replay, "--run-dir", str(folder)]
         service = ChildProcess(
             "replay", command("coop-replay", *flags, *["--shared-memory"] * shared_memory), folder / "log"

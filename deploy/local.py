@@ -9,6 +9,7 @@ from pathlib import Path
 from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
+from common.process.console import stamped
 from common.process.files import write_whole
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
@@ -106,7 +107,7 @@ class Topology:
             if status > 0 and not process.name.startswith("actor"):
                 raise (UsageError if status == UsageError.exit_status else RunError)(process.why())
             if status:
-                display.say(f"{process.why()}; starting it again")
+                display.say(stamped(f"{process.why()}; starting it again"))
             else:
                 policy.at = now + GRACE  # it was told to stop, and the learner is likely to follow
         elif policy.due(now):

@@ -15,6 +15,7 @@ from common.errors import BadMessage
 from common.messaging.keys import status_key
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.transport import Node, open_session
+from common.process.console import Sight, connected, progress_line, returns, stamped
 from common.process.display import LiveDisplay
 from common.process.lifecycle import Stop
 
@@ -56,30 +57,15 @@ class RunStatus:
 
     def line(self) -> str:
         """The status in one line."""
-        told = self.learner
-        if not told:
-            return "waiting for the learner"
-        text = (
-            f"step {told['env_steps']:,}/{told['total_steps']:,}  {self.returns()}  "
-            f"{told['updates_per_s']:.0f} updates/s  "
-            f"network {told['acting']} acts  {self.connected()}"
-        )
-        return f"{text}  [{told['waiting']}]" if told.get("waiting") else text
+        return stamped(progress_line(self.learner)) if self.learner else "waiting for the learner"
 
-    def returns(self) -> str:
-        """The mean return, in words."""
-        mean, episodes = self.learner["return_mean_100"], self.learner["episodes"]
-        return f"return {mean:.1f} (last 100 of {episodes:,} episodes)" if episodes else "no episode has ended yet"
+    def events(self) -> list[tuple[int, str]]:
+        """What the learner has told of lately, each line with a number that grows."""
+        return list(self.learner.get("events", []))
 
-    def missing(self) -> list[str]:
-        """Processes that have gone and that nobody has replaced."""
-        lost = [name for name in self._node.presence.missing() if name.startswith("learner")]
-        return lost or list(self.learner.get("missing", []))
-
-    def connected(self) -> str:
-        """Who is connected, in words."""
-        counts = self.learner.get("connected", {})
-        return ", ".join(f"{counts.get(role, 0)} {role}" for role in ("learner", "replay", "actor"))
+    def learner_is_there(self) -> bool:
+        """True while a learner is connected."""
+        return bool(self._node.presence.members("learner"))
 
     def close(self) -> None:
         """Leave the run."""
@@ -92,17 +78,23 @@ class Display(LiveDisplay):
     def __init__(self, status: RunStatus) -> None:
         super().__init__(PLAIN_EVERY, refreshes=4)
         self._status = status
-        self._missing: list[str] = []
+        self._shown = 0
+        self._learner = Sight("the learner")
         self._over = Stop()  # after it they leave
         status.follow_stop(self._over)
 
     def update(self) -> None:
         """Show what the status says now."""
         self._status.refresh()
-        missing = [] if self._over.is_set() else self._status.missing()
-        for name in set(missing) - set(self._missing):
-            self.say(f"{name} does not answer")
-        self._missing = missing
+        for number, line in self._status.events():
+            if number > self._shown:
+                self._shown = number
+                self.say(line)
+        told = self._status.learner
+        if told and not self._over.is_set():
+            text = self._learner.look(self._status.learner_is_there(), told["origin"])
+            if text:
+                self.say(stamped(text))
         super().update()
 
     def line(self) -> str:
@@ -120,12 +112,16 @@ class Display(LiveDisplay):
             return table
         rows = {
             "step": f"{told['env_steps']:,} of {told['total_steps']:,}",
-            "episodes": self._status.returns(),
+            "episodes": returns(told["return_mean_100"], told["episodes"]),
             "updates": f"{told['updates']:,}, {told['updates_per_s']:.0f}/s",
             "acting": f"network {told['acting']}, epsilon {told['epsilon']:.3f}, s {told['s']:.3f}",
-            "connected": self._status.connected(),
+            "connected": connected(told["connected"]),
         }
-        if told.get("waiting"):
+        if told["warning"]:
+            rows["warning"] = str(told["warning"])
+        if told["missing"]:
+            rows["lost"] = ", ".join(told["missing"])
+        if told["waiting"]:
             rows["waiting"] = str(told["waiting"])
         for name, value in rows.items():
             table.add_row(name, value)

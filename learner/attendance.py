@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+from common.messaging.messages.join import Join
+
 FORGOTTEN = 60.0  # seconds after which one that is lost is no longer missed
 
 
@@ -18,46 +20,47 @@ class Attendance:
     def __init__(self, event: Callable[[str], None]) -> None:
         self._event = event
         self._lock = threading.RLock()  # events come in the order in which things happen
-        self._names: dict[tuple[str, int], str] = {}
-        self._leaving: set[tuple[str, int]] = set()
-        self._away: set[tuple[str, int]] = set()
-        self._lost: dict[tuple[str, int], float] = {}  # those away that nobody has replaced, and since when
+        self._names: dict[int, str] = {}
+        self._leaving: set[int] = set()
+        self._away: set[int] = set()
+        self._roles: dict[int, str] = {}
+        self._lost: dict[int, float] = {}  # those away that nobody has replaced, and since when
 
-    def joined(self, role: str, incarnation: int, name: str, *, again: bool, listens: str = "") -> None:
-        """Note a join, the first of this process or, `again`, one after a restart of the learner."""
+    def joined(self, request: Join, name: str) -> None:
+        """Note a join, the first of this process or one after a restart of the learner."""
         with self._lock:
-            who = role, incarnation
+            who = request.incarnation
             if who in self._names:
                 return
-            self._names[who] = name
-            replaced = next((lost for lost in self._lost if lost[0] == role), None)
+            self._names[who], self._roles[who] = f"{name} on {request.origin}", request.role
+            replaced = next((lost for lost in self._lost if self._roles[lost] == request.role), None)
             if replaced is not None:
                 del self._lost[replaced]
-            self._event(f"{name} {'is back' if again else 'joined'}{listens and f'; it listens on {listens}'}")
+            listens = f"; it listens on {', '.join(request.endpoints)}" if request.endpoints else ""
+            self._event(f"{self._names[who]} {'joined' if request.index < 0 else 'is back'}{listens}")
 
-    def leaving(self, role: str, incarnation: int) -> None:
+    def leaving(self, incarnation: int) -> None:
         """Note that a process is about to end well."""
         with self._lock:
-            self._leaving.add((role, incarnation))
+            self._leaving.add(incarnation)
 
-    def token(self, role: str, incarnation: int, there: bool, now: float) -> None:
+    def token(self, incarnation: int, there: bool, now: float) -> None:
         """Note that the liveliness token of a process has come or gone."""
         with self._lock:
-            who = role, incarnation
-            name = self._names.get(who)
+            name = self._names.get(incarnation)
             if name is None:
                 return
-            if there and who in self._away:
-                self._away.discard(who)
-                self._lost.pop(who, None)
+            if there and incarnation in self._away:
+                self._away.discard(incarnation)
+                self._lost.pop(incarnation, None)
                 self._event(f"{name} is back")
-            elif not there and who in self._leaving:
-                self._leaving.discard(who)
-                del self._names[who]
+            elif not there and incarnation in self._leaving:
+                self._leaving.discard(incarnation)
+                del self._names[incarnation], self._roles[incarnation]
                 self._event(f"{name} left")
-            elif not there and who not in self._away:
-                self._away.add(who)
-                self._lost[who] = now
+            elif not there and incarnation not in self._away:
+                self._away.add(incarnation)
+                self._lost[incarnation] = now
                 self._event(f"{name} does not answer")
 
     def missing(self, now: float) -> list[str]:

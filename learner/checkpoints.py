@@ -25,15 +25,19 @@ PAUSE = 0.05  # seconds between questions
 class Checkpoints:
     """Saves epochs, one at a time.
 
-    An epoch that can't be saved is given up, with one printed line, and the run goes on to the next.
+    An epoch that can't be saved is given up, with one event, and the run goes on to the next.
 
     Args:
         epochs: are told of those that are finished.
+        event: told the same in words.
     """
 
-    def __init__(self, node: Node, run_dir: Path, samples: SampleClient, epochs: SharedEpochs) -> None:
+    def __init__(
+        self, node: Node, run_dir: Path, samples: SampleClient, epochs: SharedEpochs, event: Callable[[str], None]
+    ) -> None:
         self._node = node
         self._run_dir = run_dir
+        self._event = event
         self._samples = samples
         self._epochs = epochs
         self._writer: threading.Thread | None = None
@@ -68,9 +72,10 @@ class Checkpoints:
         try:
             self._save(number, state)
         except RunError as error:
-            print(f"{error}; the run goes on without it", flush=True)
+            self._event(f"{error}; the run goes on without it")
 
     def _save(self, number: int, state: dict[str, Any]) -> None:
+        began = time.monotonic()
         try:
             try:
                 self._ask(Snapshot(number, complete_epochs(self._run_dir)).encode(self._node.run))
@@ -83,6 +88,7 @@ class Checkpoints:
         except CoopError as error:
             raise RunError(f"epoch {number}: {error}") from error
         self._epochs.finished(number)
+        self._event(f"epoch {number} saved, {time.monotonic() - began:.1f} s")
 
     def _wait_for(self, question: bytearray) -> None:
         while self._ask(question).kind == Retry.kind:

@@ -10,6 +10,7 @@ from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.messaging.clients import SampleClient
 from common.messaging.transport import Node, locators, new_incarnation, open_session
+from common.process.console import Console
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
 from common.process.threads import use_threads
@@ -64,9 +65,10 @@ def _run() -> None:
 
 def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path, stop: Stop) -> None:
     """One run from its beginning, or from an epoch, to its end."""
+    console = Console()
     held = whole_epochs(path) if options.resume else []
     if options.resume and not held:
-        print(beginning(path), flush=True)
+        console.event(beginning(path))
     trainer = Trainer(Agent(config, spec), time.monotonic())
     agent = trainer.agent
     epochs = SharedEpochs(held, str(path), restart=options.restart)
@@ -75,26 +77,27 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
     with Node(session, config.run, "learner", incarnation) as node:
         run_id = settle(path, config)
         roster = Roster(path, time.monotonic())
-        Reception(node, config, spec, agent.networks[0].layout_digest(), run_id, epochs, roster)
-        print(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}", flush=True)
+        layout = agent.networks[0].layout_digest()
+        reception = Reception(node, config, spec, layout, run_id, epochs, roster, console.event)
+        console.event(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}")
         if held:
-            print("waiting for the replay service to tell which epochs it holds", flush=True)
+            console.event("waiting for the replay service to tell which epochs it holds")
         number = epochs.wait(stop)
         if number is None:
             return
         state = go_back(path, number)
         if state is not None:
             trainer.load_state(state, time.monotonic())
-            print(f"goes on from epoch {number}", flush=True)
+            console.event(f"goes on from epoch {number}")
         elif held:
-            print("begins anew: no epoch is held by both", flush=True)
+            console.event("begins anew: no epoch is held by both")
         settings, told = config.learner, 0 if state is None else state["told"]
         samples = SampleClient(
             node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, told
         )
-        checkpoints = Checkpoints(node, path, samples, epochs)
+        checkpoints = Checkpoints(node, path, samples, epochs, console.event)
         with RunDirectory(path, config, None if state is None else state["sizes"]) as directory:
-            summary = LearnerService(node, stop, trainer, directory, samples, checkpoints).run()
+            summary = LearnerService(node, stop, trainer, directory, samples, checkpoints, reception, console).run()
     print(summary, flush=True)
     if trainer.diverged:
         raise RunError(trainer.diverged)

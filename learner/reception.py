@@ -1,28 +1,68 @@
-"""The learner's answer to those who want to join: the whole run in one message."""
+"""The learner's answers to those who join and to those who leave."""
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Callable
 from functools import partial
 
 from common.errors import BadMessage
 from common.messaging.keys import join_key
 from common.messaging.messages.answers import Retry
-from common.messaging.messages.join import Join, Joined
-from common.messaging.presence import Origin
+from common.messaging.messages.join import Farewell, Join, Joined, Leave
+from common.messaging.presence import JOINING, Origin
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.types import EnvSpec
+from learner.attendance import Attendance
 from learner.roster import Occupied, Roster
 from learner.shared_epochs import SharedEpochs
 
 
+class Departure:
+    """A replay service that was told to stop, and that stays until what it holds has been saved; safe for threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._asked: int | None = None
+        self._granted: int | None = None
+        self._over = False
+
+    @property
+    def is_due(self) -> bool:
+        """True while a replay service waits for an epoch to be saved."""
+        with self._lock:
+            return self._asked is not None and self._asked != self._granted
+
+    def ask(self, incarnation: int) -> bool:
+        """Note that a replay service wants to leave; True once it may."""
+        with self._lock:
+            self._asked = incarnation
+            return self._over or self._granted == incarnation
+
+    def grant(self) -> None:
+        """Let the one that has asked go: what there was to save is saved."""
+        with self._lock:
+            self._granted = self._asked
+
+    def end(self) -> None:
+        """Let everybody go from now on: the run is over."""
+        with self._lock:
+            self._over = True
+
+
 class Reception:
-    """Answers join requests and remembers where the replay service listens.
+    """Answers join requests and farewells, and remembers where the replay service listens.
 
     Args:
         epochs: tell which epoch the run goes on from.
+        event: told who comes and goes, in words.
+
+    Attributes:
+        attendance: who is there, by name.
+        departure: the replay service's, if it wants to leave.
     """
 
     def __init__(
@@ -34,7 +74,10 @@ class Reception:
         run_id: int,
         epochs: SharedEpochs,
         roster: Roster,
+        event: Callable[[str], None],
     ) -> None:
+        self.attendance = Attendance(event)
+        self.departure = Departure()
         self._node = node
         self._config = config
         self._spec = spec
@@ -44,22 +87,27 @@ class Reception:
         self._roster = roster
         self._replay_endpoints: list[str] = []
         self._replay: Origin | None = None
-        for role in ("replay", "actor"):  # each answered by a thread of its own
-            node.serve(join_key(node, role), partial(self._answer, role))
+        for key in {join_key(node, role) for role in JOINING}:  # each answered by a thread of its own
+            node.serve(key, partial(self._answer, key))
 
-    def _answer(self, role: str, message: Message) -> bytearray:
+    def _answer(self, key: str, message: Message) -> bytearray:
+        if message.kind == Leave.kind:
+            return self._leave(key, Leave.decode(message).incarnation)
         request = Join.decode(message)
-        if request.role != role:
-            raise BadMessage("fields.role", f"{request.role!r}; this key is for {role!r}")
+        if key != join_key(self._node, request.role):
+            raise BadMessage("fields.role", f"{request.role!r} asks at {join_key(self._node, request.role)}")
         epoch, anew, index = self._epochs.newest, False, 0
         try:
-            if role == "actor":
+            if request.role == "actor":
                 index = self._roster.actor(request)
-            elif request.endpoints:  # one without them only asks which run this is
+            elif request.role == "replay" and request.endpoints:  # one without them only asks which run this is
                 index = self._admit(request)
                 epoch, anew = self._epochs.offered(request)
         except Occupied as other:
             return Retry(str(other)).encode(self._node.run)
+        if request.role == "actor" or request.endpoints:
+            name = f"actor {index}" if request.role == "actor" else "replay service"
+            self.attendance.joined(request, name)
         joined = Joined(
             self._config,
             self._spec,
@@ -74,8 +122,18 @@ class Reception:
         return joined.answer()
 
     def _admit(self, request: Join) -> int:
-        """The number of the replay service that serves, and to which actors are sent; raises as `Roster`."""
+        """The number of the replay service that serves, and to which actors are sent; raises as `Roster.replay`."""
         there = {int(incarnation, 16) for incarnation in self._node.presence.members("replay")}
         index = self._roster.replay(request, time.monotonic(), there)
         self._replay_endpoints, self._replay = request.endpoints, request.origin
         return index
+
+    def _leave(self, key: str, incarnation: int) -> bytearray:
+        if incarnation == self._roster.serving:
+            if key != join_key(self._node, "replay"):
+                raise BadMessage("fields.incarnation", "not an actor's")
+            if not self.departure.ask(incarnation):
+                return Retry("an epoch is to be saved first").encode(self._node.run)
+            self._roster.dismiss(incarnation)
+        self.attendance.leaving(incarnation)
+        return Farewell().encode(self._node.run)

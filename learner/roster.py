@@ -65,6 +65,11 @@ class Roster:
         except (OSError, ValueError, TypeError) as error:
             raise RunError(f"{self._path}: {error}") from error
 
+    @property
+    def serving(self) -> int:
+        """Incarnation of the replay service that serves; -1 before the first."""
+        return self._entries.serving
+
     def actor(self, request: Join) -> int:
         """The number of an actor: its own one again, or a new one.
 

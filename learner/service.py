@@ -7,14 +7,18 @@ from typing import Any
 
 import msgspec
 
+from common.errors import RunError
 from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key, stop_key
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.stop import EndOfRun
+from common.messaging.presence import Origin
 from common.messaging.transport import NoAnswer, Node
+from common.process.console import Console, progress_line
 from common.process.lifecycle import Stop
 from learner.broadcast import Broadcaster
 from learner.checkpoints import Checkpoints
+from learner.reception import Reception
 from learner.records.curve import draw_learning_curve
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
@@ -40,6 +44,8 @@ class LearnerService:
         directory: RunDirectory,
         samples: SampleClient,
         checkpoints: Checkpoints,
+        reception: Reception,
+        console: Console,
     ) -> None:
         self._node = node
         self._stop = stop
@@ -51,7 +57,8 @@ class LearnerService:
         self._broadcaster = Broadcaster(node, trainer.agent)
         self._status_due = 0.0
         self._status: dict[str, Any] = {}
-        self._missing: list[str] = []
+        self._reception = reception
+        self._console = console
         self._speed = (time.monotonic(), trainer.agent.updates, 0.0)
         node.presence.on_change(self._look_round)
 
@@ -89,6 +96,8 @@ class LearnerService:
                 trainer.epoch_begun()
         elif trainer.trained_out() and (stats := self._replay_stats()) is not None:
             self._carry_out(trainer.note(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
+        if got is None and self._reception.departure.is_due:
+            self._save_for_departure()
         if time.monotonic() >= self._status_due:
             self._tell()
 
@@ -120,19 +129,34 @@ class LearnerService:
             "warning": telemetry.warning(self._agent),
             "bad_messages": self._node.bad_messages,
             "faults": self._node.faults.count,
-            "connected": self._node.presence.counts(),
-            "missing": self._node.presence.missing(),
+            "origin": str(Origin.here()),
+            **self._members(),
         }
         self._node.publish_status(self._status)
+        self._console.progress(self._agent.updates, self._samples.waiting, lambda: progress_line(self._status))
 
-    def _look_round(self) -> None:
-        """Name those who have gone at once: the loop may be waiting for one of them."""
-        missing = self._node.presence.missing()
-        for name in set(missing) - set(self._missing):
-            print(f"{name} does not answer", flush=True)
-        if self._status and missing != self._missing:
-            self._node.publish_status({**self._status, "connected": self._node.presence.counts(), "missing": missing})
-        self._missing = missing
+    def _members(self) -> dict[str, Any]:
+        return {
+            "connected": self._node.presence.counts(),
+            "missing": self._reception.attendance.missing(time.monotonic()),
+            "events": self._console.recent(),
+        }
+
+    def _look_round(self, incarnation: int, there: bool) -> None:
+        """Say at once who has come or gone: the loop may be waiting for one of them."""
+        self._reception.attendance.token(incarnation, there, time.monotonic())
+        if self._status:
+            self._node.publish_status({**self._status, **self._members()})
+
+    def _save_for_departure(self) -> None:
+        """Save an epoch for the replay service that waits for it before it leaves."""
+        try:
+            if self._agent.updates and self._trainer.sound():
+                self._checkpoints.save(self._state())
+        except RunError as error:
+            self._console.event(f"{error}; the run goes on without it")
+        finally:
+            self._reception.departure.grant()
 
     def _save(self) -> None:
         """Save the closing epoch, unless nothing was learned, the agent diverged or the replay service is gone."""
@@ -147,7 +171,7 @@ class LearnerService:
 
     def _finish(self, outcome: str) -> Summary:
         """Collect the last counters, write the summary, and send everybody home."""
-        self._node.presence.on_change(lambda: None)
+        self._reception.departure.end()
         try:
             stats = self._replay_stats()
             steps, lost, duplicates = (

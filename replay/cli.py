@@ -9,11 +9,12 @@ from pathlib import Path
 import msgspec
 
 from common.errors import PeerLost, RunError
-from common.messaging.joining import Membership, join
+from common.messaging.joining import Membership, join, take_leave
 from common.messaging.messages.join import MOST_EPOCHS, Join, Joined
 from common.messaging.presence import LEASE
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process import cli
+from common.process.console import Console
 from common.process.lifecycle import Stop, run_main
 from common.process.memory import keep_freed_memory
 from common.settings.options import RoleOptions
@@ -55,17 +56,18 @@ def _run() -> None:
     session = open_session(options.listen, options.connect, options.zenoh_config, options.shared_memory)
     with Node(session, options.run, "replay", incarnation) as node:
         node.follow_stop(stop)
-        joining = partial(join, node, stop, connect=options.connect, timeout=options.join_timeout)
+        console = Console()
+        joining = partial(join, node, stop, connect=options.connect, timeout=options.join_timeout, event=console.event)
         known = joining(Join("replay", incarnation, []))
         if known is not None:
             folder = ReplayFolder(options.run_dir or _named(options.run, known.run_id), known.run_id)
-            print(folder.check(resume=options.resume), flush=True)
+            console.event(folder.check(resume=options.resume))
             with folder.lock():
                 held = ReplayEpochs(folder.path, known.run_id).whole()
                 request = Join("replay", incarnation, locators(session), epochs=held[-MOST_EPOCHS:])
                 joined = joining(request)
                 if joined is not None:
-                    _serve(node, stop, options, folder, request, joined)
+                    _serve(node, stop, options, folder, request, joined, console)
     if stop.failed:
         raise PeerLost(stop.reason)
 
@@ -74,19 +76,33 @@ def _named(run: str, run_id: int) -> Path:
     return Path("runs") / f"{run}-replay-{run_id:x}"
 
 
-def _serve(node: Node, stop: Stop, options: ReplayOptions, folder: ReplayFolder, request: Join, joined: Joined) -> None:
-    """Serve a run that this process has joined, until the stop."""
-    service = _service(node, joined, folder)
+def _serve(
+    node: Node,
+    stop: Stop,
+    options: ReplayOptions,
+    folder: ReplayFolder,
+    request: Join,
+    joined: Joined,
+    console: Console,
+) -> None:
+    """Serve a run that this process has joined until the stop, and then until the learner has saved what it needs."""
+    service = _service(node, joined, folder, console)
 
     def learned(_: Joined, asked: float) -> None:
         service.confirm(asked + LEASE)
 
-    with Membership(node, stop, msgspec.structs.replace(request, serving=True), joined, options.patience, learned):
+    console.event(f"joined run {options.run!r} on {joined.learner}; listens on {', '.join(request.endpoints)}")
+    rejoining = msgspec.structs.replace(request, serving=True)
+    with Membership(node, stop, rejoining, joined, options.patience, learned, console.event):
         service.start()
-        service.run(stop)
+        service.run(stop, console)
+    if not stop.failed:
+        take_leave(node, request)
+    service.close()
+    console.event(f"{stop.reason}; {service.progress()}")
 
 
-def _service(node: Node, joined: Joined, folder: ReplayFolder) -> ReplayService:
+def _service(node: Node, joined: Joined, folder: ReplayFolder, console: Console) -> ReplayService:
     """A service whose table is as the folder has it, at the learner's epoch or, where there is a journal, later.
 
     Raises:
@@ -110,5 +126,5 @@ def _service(node: Node, joined: Joined, folder: ReplayFolder) -> ReplayService:
             raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
         core.recorder = journal
         epochs = ReplayEpochs(folder.path, folder.run_id, journal)
-    print(found, flush=True)
+    console.event(found)
     return ReplayService(node, core, epochs, confirmed=0.0)

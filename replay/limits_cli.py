@@ -34,7 +34,7 @@ def _run() -> None:
     options = cli.parse(LimitsOptions, "coop-limits", "Show, and change, how a run keeps acting and learning in step.")
     stop = Stop()
     stop.on_signals()
-    request = Join("actor", new_incarnation(), [], index=0)  # asks where the replay service is; takes no actor's place
+    request = Join("watch", new_incarnation(), [])  # asks where the replay service is
     with Node(open_session((), options.connect, options.zenoh_config), options.run, "watch", 0) as node:
         joined = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
     if joined is None:

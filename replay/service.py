@@ -23,11 +23,13 @@ from common.messaging.messages.sample import DrawRequest, encode_batch
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.transport import Node
 from common.messaging.wire import Message
+from common.process.console import Console
 from common.process.lifecycle import Stop
 from replay.core import ReplayCore, Wait
 from replay.persistence.epochs import ReplayEpochs
 
 HOLD = 1.0  # seconds
+LEAVING = "the replay service leaves"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"
 STATUS_EVERY = 0.5  # seconds
 INSERT_QUEUE = 256
@@ -63,7 +65,7 @@ class ReplayService:
         self._changed = threading.Condition()
         self._inserts = _Gate()
         self._draws = _Gate()
-        self._closing = False
+        self._leaving = False
         self._broken = ""  # why the core must not be used any more
         self._batch = bytearray()  # the last one answered; one thread answers, and sending has copied it
 
@@ -76,16 +78,18 @@ class ReplayService:
         node.serve(replay_key(node, "limits"), self._limits)
         node.serve(replay_key(node, "snapshot"), self._snapshot)
 
-    def run(self, stop: Stop) -> None:
-        """Tell displays what goes on, until the stop."""
+    def run(self, stop: Stop, console: Console) -> None:
+        """Tell displays what goes on, until the stop; then acknowledge and draw no more, but save epochs still."""
         problem = ""
         while not stop.wait(STATUS_EVERY):
             if self._broken:
                 stop.set(self._broken, failed=True)
             if problem != self._core.problem:
                 problem = self._core.problem
-                print(problem or "the journal can be written again", flush=True)
+                console.event(problem or "the journal can be written again")
             stats = self.stats()
+            waiting = stats.inserts_wait_for or stats.samples_wait_for
+            console.progress(stats.inserted + stats.drawn, waiting, self.progress)
             self._node.publish_status(
                 {
                     "size": stats.size,
@@ -98,8 +102,16 @@ class ReplayService:
                 }
             )
         with self._changed:
-            self._closing = True
+            self._leaving = True
             self._changed.notify_all()
+
+    def progress(self) -> str:
+        """How far the run is, in one line."""
+        stats = self.stats()
+        return f"{stats.inserted:,} transitions taken, {stats.size:,} held, {stats.drawn:,} batches drawn"
+
+    def close(self) -> None:
+        """Wait for what is being written."""
         self._epochs.close()
 
     def confirm(self, until: float) -> None:
@@ -161,7 +173,7 @@ class ReplayService:
                 now = time.monotonic()
                 gate.closed_at = gate.closed_at or now
                 left = gate.closed_at + HOLD - now
-                if left <= 0 or self._closing:
+                if left <= 0 or self._leaving:
                     return outcome
                 self._changed.wait(left)
             gate.closed_at = None
@@ -188,6 +200,8 @@ class ReplayService:
 
     def _why_not(self) -> Wait | None:
         """Why this service may neither acknowledge nor draw now; None while it may."""
+        if self._leaving:
+            return Wait(LEAVING)
         return None if time.monotonic() < self._confirmed else Wait(UNCONFIRMED)
 
     def _stats(self, message: Message) -> bytearray:

@@ -3,8 +3,11 @@
 import re
 
 import pytest
+from msgspec.structs import replace
 
-from common.process.console import STANDSTILL, Console, Standstill, counted, progress_line
+from common.messaging.messages.join import Join
+from common.messaging.presence import Origin
+from common.process.console import STANDSTILL, Console, Sight, Standstill, counted, progress_line
 from learner.attendance import FORGOTTEN, Attendance
 
 STATUS = {
@@ -15,6 +18,8 @@ STATUS = {
     "return_mean_100": 175.12,
     "episodes": 133,
     "connected": {"learner": 1, "replay": 1, "actor": 2},
+    "missing": [],
+    "warning": "",
     "waiting": "",
 }
 
@@ -27,6 +32,11 @@ STATUS = {
         ({"episodes": 52, "connected": {"actor": 1}, "waiting": "x"},
          "step 9,964/1,000,000  return 175.1 (52 episodes)  247 updates/s  network 2 acts  "
          "0 replay services, 1 actor  [x]"),
+        ({"warning": "w"}, "step 9,964/1,000,000  return 175.1 (last 100 of 133 episodes)  247 updates/s  "
+         "network 2 acts  1 replay service, 2 actors  warning: w"),
+        ({"missing": ["actor 0 on act (pid 8)"]},
+         "step 9,964/1,000,000  return 175.1 (last 100 of 133 episodes)  247 updates/s  network 2 acts  "
+         "1 replay service, 2 actors  lost: actor 0 on act (pid 8)"),
         ({"episodes": 1}, "step 9,964/1,000,000  return 175.1 (1 episode)  247 updates/s  network 2 acts  "
          "1 replay service, 2 actors"),
         ({"episodes": 0, "env_steps": 0}, "step 0/1,000,000  no episode has ended yet  247 updates/s  network 2 acts  "
@@ -55,31 +65,33 @@ def test_members_come_and_go() -> None:
         events.clear()
         return new
 
-    attendance.token("replay", 1, True, 0.0)
-    attendance.joined("replay", 1, "replay service on rep (pid 7)", again=False, listens="tcp/rep:1")
-    attendance.joined("replay", 1, "replay service on rep (pid 7)", again=True, listens="tcp/rep:1")  # asks each moment
-    attendance.joined("actor", 2, "actor 0 on act (pid 8)", again=False)
+    attendance.token(1, True, 0.0)
+    service = Join("replay", 1, ["tcp/rep:1"], origin=Origin("rep", 7))
+    actor = Join("actor", 2, [], origin=Origin("act", 8))
+    attendance.joined(service, "replay service")
+    attendance.joined(replace(service, index=0), "replay service")  # asks each moment
+    attendance.joined(actor, "actor 0")
     assert told() == ["replay service on rep (pid 7) joined; it listens on tcp/rep:1", "actor 0 on act (pid 8) joined"]
-    attendance.token("actor", 2, False, 1.0)
-    attendance.token("actor", 99, False, 1.0)  # one that never joined
+    attendance.token(2, False, 1.0)
+    attendance.token(99, False, 1.0)  # one that never joined
     assert told() == ["actor 0 on act (pid 8) does not answer"]
     assert attendance.missing(1.0) == ["actor 0 on act (pid 8)"]
-    attendance.token("actor", 2, True, 2.0)
+    attendance.token(2, True, 2.0)
     assert told() == ["actor 0 on act (pid 8) is back"]
     assert attendance.missing(2.0) == []
-    attendance.token("actor", 2, False, 3.0)
-    attendance.token("replay", 1, False, 3.0)
+    attendance.token(2, False, 3.0)
+    attendance.token(1, False, 3.0)
     told()
-    attendance.joined("actor", 3, "actor 1 on act (pid 9)", again=False)
+    attendance.joined(replace(actor, incarnation=3, origin=Origin("act", 9)), "actor 1")
     assert attendance.missing(3.0) == ["replay service on rep (pid 7)"], "another one has taken the actor's place"
     assert attendance.missing(3.0 + FORGOTTEN) == []
     told()
-    attendance.token("actor", 2, True, 4.0)
+    attendance.token(2, True, 4.0)
     assert told() == ["actor 0 on act (pid 8) is back"], "although another one had taken its place"
-    attendance.leaving("actor", 2)
-    attendance.token("actor", 2, False, 4.0)
+    attendance.leaving(2)
+    attendance.token(2, False, 4.0)
     assert told() == ["actor 0 on act (pid 8) left"]
-    attendance.joined("actor", 2, "actor 0 on act (pid 8)", again=True)
+    attendance.joined(replace(actor, index=0), "actor 0")
     assert told() == ["actor 0 on act (pid 8) is back"]
 
 
@@ -93,6 +105,17 @@ def test_a_standstill_is_told_once() -> None:
     assert look(STANDSTILL + 10, 6, "") == "goes on"
     assert look(STANDSTILL + 10, 7, "") == ""
     assert look(2 * STANDSTILL + 10, 7, "again") == "waiting: again"
+
+
+def test_others_go_out_of_sight_and_come_back() -> None:
+    look = Sight("the learner").look
+    assert look(False, "") == "", "not there yet"
+    assert look(True, "head (pid 1)") == ""
+    assert look(True, "head (pid 1)") == ""
+    assert look(False, "head (pid 1)") == "the learner on head (pid 1) does not answer"
+    assert look(False, "head (pid 1)") == ""
+    assert look(True, "head (pid 1)") == "the learner on head (pid 1) is back"
+    assert look(True, "head (pid 2)") == "the learner on head (pid 2) is back", "so soon that nobody missed it"
 
 
 def test_events_have_a_time_and_a_number(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,15 +8,16 @@ from msgspec.structs import replace
 from samples import make_segment
 
 from common.errors import JoinError
-from common.messaging import wire
-from common.messaging.joining import difference, join
+from common.messaging import joining, wire
+from common.messaging.joining import difference, join, take_leave
 from common.messaging.keys import join_key, replay_key
-from common.messaging.messages.join import Join, Joined
+from common.messaging.messages.join import Join, Joined, Leave
 from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
 from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current
-from common.messaging.transport import Node, Refused, new_incarnation, open_session
+from common.messaging.presence import Origin
+from common.messaging.transport import Node, Refused, open_session
 from common.process.lifecycle import Stop
 from common.settings.config import RunConfig
 from common.types import EnvSpec
@@ -32,7 +33,7 @@ REQUEST = Join("actor", 3, [])
 
 
 def _receive(node: Node, spec: EnvSpec) -> None:
-    Reception(node, RunConfig(run="test"), spec, "layout", run_id=9, epochs=SharedEpochs([], "run"), roster=Roster())
+    Reception(node, RunConfig(run="test"), spec, "layout", 9, SharedEpochs([], "run"), Roster(), print)
 
 
 def test_another_protocol_is_refused_with_both_versions(
@@ -81,8 +82,8 @@ def test_another_learner(theirs: Joined, words: str | None) -> None:
 
 def test_presence(nodes: tuple[Node, Node], endpoint: str) -> None:
     learner, _ = nodes
-    changes: list[list[str]] = []
-    learner.presence.on_change(lambda: changes.append(learner.presence.missing()))
+    changes: list[tuple[int, bool]] = []
+    learner.presence.on_change(lambda *change: changes.append(change))
 
     def wait_for(counts: dict[str, int]) -> None:
         deadline = time.monotonic() + 10
@@ -91,14 +92,50 @@ def test_presence(nodes: tuple[Node, Node], endpoint: str) -> None:
             time.sleep(0.01)
 
     wait_for({"learner": 1, "actor": 1})
+    changes.clear()
     with Node(open_session((), (endpoint,)), "test", "replay", 0xAB):
         wait_for({"learner": 1, "actor": 1, "replay": 1})
+        assert learner.presence.members("replay") == {"ab"}
+        assert learner.presence.absence("replay") == 0.0
     wait_for({"learner": 1, "actor": 1})
-    assert learner.presence.missing() == ["replay ab"]
-    with Node(open_session((), (endpoint,)), "test", "replay", new_incarnation()):
-        wait_for({"learner": 1, "actor": 1, "replay": 1})
-        assert learner.presence.missing() == [], "another one has taken its place"
-    assert ["replay ab"] in changes
+    assert 0 < learner.presence.absence("replay") < 10
+    assert changes == [(0xAB, True), (0xAB, False)]
+
+
+def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joining, "OCCUPIED", 0.0)
+    learner, actor = nodes
+    events: list[str] = []
+    reception = Reception(
+        learner, RunConfig(run="test"), spec, "layout", 9, SharedEpochs([], "run"), Roster(), events.append
+    )
+    service = Join("replay", 5, ["tcp/rep:1"], origin=Origin("rep", 7))
+    other = replace(service, incarnation=6, origin=Origin("rep", 8))
+    assert join(actor, Stop(), service, (), 5) is not None
+    with pytest.raises(JoinError, match=r"run 'test': the replay service on rep \(pid 7\) serves this run"):
+        join(actor, Stop(), other, (), 5)
+    watching = join(actor, Stop(), Join("watch", 9, []), (), 5)
+    assert watching is not None
+    assert (watching.index, watching.replay_endpoints, watching.replay) == (0, ["tcp/rep:1"], Origin("rep", 7))
+    payload = Leave(5).encode("test")
+    with pytest.raises(Refused, match="not an actor's"):
+        actor.ask(join_key(actor, "actor"), payload)
+    assert not reception.departure.is_due
+    assert actor.ask(join_key(actor, "replay"), payload).kind == "retry", "an epoch comes first"
+    assert reception.departure.is_due
+    reception.departure.grant()
+    assert not reception.departure.is_due
+    assert actor.ask(join_key(actor, "replay"), payload).kind == "farewell"
+    assert join(actor, Stop(), other, (), 5) is not None
+    take_leave(actor, Join("actor", 3, []))
+    with pytest.raises(JoinError, match=r"the replay service on rep \(pid 8\) has taken over from this one"):
+        join(actor, Stop(), replace(service, index=0), (), 5)
+    reception.departure.end()
+    take_leave(actor, other)
+    assert events == [
+        "replay service on rep (pid 7) joined; it listens on tcp/rep:1",
+        "replay service on rep (pid 8) joined; it listens on tcp/rep:1",
+    ]
 
 
 def test_the_limiter_changes_while_the_run_goes_on(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:

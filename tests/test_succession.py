@@ -1,11 +1,13 @@
 """One replay service serves a run; whoever takes over from it is found by all, wherever it listens."""
 
+import json
 import re
 import signal
 import socket
 import time
 from pathlib import Path
 
+import pytest
 from samples import make_segment
 from test_topology import lines, running, wait_for
 
@@ -17,8 +19,10 @@ from common.messaging.messages.sample import DrawRequest
 from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.process.lifecycle import Stop
+from common.process.processes import free_endpoint
 from common.settings.config import RunConfig
 from common.types import EnvSpec
+from learner.records.epochs import newest_epoch
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
 from replay.service import ReplayService
@@ -73,11 +77,8 @@ def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_
 
 
 def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    path = tmp_path / "run"
-    joining = ("--run", "hand", "--connect", endpoint)
+    endpoint, path = free_endpoint(), tmp_path / "run"
+    joining = ("--run", "hand", "--connect", endpoint, "--join-timeout", "120")
     learning = ("--run", "hand", "--listen", endpoint, "--total-steps", "10000000", "--run-dir", str(path))
     metrics = path / "metrics.jsonl"
     with (
@@ -85,7 +86,7 @@ def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path
         running("coop-replay", *joining, "--run-dir", str(tmp_path / "first")) as first,
         running("coop-actor", *joining) as actor,
     ):
-        wait_for("the first metrics", lambda: lines(metrics) >= 1)
+        wait_for("the first metrics", lambda: lines(metrics) >= 1, 120)
         with running("coop-replay", *joining, "--run-dir", str(tmp_path / "second")) as second:
             _, err = second.communicate(timeout=60)
         assert second.returncode == 1
@@ -104,3 +105,39 @@ def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path
             learner.send_signal(signal.SIGINT)
             for process in (learner, actor, third):
                 process.wait(60)
+
+
+@pytest.mark.parametrize("first", ["everybody", "replay"])
+def test_whoever_is_told_to_stop_first_the_closing_epoch_is_saved(first: str, tmp_path: Path) -> None:
+    endpoint, path = free_endpoint(), tmp_path / "run"
+    joining = ("--run", "hand", "--connect", endpoint, "--join-timeout", "120")
+    learning = ("--run", "hand", "--listen", endpoint, "--total-steps", "10000000", "--run-dir", str(path))
+    serving = (*joining, "--run-dir", str(path), "--listen", "tcp/127.0.0.1:0")
+    with (
+        running("coop-learner", *learning) as learner,
+        running("coop-replay", *serving) as replay,
+        running("coop-actor", *joining) as actor,
+    ):
+        wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1, 120)
+        if first == "everybody":
+            for process in (actor, replay, learner):
+                process.send_signal(signal.SIGTERM)
+        else:
+            replay.send_signal(signal.SIGTERM)
+            replay.wait(40)
+            saved = newest_epoch(path)
+            assert saved is not None, "the epoch comes first"
+            with running("coop-replay", *serving, "--resume") as another:
+                before = lines(path / "metrics.jsonl")
+                wait_for("metrics with another one", lambda: lines(path / "metrics.jsonl") > before + 1)
+                another.send_signal(signal.SIGTERM)
+                another.wait(40)
+            learner.send_signal(signal.SIGTERM)
+        for process in (learner, replay, actor):
+            process.wait(60)
+    summary = json.loads((path / "summary.json").read_text())
+    saved = newest_epoch(path)
+    assert saved is not None
+    assert int(saved.name) == summary["updates"] > 0
+    assert (saved / "replay" / "frames.npy").exists()
+    assert summary["transitions_lost"] in (0, None)

@@ -13,29 +13,41 @@ from common.errors import BadMessage, JoinError
 from common.messaging.endpoints import unknown_hosts
 from common.messaging.keys import join_key
 from common.messaging.messages.answers import Retry
-from common.messaging.messages.join import Join, Joined
+from common.messaging.messages.join import Join, Joined, Leave
 from common.messaging.transport import NoAnswer, Node, Refused
+from common.process.console import Sight, Standstill
 from common.process.lifecycle import Stop
 from common.settings.tables import first_difference, identity
 
 RETRY_PAUSE = 0.1  # seconds
 OCCUPIED = 5.0  # seconds that a replay service waits for the end of another one: a dead one is given up sooner
 ASK_EVERY = 0.4  # seconds between a member's questions, where its work depends on the answer
+LEAVE_WITHIN = 25.0  # seconds that a process which was told to stop stays because the learner needs it
 SELDOM = 5.0  # seconds between those of one to which nothing has happened
 
 
 def join(
-    node: Node, stop: Stop, request: Join, connect: Sequence[str], timeout: float, *, need_replay: bool = False
+    node: Node,
+    stop: Stop,
+    request: Join,
+    connect: Sequence[str],
+    timeout: float,
+    *,
+    need_replay: bool = False,
+    event: Callable[[str], None] = lambda text: None,
 ) -> Joined | None:
     """Ask the learner until it answers; None if the stop came first.
 
     need_replay: wait also until the learner knows where the replay service listens.
+    event: told once in words what a long wait is for.
 
     Raises:
         JoinError: no learner (or no replay service) within `timeout` seconds, or the learner refused this process, or
             another replay service serves the run.
     """
+    where = ", ".join(connect) or "no endpoint (give --connect)"
     deadline = time.monotonic() + timeout
+    standstill = Standstill()
     vacant_by: float | None = None
     answered = False
     while not stop.is_set():
@@ -52,13 +64,15 @@ def join(
             elif answer.replay_endpoints or not need_replay:
                 return answer
         if time.monotonic() > deadline and vacant_by is None:
-            where = ", ".join(connect) or "no endpoint (give --connect)"
             missing = "replay service" if answered else "learner"
             text = f"no {missing} of run {node.run!r} found at {where} within {timeout:g} s"
             if not answered and (unknown := unknown_hosts(connect)):
                 text = f"{text}; the host {unknown[0]!r} is not known"
             others = [] if answered else other_runs(node)
             raise JoinError(f"{text}; there is run {', '.join(map(repr, others))}" if others else text)
+        awaited = f"a replay service of run {node.run!r}" if answered else f"the learner of run {node.run!r} at {where}"
+        if text := standstill.look(time.monotonic(), 0, f"waiting for {awaited}"):
+            event(text)
         stop.wait(RETRY_PAUSE)
     return None
 
@@ -77,6 +91,25 @@ def ask_to_join(node: Node, request: Join) -> Joined | str:
         raise JoinError(f"the learner of run {node.run!r} refused: {error}") from error
 
 
+def take_leave(node: Node, request: Join) -> None:
+    """Tell the learner that this process was told to stop, and stay until that has saved what it needs of it.
+
+    Ends after `LEAVE_WITHIN` seconds, or where there is no learner.
+    """
+    deadline = time.monotonic() + LEAVE_WITHIN
+    payload = Leave(request.incarnation).encode(node.run)
+    while time.monotonic() < deadline:
+        try:
+            if node.ask(join_key(node, request.role), payload, timeout=1.0).kind != Retry.kind:
+                return
+        except NoAnswer:
+            if not node.presence.members("learner"):
+                return
+        except (Refused, BadMessage):
+            return
+        time.sleep(RETRY_PAUSE)
+
+
 def other_runs(node: Node) -> list[str]:
     """Names of the runs whose learners this process is connected to."""
     tokens = node.session.liveliness().get("coop/*/alive/learner/*", timeout=1.0)
@@ -91,7 +124,9 @@ class Membership:
     Args:
         request: as this process joined first. joined: the answer that it got then.
         learned: called with each answer, and with the time at which it was asked for.
-        urgent: tells whether the next answer is waited for; if not, the learner is asked now and then only.
+        event: told in words who does not answer, and who is back.
+        replay_there: tells whether a replay service is connected; while there is none, where the next one listens is
+            waited for, and otherwise asked now and then. None: this is the replay service, which asks all the time.
     """
 
     def __init__(
@@ -102,7 +137,8 @@ class Membership:
         joined: Joined,
         patience: float,
         learned: Callable[[Joined, float], None],
-        urgent: Callable[[], bool] = lambda: True,
+        event: Callable[[str], None],
+        replay_there: Callable[[], bool] | None = None,
     ) -> None:
         self._node = node
         self._stop = stop
@@ -110,7 +146,8 @@ class Membership:
         self._joined = joined
         self._patience = patience
         self._learned = learned
-        self._urgent = urgent
+        self._event = event
+        self._replay_there = replay_there
         self._thread = threading.Thread(target=self._run, name="membership", daemon=True)
         self._thread.start()
 
@@ -122,6 +159,7 @@ class Membership:
         self._thread.join()
 
     def _run(self) -> None:
+        learner, replay = Sight("the learner"), Sight("the replay service")
         known, asked = self._node.presence.members("learner"), time.monotonic()
         while not self._stop.wait(ASK_EVERY):
             if self._node.presence.absence("learner") > self._patience:
@@ -129,10 +167,17 @@ class Membership:
                 self._stop.set(text, failed=True)
                 return
             there = self._node.presence.members("learner")
-            if there - known or self._urgent() or time.monotonic() - asked > SELDOM:
+            replay_there = self._replay_there is not None and self._replay_there()
+            if there - known or not replay_there or time.monotonic() - asked > SELDOM:
                 asked = time.monotonic()
                 if self._ask(asked):
                     known = there
+            for text in (
+                learner.look(bool(there & known), str(self._joined.learner)),
+                replay.look(replay_there, str(self._joined.replay)),
+            ):
+                if text and not self._stop.is_set():
+                    self._event(text)
 
     def _ask(self, now: float) -> bool:
         """Ask the learner once; True if it answered."""
@@ -146,6 +191,7 @@ class Membership:
         if problem:
             self._stop.set(problem, failed=True)
         elif isinstance(answer, Joined):
+            self._joined = answer
             self._learned(answer, now)
         return True
 

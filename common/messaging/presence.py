@@ -20,8 +20,8 @@ from common.bounded import Name
 from common.messaging.faults import Faults
 
 ROLES = ("learner", "replay", "actor")
+JOINING = ("replay", "actor", "watch")  # roles that ask the learner for the run; one that watches takes no part in it
 LEASE = 1.5  # seconds of silence after which a link is given up, and the learner's word no longer holds
-FORGOTTEN = 60.0  # seconds after which one that has gone is no longer missed
 
 
 class Origin(NamedTuple):
@@ -50,30 +50,23 @@ class Presence:
 
     def __init__(self, session: zenoh.Session, prefix: str, faults: Faults) -> None:
         self._there: set[str] = set()
-        self._gone: dict[str, float] = {}  # since when
+        self._gone: dict[str, float] = {}  # by role, when the last of it went
         self._lock = threading.Lock()
-        self._on_change: Callable[[], None] = lambda: None
+        self._on_change: Callable[[int, bool], None] = lambda incarnation, there: None
         self._began = time.monotonic()
         for role in ROLES:  # one subscriber each: access control may let a process see some roles only
             session.liveliness().declare_subscriber(
                 f"{prefix}/{role}/*", faults.guarded("watching who is there", self._tell), history=True
             )
 
-    def on_change(self, call: Callable[[], None]) -> None:
-        """Have `call` called whenever somebody comes or goes, in a thread of Zenoh's."""
+    def on_change(self, call: Callable[[int, bool], None]) -> None:
+        """Have `call(incarnation, there)` called whenever somebody comes or goes, in a thread of Zenoh's."""
         self._on_change = call
 
     def counts(self) -> dict[str, int]:
         """How many processes of each role are connected."""
         with self._lock:
             return dict(Counter(name.split("/")[0] for name in self._there))
-
-    def missing(self) -> list[str]:
-        """Processes that have gone and that no other of their role has replaced, as "ROLE INCARNATION"."""
-        now = time.monotonic()
-        with self._lock:
-            self._gone = {name: since for name, since in self._gone.items() if now - since < FORGOTTEN}
-            return [name.replace("/", " ") for name in self._gone]
 
     def members(self, role: str) -> set[str]:
         """Incarnations of a role that are connected."""
@@ -85,18 +78,15 @@ class Presence:
         with self._lock:
             if any(name.startswith(f"{role}/") for name in self._there):
                 return 0.0
-            left = max((since for name, since in self._gone.items() if name.startswith(f"{role}/")), default=0.0)
-            return time.monotonic() - max(left, self._began)
+            return time.monotonic() - self._gone.get(role, self._began)
 
     def _tell(self, sample: zenoh.Sample) -> None:
-        name = "/".join(str(sample.key_expr).split("/")[-2:])
+        role, incarnation = str(sample.key_expr).split("/")[-2:]
+        there = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
-            if sample.kind == zenoh.SampleKind.DELETE:
-                self._there.discard(name)
-                self._gone[name] = time.monotonic()
+            if there:
+                self._there.add(f"{role}/{incarnation}")
             else:
-                self._there.add(name)
-                role = f"{name.split('/')[0]}/"
-                replaced = name if name in self._gone else next((old for old in self._gone if old.startswith(role)), "")
-                self._gone.pop(replaced, None)
-        self._on_change()
+                self._there.discard(f"{role}/{incarnation}")
+                self._gone[role] = time.monotonic()
+        self._on_change(int(incarnation, 16), there)

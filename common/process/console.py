@@ -25,7 +25,7 @@ class Console:
     def event(self, text: str) -> None:
         """Print what has just happened."""
         with self._lock:
-            line = f"{time.strftime('%H:%M:%S')} {text}"
+            line = stamped(text)
             last = self._recent[-1][0] if self._recent else 0
             self._recent.append((max(last + 1, time.time_ns() // 1_000_000), line))
             print(line, flush=True)
@@ -36,33 +36,67 @@ class Console:
             return [list(event) for event in self._recent]
 
     def progress(self, count: int, reason: str, line: Callable[[], str]) -> None:
-        """Print `line()` if it is time, and an event where `count` stands still for a `reason`, or moves again."""
+        """Print `line()` if it is time, and an event where `count` stands still for a `reason`, or moves again.
+
+        While it stands still, there is no progress to print.
+        """
         now = time.monotonic()
         if text := self._standstill.look(now, count, reason):
             self.event(text)
         if now >= self._progress_due:
             self._progress_due = now + PROGRESS_EVERY
-            print(f"{time.strftime('%H:%M:%S')} {line()}", flush=True)
+            if not self._standstill.told:
+                print(stamped(line()), flush=True)
 
 
 class Standstill:
-    """Notices that a count stands still for longer than `STANDSTILL`, and that it moves again; time comes in."""
+    """Notices that a count stands still for longer than `STANDSTILL`, and that it moves again; time comes in.
+
+    told: the count stands still, and that was worth a line.
+    """
 
     def __init__(self) -> None:
+        self.told = False
         self._count = -1
         self._moved = 0.0
-        self._told = False
 
     def look(self, now: float, count: int, reason: str) -> str:
         """What is worth a line now; empty if nothing is. reason: why the count may be waiting, in words."""
         if count != self._count:
             self._count, self._moved = count, now
-            told, self._told = self._told, False
+            told, self.told = self.told, False
             return "goes on" if told else ""
-        if self._told or not reason or now - self._moved < STANDSTILL:
+        if self.told or not reason or now - self._moved < STANDSTILL:
             return ""
-        self._told = True
-        return f"waiting: {reason}"
+        self.told = True
+        return reason if reason.startswith("waiting") else f"waiting: {reason}"
+
+
+class Sight:
+    """Notices that another member of the run is out of sight, and that it or another one in its place is back.
+
+    Args:
+        role: as in "the learner".
+    """
+
+    def __init__(self, role: str) -> None:
+        self._role = role
+        self._seen = ""
+        self._lost = False
+
+    def look(self, there: bool, where: str) -> str:
+        """What is worth a line now; empty if nothing is. where: host and process id of the one that serves now."""
+        if not there:
+            told, self._lost = self._lost or not self._seen, bool(self._seen)
+            return "" if told else f"{self._role} on {self._seen} does not answer"
+        first, back = not self._seen, self._lost or where != self._seen
+        self._seen, self._lost = where, False
+        return f"{self._role} on {where} is back" if back and not first else ""
+
+
+def stamped(text: str) -> str:
+    """A line with its time."""
+    return f"{time.strftime('%H:%M:%S')} {text}"
 
 
 def counted(number: int, noun: str) -> str:
@@ -90,4 +124,8 @@ def progress_line(status: Mapping[str, Any]) -> str:
         f"{returns(status['return_mean_100'], status['episodes'])}  "
         f"{status['updates_per_s']:.0f} updates/s  network {status['acting']} acts  {connected(status['connected'])}"
     )
+    if status["warning"]:
+        text += f"  warning: {status['warning']}"
+    if status["missing"]:
+        text += f"  lost: {', '.join(status['missing'])}"
     return f"{text}  [{status['waiting']}]" if status["waiting"] else text

@@ -13,7 +13,8 @@ from rich.live import Live
 class LiveDisplay(ABC):
     """A context that is told to `update` again and again.
 
-    plain_every: seconds between lines where the output is no terminal. refreshes: pictures per second on one.
+    plain_every: seconds between lines where the output is no terminal; none is repeated. refreshes: pictures per second
+    on a terminal.
     """
 
     def __init__(self, plain_every: float, refreshes: float) -> None:
@@ -21,6 +22,7 @@ class LiveDisplay(ABC):
         self._live = Live(console=self._console, refresh_per_second=refreshes, transient=True)
         self._plain_every = plain_every
         self._due = time.monotonic() + plain_every
+        self._plain = ""
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:
@@ -36,7 +38,9 @@ class LiveDisplay(ABC):
             self._live.update(self.picture())
         elif time.monotonic() >= self._due:
             self._due = time.monotonic() + self._plain_every
-            self.say(self.line())
+            before, self._plain = self._plain, self.line()
+            if self._plain != before:
+                self.say(self._plain)
 
     def say(self, text: str) -> None:
         """Print a line that stays."""

@@ -12,7 +12,7 @@ from common.bounds import MAX_COUNT
 from common.errors import BadMessage, UsageError
 from common.messaging import wire
 from common.messaging.messages.body import Body
-from common.messaging.presence import ROLES, Origin
+from common.messaging.presence import JOINING, Origin
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.settings.tables import to_tables, validated
@@ -34,7 +34,7 @@ class Join(Body, frozen=True):
 
     kind: ClassVar[str] = "join"
 
-    role: Annotated[str, Meta(pattern=f"^({'|'.join(ROLES)})$")]
+    role: Annotated[str, Meta(pattern=f"^({'|'.join(JOINING)})$")]
     incarnation: Incarnation
     endpoints: Endpoints
     index: Annotated[int, Meta(ge=-1, le=MAX_COUNT)] = -1

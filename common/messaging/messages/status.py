@@ -22,7 +22,11 @@ def encode_status(run: str, status: dict[str, Any]) -> bytearray:
 
 
 class LearnerStatus(msgspec.Struct, frozen=True):
-    """What a display needs of the learner's status."""
+    """What a display needs of the learner's status.
+
+    connected: processes by role. missing: those that are lost. events: the newest lines of its console, each with a
+    number that grows. origin: where it runs.
+    """
 
     env_steps: Counter
     total_steps: Counter
@@ -35,7 +39,10 @@ class LearnerStatus(msgspec.Struct, frozen=True):
     s: Real
     waiting: Text
     connected: dict[Name, Counter]
-    missing: Annotated[list[Name], Meta(max_length=256)]
+    warning: Text
+    missing: Annotated[list[Text], Meta(max_length=1024)]
+    events: Annotated[list[tuple[int, Text]], Meta(max_length=64)]
+    origin: Text
 
     @classmethod
     def decode(cls, message: Message) -> Self:
