@@ -12,7 +12,7 @@ import zenoh
 from actors.policy import Policy
 from actors.service import ActorService
 from common.envs.make import make_vector_env
-from common.errors import JoinError, PeerLost
+from common.errors import JoinError
 from common.messaging.joining import Membership, join, take_leave
 from common.messaging.messages.join import Join, Joined
 from common.messaging.route import ReplayRoute
@@ -59,8 +59,7 @@ def _run() -> None:
                 _play(node, stop, options, request, joined, console)
         finally:
             take_leave(node, request)
-    if stop.failed:
-        raise PeerLost(stop.reason)
+    stop.leave()
 
 
 def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined, console: Console) -> None:

@@ -73,7 +73,7 @@ class Roles:
         self.processes["learner"].interrupt()
         for process in self.processes.values():
             process.end(GRACE)
-            if process.exit_status():
+            if process.exit_status() and not process.was_interrupted():
                 raise RunError(process.why())
         summary: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
         return summary

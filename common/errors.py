@@ -3,6 +3,7 @@
 CoopError
 |- UsageError      a flag, file or grid that can't be right: exit status 2, before anything starts
 |- RunError        a run that could not start or finish: exit status 1
+|  |- Interrupted  a signal has ended the work: exit status 130 or 143
 |  |- JoinError    no learner answered, or it refused us
 |  '- PeerLost     a role that this one needs stopped answering
 '- BadMessage      bytes from the wire that are not a valid message (names the field)
@@ -29,6 +30,14 @@ class RunError(CoopError):
 
 class JoinError(RunError):
     """No learner answered within the join time-out, or the learner refused this process."""
+
+
+class Interrupted(RunError):
+    """A signal has ended the work before its end; the exit status tells which one."""
+
+    def __init__(self, text: str, exit_status: int) -> None:
+        super().__init__(text)
+        self.exit_status = exit_status
 
 
 class PeerLost(RunError):

@@ -78,13 +78,13 @@ class Topology:
             process.start()
 
     def check(self, display: Display) -> bool:
-        """Look after the processes, and start those again that were killed; True once the learner has ended well.
+        """Start those again that were killed; True once the learner has ended well or by a signal.
 
         Raises:
             RunError: a role gave up by itself, or dies again and again.
             UsageError: a role found the config wrong.
         """
-        if self.learner.exit_status() == 0 or (self._interrupted and self.learner.was_interrupted()):
+        if self.learner.exit_status() == 0 or self.learner.was_interrupted():
             return True
         for process in self._all():
             if process.exit_status() is not None and not self._interrupted:
@@ -104,7 +104,7 @@ class Topology:
             status = process.exit_status() or 0
             if not policy.ended(now):
                 raise RunError(f"{process.why()}; it has been started again {RESTARTS} times")
-            if status > 0 and not process.name.startswith("actor"):
+            if status > 0 and not process.was_interrupted() and not process.name.startswith("actor"):
                 raise (UsageError if status == UsageError.exit_status else RunError)(process.why())
             if status:
                 display.say(stamped(f"{process.why()}; starting it again"))
@@ -174,8 +174,9 @@ def _supervise(topology: Topology, options: LocalOptions, config: RunConfig, dir
         status.close()
     if topology.learner.was_interrupted():
         topology.abort()
-        print("interrupted while the learner was starting; --resume goes on")
-        return
+        print(f"{topology.learner.last_line()}; --resume goes on")
+        stop.leave()
+        raise RunError(topology.learner.why())  # somebody has interrupted the learner alone
     topology.finish()
     print(topology.learner.last_line())
     curve = directory / "learning_curve.png"

@@ -44,6 +44,8 @@ def _run() -> None:
     print(f"{summary}; {path}")
     if run.trainer.diverged:
         raise RunError(run.trainer.diverged)
+    if summary.exit == stop.reason:  # else the run was over before
+        stop.leave()
 
 
 def run_lockstep(run: Lockstep, directory: RunDirectory, stop: Stop) -> Summary:

@@ -84,6 +84,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
             console.event("waiting for the replay service to tell which epochs it holds")
         number = epochs.wait(stop)
         if number is None:
+            stop.leave()
             return
         state = go_back(path, number)
         if state is not None:
@@ -101,5 +102,5 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
     print(summary, flush=True)
     if trainer.diverged:
         raise RunError(trainer.diverged)
-    if stop.failed:
-        raise RunError(stop.reason)
+    if stop.failed or summary.exit == stop.reason:  # else the run was over before a signal came
+        stop.leave()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from common.errors import PeerLost, RunError
+from common.errors import RunError
 from common.messaging.joining import Membership, join, take_leave
 from common.messaging.messages.join import MOST_EPOCHS, Join, Joined
 from common.messaging.presence import LEASE
@@ -68,8 +68,7 @@ def _run() -> None:
                 joined = joining(request)
                 if joined is not None:
                     _serve(node, stop, options, folder, request, joined, console)
-    if stop.failed:
-        raise PeerLost(stop.reason)
+    stop.leave()
 
 
 def _named(run: str, run_id: int) -> Path:

@@ -166,7 +166,7 @@ def test_ctrl_c_a_killed_actor_and_resume(tmp_path: Path) -> None:
         wait_for("metrics with the new actor", lambda: lines(path / "metrics.jsonl") > before + 1)
         local.send_signal(signal.SIGINT)
         out, err = local.communicate(timeout=40)
-        assert (local.returncode, err) == (0, "")
+        assert (local.returncode, err) == (130, "")
     assert re.search(SILENT, out)
     assert re.search(SILENT.replace("does not answer", "is back"), out)
     assert re.search(r"actor 1 ended \(killed by SIGKILL\).*starting it again", out)

@@ -93,7 +93,7 @@ def run(keys: Path) -> Iterator[tuple[str, str]]:
         roles[0].interrupt()
         for role in roles:
             role.end(60.0)
-        assert [role.exit_status() for role in roles] == [0, 0, 0], [role.last_line() for role in roles]
+        assert [role.exit_status() for role in roles] == [130, 0, 0], [role.last_line() for role in roles]
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["transitions_lost"], summary["exit"]) == (0, "interrupted")
 

@@ -9,14 +9,17 @@ import threading
 from collections.abc import Callable
 from types import FrameType
 
-from common.errors import CoopError
+from common.errors import CoopError, PeerLost
 
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
-INTERRUPTED = 130  # exit status after Ctrl-C where there was nothing to stop cleanly
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """A request to stop, with its reason; set by a signal, by a message or by the code itself."""
+    """A request to stop, with its reason; set by a signal, by a message or by the code itself.
+
+    failed: the process must end with exit status 1. exit_status: after a signal, as a shell tells it; else 0.
+    """
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -24,11 +27,12 @@ class Stop:
         self._parent = int(supervisor) if supervisor else None
         self.reason = ""
         self.failed = False
+        self.exit_status = 0
 
-    def set(self, reason: str, failed: bool = False) -> None:
-        """Ask for the stop; the first reason stays. `failed`: the process must end with exit status 1."""
+    def set(self, reason: str, failed: bool = False, exit_status: int = 0) -> None:
+        """Ask for the stop; the first reason stays, and what belongs to it."""
         if not self._event.is_set():
-            self.reason, self.failed = reason, failed
+            self.reason, self.failed, self.exit_status = reason, failed, exit_status
         self._event.set()
 
     def is_set(self) -> bool:
@@ -48,10 +52,22 @@ class Stop:
         def handle(number: int, frame: FrameType | None) -> None:
             if number == signal.SIGINT and self.is_set():
                 raise KeyboardInterrupt
-            self.set("interrupted")
+            self.set("interrupted", exit_status=status_after(number))
 
-        signal.signal(signal.SIGINT, handle)
-        signal.signal(signal.SIGTERM, handle)
+        for number in SIGNALS:
+            signal.signal(number, handle)
+
+    def leave(self) -> None:
+        """End the process as the reason of the stop asks.
+
+        Raises:
+            PeerLost: it is a failure.
+            SystemExit: it is a signal, which schedulers must not take for the end of the work.
+        """
+        if self.failed:
+            raise PeerLost(self.reason)
+        if self.exit_status:
+            sys.exit(self.exit_status)
 
     def on_thread_failures(self) -> None:
         """Let a thread that ends of an error of this program end the process, which would live on without it."""
@@ -62,6 +78,23 @@ class Stop:
             self.set(f"error of this program in the thread {name!r}: {failure.exc_value!r}", failed=True)
 
         threading.excepthook = handle
+
+
+def status_after(number: int) -> int:
+    """The exit status that tells of a signal."""
+    return 128 + number
+
+
+def end_on_signals(program: str) -> None:
+    """Let SIGINT and SIGTERM end this process at once, which has begun nothing yet; `Stop.on_signals` takes over."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        # Not by an exception: what is being imported may swallow it.
+        os.write(sys.stderr.fileno(), f"{program}: interrupted\n".encode())
+        os._exit(status_after(number))
+
+    for number in SIGNALS:
+        signal.signal(number, handle)
 
 
 def run_main(program: str, main: Callable[[], None]) -> None:
@@ -77,4 +110,4 @@ def run_main(program: str, main: Callable[[], None]) -> None:
         sys.exit(1)
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr, flush=True)
-        sys.exit(INTERRUPTED)
+        sys.exit(status_after(signal.SIGINT))

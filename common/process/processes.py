@@ -11,9 +11,10 @@ import sysconfig
 from pathlib import Path
 
 from common.errors import RunError
-from common.process.lifecycle import INTERRUPTED, SUPERVISED
+from common.process.lifecycle import SIGNALS, SUPERVISED, status_after
 from common.process.locks import INHERITED
 
+SIGNAL_STATUSES = tuple(map(status_after, SIGNALS))
 LAST_WORDS = 400  # characters of a log's last line
 
 
@@ -59,8 +60,8 @@ class ChildProcess:
         return None if self._process is None else self._process.poll()
 
     def was_interrupted(self) -> bool:
-        """True where an interrupt ended it before it could stop cleanly, as while it starts."""
-        return self.exit_status() in (-signal.SIGINT, INTERRUPTED)
+        """True where SIGINT or SIGTERM ended it, cleanly or while it started."""
+        return self.exit_status() in (*SIGNAL_STATUSES, *(-number for number in SIGNALS))
 
     def interrupt(self) -> None:
         """Ask it to stop cleanly."""

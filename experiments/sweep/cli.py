@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from common.errors import RunError, UsageError
+from common.errors import Interrupted, RunError, UsageError
 from common.process.cli import parse
 from common.process.lifecycle import Stop, run_main
 from experiments.sweep import slurm
@@ -92,7 +92,8 @@ def _work(runner: Runner, folder: Path) -> None:
     """Run until no cell is left or somebody asks to stop.
 
     Raises:
-        RunError: interrupted, or cells have failed.
+        Interrupted: a signal has come before the end.
+        RunError: cells have failed.
     """
     stop = Stop()
     stop.on_signals()
@@ -113,7 +114,7 @@ def _work(runner: Runner, folder: Path) -> None:
     for name, why in runner.tally.failed.items():
         print(f"failed: {name}: {why}")
     if not runner.done:
-        raise RunError(f"{stop.reason} with {line}; the same command goes on from here")
+        raise Interrupted(f"{stop.reason} with {line}; the same command goes on from here", stop.exit_status or 1)
     if runner.tally.failed:
         count = len(runner.tally.failed)
         raise RunError(f"{count} of {len(runner.folders)} cells failed; the same command tries them again")

@@ -1,0 +1,42 @@
+"""The console commands. What they need takes seconds to import: until then a signal ends the process at once."""
+
+from __future__ import annotations
+
+import importlib
+
+from common.process.lifecycle import end_on_signals
+
+
+def actor() -> None:
+    """`coop-actor`."""
+    _begin("coop-actor", "actors.cli")
+
+
+def learner() -> None:
+    """`coop-learner`."""
+    _begin("coop-learner", "learner.cli")
+
+
+def local() -> None:
+    """`coop-local`."""
+    _begin("coop-local", "deploy.local")
+
+
+def lockstep() -> None:
+    """`coop-lockstep`."""
+    _begin("coop-lockstep", "experiments.lockstep_cli")
+
+
+def replay() -> None:
+    """`coop-replay`."""
+    _begin("coop-replay", "replay.cli")
+
+
+def sweep() -> None:
+    """`coop-sweep`."""
+    _begin("coop-sweep", "experiments.sweep.cli")
+
+
+def _begin(program: str, module: str) -> None:
+    end_on_signals(program)
+    importlib.import_module(module).main()

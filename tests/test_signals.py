@@ -1,0 +1,83 @@
+"""How a command ends after a signal, whenever it comes: 130 after SIGINT, 143 after SIGTERM."""
+
+import json
+import signal
+import subprocess
+import sysconfig
+import time
+from pathlib import Path
+
+import pytest
+from test_topology import lines, running, wait_for
+
+from common.errors import PeerLost
+from common.process.lifecycle import Stop
+
+SCRIPTS = Path(sysconfig.get_path("scripts"))
+ROLES = ("coop-learner", "coop-replay", "coop-actor", "coop-lockstep", "coop-local", "coop-sweep")
+
+
+def catches(pid: int, number: int) -> bool:
+    """Whether a process has a handler of its own for a signal."""
+    status = dict(line.split(":\t", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return bool(int(status["SigCgt"], 16) >> (number - 1) & 1)
+
+
+@pytest.mark.parametrize("name", ROLES)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_while_a_command_starts(name: str, number: signal.Signals, tmp_path: Path) -> None:
+    flags = ["small-buffers"] if name == "coop-sweep" else []
+    with subprocess.Popen(
+        [SCRIPTS / name, *flags], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    ) as process:
+        deadline = time.monotonic() + 60
+        while not catches(process.pid, signal.SIGTERM):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (128 + number, "", f"{name}: interrupted\n")
+    assert not list(tmp_path.iterdir()), "nothing had begun"
+
+
+def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    flags = ("--total-steps", "3000", "--run-dir", str(path), "--resume")
+    with running("coop-lockstep", *flags) as run:
+        wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
+        run.send_signal(signal.SIGTERM)
+        out, err = run.communicate(timeout=60)
+    assert (run.returncode, err) == (143, "")
+    assert out.splitlines()[-1].startswith("interrupted: ")
+    assert json.loads((path / "summary.json").read_text())["exit"] == "interrupted"
+    done = subprocess.run([SCRIPTS / "coop-lockstep", *flags], capture_output=True, text=True, timeout=90, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("goes on from epoch ")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_whole_run_on_one_machine(number: signal.Signals, status: int, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    with running("coop-local", "--total-steps", "100000", "--run-dir", str(path)) as local:
+        wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
+        local.send_signal(number)
+        out, err = local.communicate(timeout=90)
+    assert (local.returncode, err) == (status, "")
+    assert out.splitlines()[-1].endswith("; --resume goes on")
+    assert json.loads((path / "summary.json").read_text())["exit"] == "interrupted"
+
+
+def test_the_first_reason_tells_the_status() -> None:
+    stop = Stop()
+    stop.set("complete")
+    stop.set("interrupted", exit_status=143)
+    stop.leave()
+    interrupted = Stop()
+    interrupted.set("interrupted", exit_status=143)
+    with pytest.raises(SystemExit, match="143"):
+        interrupted.leave()
+    lost = Stop()
+    lost.set("the learner has gone", failed=True)
+    with pytest.raises(PeerLost, match="the learner has gone"):
+        lost.leave()
