@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -220,6 +220,10 @@ class ReplayCore:
         self.recorder.limit(limiter)
         self.limiter = limiter
 
+    def adopt(self, limiter: RateLimiter) -> None:
+        """Take over the settings that the run had before; it may be longer now than it was then."""
+        self.limiter = replace(limiter, total=self._total_steps)
+
     def snapshot(self, base: int, keep: Sequence[int] = ()) -> CoreSnapshot:
         """Everything as it is now; a learner that is back at `base` updates can be served from it.
 
@@ -259,7 +263,7 @@ class ReplayCore:
         self._episodes.load(books["first_episode"], episodes, dict(books.get("floors", [])))
         self._accounts = {actor: _Account(accepted, acked) for actor, accepted, acked in books["accounts"]}
         self._learners = list(books["learners"])
-        self.limiter = RateLimiter.from_table(books["limiter"])
+        self.adopt(RateLimiter.from_table(books["limiter"]))
         self._replies = {drawn.sequence: Reply(self.table.pin(batch), drawn) for batch, drawn in replies}
 
     def _follow(self, request: DrawRequest) -> None:

@@ -1,6 +1,7 @@
 """Epochs on disk: what is restored goes on alike, torn ones are passed over, old ones go."""
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,16 @@ def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
             np.testing.assert_array_equal(getattr(first.batch.read(), name), getattr(second.batch.read(), name))
         assert first.drawn == second.drawn
     assert twin.snapshot(base).books == core.snapshot(base).books
+
+
+def test_a_run_that_was_complete_may_go_on_for_longer(spec: EnvSpec, tmp_path: Path) -> None:
+    core, epochs = _used_core(spec), ReplayEpochs(tmp_path, 5)
+    core.limit(core.limiter.changed(core.table.inserted, core.drawn, ratio=0.5))
+    save(core, epochs, 10)
+    longer = replace(CONFIG, total_steps=2 * CONFIG.total_steps)
+    epochs.restore(twin := ReplayCore(longer, spec), 10)
+    assert (twin.limiter.total, twin.limiter.ratio) == (longer.total_steps, 0.5)
+    assert twin.limiter.why_not_insert(CONFIG.total_steps, core.limiter.draws_total or 0) is None
 
 
 def test_the_frames_of_old_answers_are_given_back(spec: EnvSpec, tmp_path: Path) -> None:

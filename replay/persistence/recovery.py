@@ -62,7 +62,7 @@ def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Itera
                 raise RunError(f"{folder}: file {number}, batch {request.sequence}: not the transitions taken down")
             yield request, batch
         elif kind == LIMITER:
-            core.limiter = read_limiter(payload)
+            core.adopt(read_limiter(payload))
 
 
 def following_files(folder: Path, first: int) -> list[int]:
