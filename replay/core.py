@@ -300,4 +300,5 @@ def make_table(config: RunConfig, spec: EnvSpec) -> Table:
         rng=np.random.default_rng([config.seed, 1]),
         priority_exponent=settings.priority_exponent,
         importance_exponent=settings.importance_exponent,
+        replacement=settings.replacement,
     )

@@ -200,6 +200,16 @@ def test_atari_truncation_is_no_end_and_counts_steps() -> None:
         before = step.obs
 
 
+@pytest.mark.parametrize(("env_id", "limit"), [("CartPole-v0", 4), ("coop/Catch-v0", 3), ("breakout", 5)])
+def test_a_time_limit_is_terminal_where_asked(env_id: str, limit: int) -> None:
+    config = EnvSettings(id=env_id, max_episode_steps=limit, time_limit_terminal=True)
+    _, steps = played(config, 2, np.ones((3 * limit, 2)))
+    ends = [[n % limit == limit - 1] * 2 for n in range(3 * limit)]
+    assert [step.restarted.tolist() for step in steps] == ends
+    assert [step.terminated.tolist() for step in steps] == ends
+    assert [step.episode_over.tolist() for step in steps] == ends
+
+
 def test_atari_rewards_are_clipped_for_learning_only() -> None:
     actions = random_actions(6, 400, 2)
     _, steps = played(EnvSettings(id="space_invaders", clip_rewards=True), 2, actions)

@@ -71,10 +71,24 @@ def test_lowest_priority_heap_stays_small() -> None:
 
 
 def test_uniform_draws_every_row_alike() -> None:
-    rows, weights = Uniform(np.random.default_rng(0)).draw(100_000, 10)
+    rows, weights = Uniform(np.random.default_rng(0), replacement=True).draw(100_000, 10)
     np.testing.assert_allclose(np.bincount(rows) / 100_000, 0.1, atol=0.005)
     assert weights.dtype == np.float32
     assert (weights == 1).all()
+
+
+@pytest.mark.parametrize(("count", "size"), [(32, 33), (32, 32), (10, 10_000), (7, 3), (32, 5)])
+def test_without_replacement_none_comes_again_before_all_others(count: int, size: int) -> None:
+    policy = Uniform(np.random.default_rng(0), replacement=False)
+    drawn = np.zeros(size)
+    for _ in range(300):
+        rows, weights = policy.draw(count, size)
+        times = np.bincount(rows, minlength=size)
+        assert len(rows) == count
+        assert (times.min(), times.max()) == (count // size, -(-count // size))
+        assert (weights == 1).all()
+        drawn += times
+    np.testing.assert_allclose(drawn, 300 * count / size, atol=5 * max(1, 300 * count / size) ** 0.5)
 
 
 @pytest.mark.parametrize(("alpha", "beta"), [(1.0, 1.0), (0.6, 0.4), (0.0, 1.0)])

@@ -1,5 +1,6 @@
 """The weight-gradient feedback: U (S + s I) V^T of each layer's weight gradient, without an SVD of it."""
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -12,6 +13,7 @@ from learner.edl.feedback import edl_gradients
 from learner.edl.polar import polar, polar_of_product
 
 S = 0.3
+RNG = np.random.default_rng(0)
 
 
 def _network(kind: str, actions: int) -> tuple[nn.Sequential, tuple[int, ...]]:
@@ -75,10 +77,10 @@ def test_any_matrix(seed: int, rows: int, columns: int, rank: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     left = torch.randn(rank, rows, generator=generator, dtype=torch.float64)
     right = torch.randn(rank, columns, generator=generator, dtype=torch.float64)
-    assert _is_polar_factor(polar(left.T @ right), left.T @ right, 1e-6)
+    assert _is_polar_factor(polar(left.T @ right, RNG), left.T @ right, 1e-6)
     if 0 < rank < min(rows, columns):
-        assert _is_polar_factor(polar_of_product(left, right), left.T @ right, 1e-6)
-        single = polar_of_product(left.float(), right.float()).double()
+        assert _is_polar_factor(polar_of_product(left, right, RNG), left.T @ right, 1e-6)
+        single = polar_of_product(left.float(), right.float(), RNG).double()
         assert _is_polar_factor(single, left.T @ right, 1e-4)
 
 
@@ -88,3 +90,42 @@ def test_batches_of_equal_samples_and_of_zero_error_are_harmless() -> None:
     for e in (torch.zeros(16, 3, dtype=torch.float64), torch.full((16, 3), 0.1, dtype=torch.float64)):
         for gradient in edl_gradients(network, x, e, S, "weight-gradient").values():
             assert gradient.isfinite().all()
+
+
+def _of_rank(rank: int, rows: int, columns: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+    """Factors of a matrix left^T right whose last samples repeat the first ones, and its U and V^T by LAPACK."""
+    generator = torch.Generator().manual_seed(rank)
+    left, right = (torch.randn(rank, n, generator=generator, dtype=torch.float64) for n in (rows, columns))
+    left, right = (torch.cat((x, x[: rank // 2])) for x in (left, right))
+    u, _, vh = torch.linalg.svd(left.T @ right, full_matrices=False)
+    return left, right, (u[:, :rank], vh[:rank])
+
+
+@pytest.mark.parametrize(("rank", "rows", "columns"), [(8, 24, 24), (6, 20, 31), (10, 31, 20), (4, 9, 5), (10, 12, 30)])
+def test_null_directions_are_paired_without_a_bias(rank: int, rows: int, columns: int) -> None:
+    """Where singular values are above rounding it is LAPACK's U V^T; the rest has mean 0 and is spread evenly."""
+    left, right, (u, vh) = _of_rank(rank, rows, columns)
+    draws = 600
+    rests = []
+    for draw in range(draws):
+        rng = np.random.default_rng(draw)
+        by_product = len(left) < min(rows, columns)
+        factor = polar_of_product(left, right, rng) if by_product else polar(left.T @ right, rng)
+        rests.append(factor - u @ vh)
+    rest = torch.stack(rests)
+    missing = min(rows, columns) - rank
+    torch.testing.assert_close(u.T @ rest, torch.zeros(draws, rank, columns, dtype=rest.dtype), atol=1e-8, rtol=0)
+    torch.testing.assert_close(rest @ vh.T, torch.zeros(draws, rows, rank, dtype=rest.dtype), atol=1e-8, rtol=0)
+    sizes = rest.square().sum((1, 2))
+    torch.testing.assert_close(sizes, torch.full_like(sizes, missing))
+    # The squared norm of the mean of so many independent draws; a fixed pairing has `missing`.
+    assert 0.7 < draws * float(rest.mean(0).square().sum()) / missing < 1.4
+
+
+def test_completions_of_a_rule_come_from_its_generator() -> None:
+    network, shape = _network("mlp", 3)
+    x, e = torch.ones(16, *shape, dtype=torch.float64), torch.full((16, 3), 0.1, dtype=torch.float64)
+    first, again, other = (edl_gradients(network, x, e, S, "weight-gradient", seed=seed) for seed in (0, 0, 1))
+    name = [name for name in first if name.endswith("weight")][1]
+    assert torch.equal(first[name], again[name])
+    assert (first[name] - other[name]).abs().max() > 0.01

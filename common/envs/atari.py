@@ -32,6 +32,7 @@ class AtariEnv:
         self.num_envs = len(seeds)
         self._seeds = np.array(seeds)
         self._clip = settings.clip_rewards
+        self._limit_terminal = settings.time_limit_terminal
         limit = settings.max_episode_steps * settings.frame_skip
         self._ale = AtariVectorEnv(
             game,
@@ -78,6 +79,8 @@ class AtariEnv:
         if np.count_nonzero(restarted):
             next_obs = obs.copy()
             next_obs[restarted] = self._shape(info["final_obs"])[restarted]
+        if self._limit_terminal:
+            terminated = terminated | restarted
         raw_rewards = rewards.astype(np.float64)
         learned = np.clip(rewards, -1, 1) if self._clip else rewards
         return Steps(obs, next_obs, learned.astype(np.float32), raw_rewards, terminated, restarted, restarted)

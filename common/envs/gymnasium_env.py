@@ -33,6 +33,7 @@ class GymnasiumEnv:
         self.num_envs = len(seeds)
         self._seeds = seeds
         self._clip = settings.clip_rewards
+        self._limit_terminal = settings.time_limit_terminal
         self._pictures = self.spec.frame_dtype == "uint8"
         space, actions = self._envs[0].observation_space, self._envs[0].action_space
         assert space.shape is not None
@@ -72,10 +73,11 @@ class GymnasiumEnv:
             self._put(next_obs, row, frame)
             rewards.append(reward)
             lengths[row] += 1
-            if terminated:
-                terminal.append(row)
-            if terminated or truncated or lengths[row] == self._limit:
+            ended = terminated or truncated or lengths[row] == self._limit
+            if ended:
                 over.append(row)
+            if terminated or (ended and self._limit_terminal):
+                terminal.append(row)
         raw_rewards = np.array(rewards, np.float64)
         learned = np.clip(raw_rewards, -1.0, 1.0) if self._clip else raw_rewards
         self._obs = self._restart(next_obs, over) if over else next_obs

@@ -60,7 +60,9 @@ class LearnerSettings:
     reset_role_at_episode: bool = False
     """Let network 1 act at the start of each episode, as Algorithm 1 writes it; lockstep runs only."""
     gamma: Share = 0.99
-    loss: Literal["squared", "huber"] = "squared"
+    loss: Literal["squared", "mse", "huber"] = "squared"
+    """squared: 1/2 e^2, the paper's; mse: e^2, as PyTorch's and the authors' code, so s weighs half as much beside it;
+    huber: 1/2 e^2 with its slope clipped to [-1, 1]."""
     double: bool = False
     """Take the target's value at the action that the trained network prefers, as in double Q-learning."""
     optimizer: OptimizerName = "rmsprop"
@@ -69,6 +71,9 @@ class LearnerSettings:
     learning_rate: PositiveFloat = 1e-3
     learning_rate_final: PositiveShare = 1.0
     """The learning rate falls exponentially to this share of itself over the whole run."""
+    learning_rate_decay: PositiveShare = 1.0
+    """The learning rate is multiplied by this, beside, after every `learning_rate_decay_every` updates, in steps."""
+    learning_rate_decay_every: Positive = 1000
     momentum: Decay = 0.0
     """Of the steps (sgd, rmsprop)."""
     alpha: Decay = 0.99
@@ -104,6 +109,8 @@ class EdlSettings:
     decay: PositiveShare = 1.0
     """s is multiplied by this every `decay_every` updates."""
     decay_every: Positive = 1000
+    decay_stepwise: bool = False
+    """Multiply at once after `decay_every` updates; else a little with each update."""
     noise: Literal["constant", "normal"] = "constant"
     """normal: s is the rate times one draw from N(0, 1) per update."""
     feedback: Literal["transform", "weight-gradient", "random"] = "transform"
@@ -128,6 +135,8 @@ class ReplaySettings:
     """Steps of reward that a transition sums up before it bootstraps (1: the paper); fewer at an episode's end."""
     eviction: Literal["fifo", "reservoir", "prioritized"] = "fifo"
     sampling: Literal["uniform", "prioritized"] = "uniform"
+    replacement: bool = True
+    """Draw a batch with replacement; without, it holds no transition twice (uniform sampling only)."""
     priority_exponent: Share = 0.6
     importance_exponent: Share = 0.4
     journal: bool = False

@@ -33,6 +33,9 @@ class EnvSettings:
     """All 18 actions in place of the game's own; ALE only."""
     max_episode_steps: Annotated[int, Field(ge=0, le=MAX_GAME_STEPS)] = 0
     """Truncate after so many steps; 0 keeps the environment's own limit (ALE: 108,000 frames)."""
+    time_limit_terminal: bool = False
+    """An episode that its time limit ends counts as terminal for learning, as in old gym; else its last state has a
+    value."""
 
     @property
     def atari(self) -> bool:

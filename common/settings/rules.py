@@ -33,6 +33,8 @@ def _problems(config: RunConfig) -> Iterator[str]:
             f"total_steps = {config.total_steps}: plans no update; allowed: at least {least} "
             f"with replay.learning_starts = {replay.learning_starts} and replay.ratio = {replay.ratio:g}"
         )
+    if not replay.replacement and replay.sampling != "uniform":
+        yield f"replay.sampling = {replay.sampling!r}: allowed: 'uniform' with replay.replacement = False"
     if replay.journal_keep and not replay.journal:
         yield "replay.journal_keep = True: needs replay.journal = True"
     if replay.prioritized and learner.batch_size * learner.prefetch > MAX_PRIORITIES:

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -40,7 +41,8 @@ class FeedbackRule:
     chain: the network, in PyTorch or in numpy; arrays of the same library go in and come out.
     feedback: "none" (backpropagation), "transform" (the equations above), "weight-gradient" (backpropagation, then
         U (S + s I) V^T of each weight gradient; biases plain) or "random" (fixed B(i), direct feedback alignment).
-    seed: draws the fixed matrices of "random", and nothing else.
+    seed: draws the fixed matrices of "random".
+    rng: draws how "weight-gradient" completes a gradient that lacks rank; of its own, from `seed`, if not given.
     polar_dtype: dtype of the passes that only the polar part needs; T(i)^T e is exact always. None: the network's.
         Of a `Chain` only.
     """
@@ -51,6 +53,7 @@ class FeedbackRule:
         feedback: str = "transform",
         seed: int = 0,
         polar_dtype: torch.dtype | None = None,
+        rng: np.random.Generator | None = None,
     ) -> None:
         if feedback not in FEEDBACKS:
             raise ValueError(f"feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
@@ -59,6 +62,7 @@ class FeedbackRule:
         self.feedback = feedback
         self._seed = seed
         self._polar_dtype = polar_dtype
+        self._rng = rng or np.random.default_rng(seed)
         self._fixed: dict[int, Array] = {}
 
     def backward(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
@@ -77,7 +81,7 @@ class FeedbackRule:
                 self.chain.write(tape, index, delta[:, 0], out)
                 if self.feedback == "weight-gradient" and s != 0:
                     gradient = out[self.chain.names[index] + "weight"]
-                    gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index])
+                    gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index], self._rng)
 
     def _transform(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
         """sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e for every layer, then its gradients."""
@@ -104,13 +108,13 @@ class FeedbackRule:
         return (error @ self._fixed[index]).reshape(shape)
 
 
-def _polar_of_gradient(gradient: Array, delta: Array, h: Array) -> Array:
+def _polar_of_gradient(gradient: Array, delta: Array, h: Array, rng: np.random.Generator) -> Array:
     """U V^T of a weight gradient [m, ...]; that of a Linear layer is delta^T h, which lacks rank in a small batch."""
     matrix = torch.as_tensor(gradient).flatten(1)
     if delta.ndim == 2 and len(delta) < min(matrix.shape):
-        factor = polar_of_product(torch.as_tensor(delta), torch.as_tensor(h))
+        factor = polar_of_product(torch.as_tensor(delta), torch.as_tensor(h), rng)
     else:
-        factor = polar(matrix)
+        factor = polar(matrix, rng)
     return like(factor.view(gradient.shape), gradient)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -81,31 +82,69 @@ def _whitened_by_eigh(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Te
     return white.squeeze(-1), None if safe.all() else ~safe
 
 
-def polar(matrix: Tensor) -> Tensor:
-    """U V^T of one matrix [m, n], by the Gram matrix of its shorter side, computed in float64."""
-    if min(matrix.shape) <= _SMALL:
-        return polar_by_svd(matrix.unsqueeze(0))[0]
+def polar(matrix: Tensor, rng: np.random.Generator) -> Tensor:
+    """U V^T of one matrix [m, n], by the Gram matrix of its shorter side, computed in float64; nan if not finite.
+
+    rng: draws the completion where the matrix lacks rank, see `polar_of_product`.
+    """
     if matrix.shape[0] > matrix.shape[1]:
-        return polar(matrix.t()).t()
+        return polar(matrix.t(), rng).t()
     wide = matrix.double()
-    units = torch.eye(len(wide), dtype=wide.dtype, device=wide.device)
-    root, doubtful = whitened((wide @ wide.t()).unsqueeze(0), units)
-    return polar_by_svd(matrix.unsqueeze(0))[0] if doubtful is not None else (root @ wide).to(matrix.dtype)
+    if len(wide) > _SMALL:
+        units = torch.eye(len(wide), dtype=wide.dtype, device=wide.device)
+        root, doubtful = whitened((wide @ wide.t()).unsqueeze(0), units)
+        if doubtful is None:
+            return (root @ wide).to(matrix.dtype)
+    if not wide.isfinite().all():
+        return torch.full_like(matrix, torch.nan)
+    u, values, vh = torch.linalg.svd(wide, full_matrices=False)
+    if missing := len(wide) - (rank := _rank(values, matrix.dtype)):
+        # Normal draws off the row space are spread evenly over the directions of its complement.
+        draw = torch.from_numpy(rng.standard_normal((wide.shape[1], missing))).to(wide.device)
+        for _ in range(2):  # the second time takes away what rounding left
+            draw -= vh[:rank].t() @ (vh[:rank] @ draw)
+        q, r = torch.linalg.qr(draw)
+        vh = torch.cat((vh[:rank], (q * r.diagonal().sign()).t()))
+    return (u @ vh).to(matrix.dtype)
 
 
-def polar_of_product(left: Tensor, right: Tensor) -> Tensor:
+def polar_of_product(left: Tensor, right: Tensor, rng: np.random.Generator) -> Tensor:
     """U V^T [m, n] of left^T right, whose rank is at most r < m, n: left [r, m], right [r, n]; nan if not finite.
 
-    With the full QR factorisations left^T = Q R and right^T = P L, left^T right = Q (R L^T) P^T. So U V^T is
-    Q K P^T, with the polar factor of the r x r matrix R L^T in the corner of K and an identity beside it, which
-    completes the null directions.
+    With the full QR factorisations left^T = Q R and right^T = P L, and the SVD R L^T = u s v, left^T right is
+    Q u s v P^T. So U V^T is Q u K v P^T, where K is the identity for the singular values above the rounding of the
+    dtype, and pairs the null directions, u and v being extended by an identity.
+
+    The pairing is a signed permutation drawn from rng, which has the mean (0) and the covariance of an orthogonal
+    matrix drawn uniformly. A fixed pairing would push the weights the same way in every update.
     """
     r, m, n = len(left), left.shape[1], right.shape[1]
     (q, q_tau), (p, p_tau) = torch.geqrf(left.t().double()), torch.geqrf(right.t().double())
-    factor = torch.eye(m, n, dtype=left.dtype, device=left.device)
-    factor[:r, :r] = polar_by_svd((q[:r].triu() @ p[:r].triu().t()).unsqueeze(0))[0].to(left.dtype)
-    factor = torch.ormqr(q.to(left.dtype), q_tau.to(left.dtype), factor)
+    corner = q[:r].triu() @ p[:r].triu().t()
+    if not corner.sum().isfinite():
+        return torch.full((m, n), torch.nan, dtype=left.dtype, device=left.device)
+    u, values, vh = torch.linalg.svd(corner)
+    factor = _paired(m, n, _rank(values, left.dtype), rng).to(corner.device)
+    factor[:r] = u @ factor[:r]
+    factor[:, :r] = factor[:, :r] @ vh
+    factor = torch.ormqr(q.to(left.dtype), q_tau.to(left.dtype), factor.to(left.dtype))
     return torch.ormqr(p.to(left.dtype), p_tau.to(left.dtype), factor, left=False, transpose=True)
+
+
+def _rank(values: Tensor, dtype: torch.dtype) -> int:
+    """How many singular values, largest first, say more than the rounding of a matrix in `dtype`."""
+    return int((values > torch.finfo(dtype).eps * values[0]).sum())
+
+
+def _paired(m: int, n: int, rank: int, rng: np.random.Generator) -> Tensor:
+    """float64 [m, n]: an identity [rank, rank], and a random signed permutation of what is left beside it."""
+    pairs = min(m, n) - rank
+    paired = np.zeros((m, n))
+    diagonal = np.arange(rank)
+    paired[diagonal, diagonal] = 1
+    rows, columns = rank + rng.permutation(m - rank)[:pairs], rank + rng.permutation(n - rank)[:pairs]
+    paired[rows, columns] = rng.choice((-1.0, 1.0), pairs)
+    return torch.from_numpy(paired)
 
 
 def polar_by_svd(matrices: Tensor) -> Tensor:

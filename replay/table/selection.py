@@ -112,21 +112,27 @@ class Sampling(Protocol):
     """Draws rows of the table, and says how to weigh them."""
 
     def draw(self, count: int, size: int) -> tuple[Rows, NDArray[np.float32]]:
-        """Rows intp [count] among 0..size-1, drawn with replacement, and weights float32 [count] (largest: 1)."""
+        """Rows intp [count] among 0..size-1, and weights float32 [count] (largest: 1)."""
 
     def prioritise(self, rows: Rows, priorities: Floats) -> None:
         """Learn the priorities of these rows."""
 
 
 class Uniform:
-    """Every held transition is equally likely."""
+    """Every held transition is equally likely; without replacement, none is drawn again before all others are."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: np.random.Generator, *, replacement: bool) -> None:
         self._rng = rng
+        self._replacement = replacement
 
     def draw(self, count: int, size: int) -> tuple[Rows, NDArray[np.float32]]:
-        """Independent draws; all weights are 1."""
-        return self._rng.integers(0, size, count), np.ones(count, np.float32)
+        """All weights are 1."""
+        if self._replacement:
+            rows = self._rng.integers(0, size, count)
+        else:
+            everything = np.tile(np.arange(size), count // size)
+            rows = np.concatenate((everything, self._rng.choice(size, count % size, replace=False)))
+        return rows, np.ones(count, np.float32)
 
     def prioritise(self, rows: Rows, priorities: Floats) -> None:
         """All are equal."""
@@ -135,7 +141,7 @@ class Uniform:
 class Proportional:
     """P(i) = p_i^alpha / sum_k p_k^alpha, weights (size P(i))^-beta over the batch's largest (Schaul et al. 2016).
 
-    One draw from each of `count` equal shares of the sum, as there. A priority below `PRIORITY_FLOOR` counts as
+    One draw from each of `count` equal shares of the sum, as there, so that one transition may be drawn twice. A priority below `PRIORITY_FLOOR` counts as
     that, so that nothing held is out of reach.
     """
 
@@ -221,12 +227,14 @@ def make_eviction(
 
 
 def make_sampling(
-    name: str, rng: np.random.Generator, capacity: int, alpha: float, beta: float
+    name: str, rng: np.random.Generator, capacity: int, alpha: float, beta: float, *, replacement: bool
 ) -> Uniform | Proportional:
-    """The sampling policy of this name; raises UsageError for any other name."""
+    """The sampling policy of this name; raises UsageError for any other, or one that can't do without replacement."""
     match name:
         case "uniform":
-            return Uniform(rng)
+            return Uniform(rng, replacement=replacement)
+        case "prioritized" if not replacement:
+            raise UsageError("sampling: 'prioritized' draws with replacement; without, allowed is uniform")
         case "prioritized":
             return Proportional(capacity, rng, alpha, beta)
     raise UsageError(f"sampling: {name!r} is not one of {', '.join(SAMPLINGS)}")

@@ -51,6 +51,7 @@ class Table:
         rng: np.random.Generator,
         priority_exponent: float = 0.6,
         importance_exponent: float = 0.4,
+        replacement: bool = True,
     ) -> None:
         """Raises UsageError for a capacity below 1, exponents below 0 or a policy that does not exist."""
         if capacity < 1:
@@ -85,7 +86,9 @@ class Table:
         self._max_priority = 1.0
         self._row_of: dict[int, int] | None = {} if self._prioritized and eviction != "fifo" else None
         self._eviction = make_eviction(eviction, rng, self._ids, self._priorities)
-        self._sampling = make_sampling(sampling, rng, capacity, priority_exponent, importance_exponent)
+        self._sampling = make_sampling(
+            sampling, rng, capacity, priority_exponent, importance_exponent, replacement=replacement
+        )
         self._tails = StreamTails(self._frames, spec.stack)
         self._sampled = 0
         self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
@@ -133,7 +136,7 @@ class Table:
             self._set_priorities(rows, np.full(len(rows), self._max_priority))
 
     def sample(self, batch_size: int) -> Batch:
-        """Draw transitions with replacement by the sampling policy. Raises ValueError while the table is empty."""
+        """Draw transitions by the sampling policy. Raises ValueError while the table is empty."""
         slots, columns = self._draw(batch_size)
         return Batch(frames=self._frames.read(slots), **columns)
 
