@@ -95,9 +95,12 @@ class Lockstep:
 
     def _updates_due(self) -> int:
         """Updates that the replay ratio asks for after this step."""
+        return self._updates_by(self.step) - self._updates_by(self.step - 1)
+
+    def _updates_by(self, step: int) -> int:
+        """Updates that follow the first `step` steps."""
         settings = self.config.replay
-        since = self.step - settings.learning_starts
-        return 0 if since <= 0 else math.floor(settings.ratio * since) - math.floor(settings.ratio * (since - 1))
+        return math.floor(settings.ratio * max(0, step - settings.learning_starts))
 
     def save(self, directory: RunDirectory) -> None:
         """Save an epoch from which `restore` goes on to the bit."""
@@ -140,7 +143,7 @@ class Lockstep:
 
     def _replay_actions(self, actions: Iterable[int]) -> None:
         """Play the actions of a run once more; the table is to come from its snapshot."""
-        for action in actions:
+        for step, action in enumerate(actions):
             turn = self._player.replay(np.array([action], np.int32))
-            self._segments.add(turn.actions, turn.steps, turn.version, turn.ended)
+            self._segments.add(turn.actions, turn.steps, self._updates_by(step), turn.ended)
             self._actions.append(action)

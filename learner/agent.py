@@ -67,11 +67,11 @@ class Agent:
         self.acting = 0
         self.updates = 0
         self.versions = [0, 0]
-        self._networks = [make_q_network(config, spec, number, self.device) for number in (0, 1)]
+        self._noise = np.random.default_rng([config.seed, 2])
+        self._networks = [make_q_network(config, spec, number, self.device, self._noise) for number in (0, 1)]
         trained = self._networks if config.two_networks else self._networks[:1]
         self.optimizers = [make_optimizer(config.learner, one.theta, one.gradient) for one in trained]
         self._weight_decay = _decay_vector(config.learner.weight_decay, self.networks[0].layout)
-        self._noise = np.random.default_rng([config.seed, 2])
 
     @property
     def networks(self) -> list[FlatNetwork]:
@@ -146,7 +146,7 @@ class Agent:
         return s * float(self._noise.standard_normal()) if self.config.edl.noise == "normal" and s else s
 
     def _learning_rate(self) -> float:
-        return schedules.learning_rate(self.config.learner, self.updates / max(1, self.config.planned_updates))
+        return schedules.learning_rate(self.config.learner, self.updates, self.config.planned_updates)
 
     def _count(self) -> bool:
         """Count an update; True where the roles change after it."""

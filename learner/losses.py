@@ -34,6 +34,18 @@ class SquaredError:
         return errors
 
 
+class MeanSquaredError:
+    """e^2, as PyTorch's MSELoss: twice the slope of the squared error."""
+
+    def cost(self, errors: Values) -> Values:
+        """See `Loss`."""
+        return errors * errors
+
+    def slope(self, errors: Values) -> Values:
+        """See `Loss`."""
+        return np.float32(2) * errors
+
+
 class Huber:
     """1/2 e^2 where |e| < 1, and |e| - 1/2 beyond: the squared error with its slope clipped to [-1, 1]."""
 
@@ -47,7 +59,7 @@ class Huber:
         return errors.clip(-1, 1)
 
 
-LOSSES: dict[str, Loss] = {"squared": SquaredError(), "huber": Huber()}
+LOSSES: dict[str, Loss] = {"squared": SquaredError(), "mse": MeanSquaredError(), "huber": Huber()}
 
 
 def td_errors(

@@ -29,12 +29,15 @@ class QNetwork:
 
     Args:
         network: the parameters, also published and saved. half: a copy in bfloat16, or None.
+        rng: what chance there is in the feedback.
 
     Attributes:
         theta, gradient: float32 [P], of PyTorch or numpy; the optimizer moves one along the other.
     """
 
-    def __init__(self, network: FlatNetwork, half: FlatNetwork | None, config: RunConfig) -> None:
+    def __init__(
+        self, network: FlatNetwork, half: FlatNetwork | None, config: RunConfig, rng: np.random.Generator
+    ) -> None:
         polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
         in_numpy = polar_dtype is None and not config.learner.compile
         self.network = network
@@ -42,7 +45,7 @@ class QNetwork:
         self._trained = Trainable(network, in_numpy)
         self._target = self._trained if half is None else Trainable(half, in_numpy)
         self._source = self._target if config.feedback == "none" else self._trained
-        rule = FeedbackRule(self._source.chain, config.feedback, config.seed, polar_dtype)
+        rule = FeedbackRule(self._source.chain, config.feedback, config.seed, polar_dtype, rng)
         ready = torch.compile if config.learner.compile else _as_it_is
         self._forward = ready(self._source.chain.forward)
         self._values = ready(self._target.values)
@@ -96,11 +99,13 @@ def make_network(
     return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
 
 
-def make_q_network(config: RunConfig, spec: EnvSpec, number: int, device: torch.device) -> QNetwork:
+def make_q_network(
+    config: RunConfig, spec: EnvSpec, number: int, device: torch.device, rng: np.random.Generator
+) -> QNetwork:
     """Network 0 or 1 of a run as it starts, ready to be trained."""
     in_half = config.network.dtype == "bfloat16"
     half = make_network(config, spec, number, device, torch.bfloat16) if in_half else None
-    return QNetwork(make_network(config, spec, number, device), half, config)
+    return QNetwork(make_network(config, spec, number, device), half, config, rng)
 
 
 def on_host(values: Array) -> NDArray[np.float32]:

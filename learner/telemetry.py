@@ -32,7 +32,7 @@ class Telemetry:
         self.largest_reward = 0.0
         self.q_abs_mean = 0.0
         self._errors: list[NDArray[np.float32]] = []
-        self._batches: list[tuple[Array, Array, Array]] = []
+        self._batches: list[tuple[Array, Array, Array, Array]] = []
         self._began = (now, 0, 0)
 
     def add(self, agent: Agent, batch: Batch, update: Update) -> None:
@@ -42,12 +42,14 @@ class Telemetry:
         self._errors.append(update.td_errors)
         self.largest_reward = max(self.largest_reward, float(np.abs(batch.rewards).max()))
         # Copies: the arrays may be views that would keep a whole message alive.
-        self._batches.append((batch.age.copy(), batch.reuse.copy(), agent.updates - batch.param_version))
+        lag = agent.updates - batch.param_version
+        self._batches.append((batch.age.copy(), batch.reuse.copy(), lag, batch.ids.copy()))
 
     def row(self, agent: Agent, drawn: Drawn, epsilon: float, now: float) -> dict[str, Any]:
         """The metrics of the updates since the last row; at least one."""
         errors = np.concatenate(self._errors)
         age, reuse, lag = (np.concatenate([arrays[i] for arrays in self._batches]) for i in range(3))
+        distinct = sum(len(np.unique(ids)) for *_, ids in self._batches)
         began, updates, steps = self._began
         seconds = max(now - began, 1e-9)
         self._errors, self._batches = [], []
@@ -74,6 +76,8 @@ class Telemetry:
             "sample_age_mean": float(age.mean()),
             "sample_age_p95": float(np.percentile(age, 95)),
             "reuse_mean": float(reuse.mean()),
+            "reuse_histogram": reuse_histogram(reuse),
+            "distinct_share": distinct / len(reuse),
             "evicted_unsampled": drawn.evicted_unsampled / max(1, drawn.evicted),
             "weight_lag_mean": float(lag.mean()),
         }
@@ -127,3 +131,12 @@ class Telemetry:
         held = [] if self.fixed is None else list(self.fixed)
         new = batch.frames[batch.obs_index[: FIXED_STATES - len(held)]].reshape(-1, *agent.spec.obs_shape)
         self.fixed = np.array([*held, *new])
+
+
+def reuse_histogram(reuse: NDArray[np.integer[Any]]) -> list[int]:
+    """Samples by how often each had been drawn, this draw included (at least 1): once, 2 to 3 times, 4 to 7, 8 to 15...
+
+    Entry b counts those drawn 2^b to 2^(b + 1) - 1 times; the last entry is not 0.
+    """
+    counts: list[int] = np.bincount(np.frexp(reuse)[1] - 1).tolist()
+    return counts

@@ -79,7 +79,7 @@ def test_coop_without_s_is_g_coop() -> None:
 
 
 @pytest.mark.parametrize("double", [False, True])
-@pytest.mark.parametrize("loss", ["squared", "huber"])
+@pytest.mark.parametrize("loss", ["squared", "mse", "huber"])
 def test_an_update_by_autograd(double: bool, loss: str) -> None:
     """One step of SGD on 1/2 e^2 (or Huber's) with the targets written out."""
     agent = Agent(_config("g-coop", optimizer="sgd", double=double, loss=loss, gamma=0.9), SPEC)
@@ -94,9 +94,11 @@ def test_an_update_by_autograd(double: bool, loss: str) -> None:
         discounts = 0.9 ** torch.tensor(batch.span) * ~torch.tensor(batch.terminated)
         targets = torch.tensor(batch.rewards) + discounts * value
     errors = online.module(obs).gather(1, actions)[:, 0] - targets
-    costs = (
-        0.5 * errors**2 if loss == "squared" else torch.nn.functional.huber_loss(errors, 0 * errors, reduction="none")
-    )
+    costs = {
+        "squared": 0.5 * errors**2,
+        "mse": torch.nn.functional.mse_loss(errors, 0 * errors, reduction="none"),
+        "huber": torch.nn.functional.huber_loss(errors, 0 * errors, reduction="none"),
+    }[loss]
     parameters = list(online.module.parameters())
     gradients = torch.autograd.grad((costs * torch.tensor(batch.weights)).mean(), parameters)
     expected = online.snapshot() - 1e-3 * torch.cat([g.flatten() for g in gradients]).numpy()

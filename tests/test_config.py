@@ -189,8 +189,13 @@ def test_a_file_that_is_not_toml(tmp_path: Path) -> None:
         (schedules.epsilon(ActorSettings(1, 1.0, 0.1, "linear", 100), 50), 0.55),
         (schedules.epsilon(ActorSettings(1, 1.0, 0.1, "linear", 100), 500), 0.1),
         (schedules.exploration_rate(EdlSettings(rate=0.1, decay=0.5, decay_every=10), 20), 0.025),
-        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_final=0.01), 0.5), 0.1),
-        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_final=0.01), 3.0), 0.01),
+        (schedules.exploration_rate(EdlSettings(rate=0.1, decay=0.5, decay_every=10), 15), 0.035355339),
+        (schedules.exploration_rate(EdlSettings(rate=0.1, decay=0.5, decay_every=10, decay_stepwise=True), 9), 0.1),
+        (schedules.exploration_rate(EdlSettings(rate=0.1, decay=0.5, decay_every=10, decay_stepwise=True), 15), 0.05),
+        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_final=0.01), 100, 200), 0.1),
+        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_final=0.01), 600, 200), 0.01),
+        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_decay=0.8), 999, 9000), 1.0),
+        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_decay=0.8), 2000, 9000), 0.64),
     ],
 )
 def test_schedules(value: float, expected: float) -> None:
@@ -201,7 +206,7 @@ def test_a_shorter_run_of_a_preset_is_how_the_longer_one_begins() -> None:
     whole = base_config(["--preset", "cartpole"])
     half = base_config(["--preset", "cartpole", "--total-steps", str(whole.total_steps // 2)])
     double = base_config(["--preset", "cartpole", "--total-steps", str(whole.total_steps * 2)])
-    for share in (0.1, 0.5, 1.0):
-        expected = schedules.learning_rate(whole.learner, share / 2)
-        assert schedules.learning_rate(half.learner, share) == pytest.approx(expected)
-        assert schedules.learning_rate(double.learner, share) == schedules.learning_rate(whole.learner, share)
+    for share in (10, 50, 100):
+        expected = schedules.learning_rate(whole.learner, share, 200)
+        assert schedules.learning_rate(half.learner, share, 100) == pytest.approx(expected)
+        assert schedules.learning_rate(double.learner, share, 200) == expected

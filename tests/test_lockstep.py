@@ -179,3 +179,25 @@ def test_an_epoch_of_the_old_format_goes_on_to_the_byte(tmp_path: Path) -> None:
     episodes = [(tmp_path / name / "episodes.csv").read_bytes() for name in ("whole", "run")]
     assert episodes[0] == episodes[1]
     assert torch.equal(whole.agent.networks[0].flat, resumed.agent.networks[0].flat)
+
+
+def test_steps_that_wait_for_their_return_come_back_with_a_resumed_run(tmp_path: Path) -> None:
+    """With n-step returns the last n - 1 steps are not in the table yet when an epoch is saved."""
+    config = base_config(["--method", "dqn"])
+    config = replace(config, replay=replace(config.replay, n_step=5, learning_starts=40))
+    first, second = Lockstep(config), Lockstep(config)
+    tables = []
+    with RunDirectory(tmp_path, config) as directory:
+        for _ in range(150):
+            _play(first, directory)
+        first.save(directory)
+        second.restore(tmp_path / "checkpoints" / str(first.agent.updates))
+        for run in (first, second):
+            for _ in range(30):
+                for _ in run.play():
+                    pass
+            tables.append(run._table.state()[1])
+            run.env.close()
+    assert tables[0].keys() == tables[1].keys()
+    for name, column in tables[0].items():
+        assert column.tobytes() == tables[1][name].tobytes(), name

@@ -73,10 +73,10 @@ class GymnasiumEnv:
             self._put(next_obs, row, frame)
             rewards.append(reward)
             lengths[row] += 1
-            ended = terminated or truncated or lengths[row] == self._limit
-            if ended:
+            is_over = terminated or truncated or lengths[row] == self._limit
+            if is_over:
                 over.append(row)
-            if terminated or (ended and self._limit_terminal):
+            if terminated or (is_over and self._limit_terminal):
                 terminal.append(row)
         raw_rewards = np.array(rewards, np.float64)
         learned = np.clip(raw_rewards, -1.0, 1.0) if self._clip else raw_rewards

@@ -72,7 +72,7 @@ class LearnerSettings:
     learning_rate_final: PositiveShare = 1.0
     """The learning rate falls exponentially to this share of itself over the whole run."""
     learning_rate_decay: PositiveShare = 1.0
-    """The learning rate is multiplied by this, beside, after every `learning_rate_decay_every` updates, in steps."""
+    """The learning rate is also multiplied by this after every `learning_rate_decay_every` updates."""
     learning_rate_decay_every: Positive = 1000
     momentum: Decay = 0.0
     """Of the steps (sgd, rmsprop)."""

@@ -16,10 +16,17 @@ def epsilon(settings: ActorSettings, env_step: int) -> float:
 
 
 def exploration_rate(settings: EdlSettings, update: int) -> float:
-    """The paper's s before any N(0, 1) draw: rate * decay^(update / decay_every)."""
-    return settings.rate * float(settings.decay ** (update / settings.decay_every))
+    """The paper's s before any N(0, 1) draw: rate * decay^(update / decay_every), whole powers only if stepwise."""
+    power = update // settings.decay_every if settings.decay_stepwise else update / settings.decay_every
+    return settings.rate * float(settings.decay**power)
 
 
-def learning_rate(settings: LearnerSettings, progress: float) -> float:
-    """Learning rate at `progress` in [0, 1] of the run: an exponential fall to learning_rate_final of itself."""
-    return settings.learning_rate * float(settings.learning_rate_final ** min(1.0, progress))
+def learning_rate(settings: LearnerSettings, update: int, planned: int) -> float:
+    """Learning rate of an update, counted from 0, in a run of `planned` updates.
+
+    An exponential fall to learning_rate_final of itself over the run, times learning_rate_decay for every
+    learning_rate_decay_every updates done.
+    """
+    progress = min(1.0, update / max(1, planned))
+    steps = update // settings.learning_rate_decay_every
+    return settings.learning_rate * float(settings.learning_rate_final**progress * settings.learning_rate_decay**steps)

@@ -94,7 +94,8 @@ def polar(matrix: Tensor, rng: np.random.Generator) -> Tensor:
         units = torch.eye(len(wide), dtype=wide.dtype, device=wide.device)
         root, doubtful = whitened((wide @ wide.t()).unsqueeze(0), units)
         if doubtful is None:
-            return (root @ wide).to(matrix.dtype)
+            quick: Tensor = (root @ wide).to(matrix.dtype)
+            return quick
     if not wide.isfinite().all():
         return torch.full_like(matrix, torch.nan)
     u, values, vh = torch.linalg.svd(wide, full_matrices=False)
@@ -105,7 +106,8 @@ def polar(matrix: Tensor, rng: np.random.Generator) -> Tensor:
             draw -= vh[:rank].t() @ (vh[:rank] @ draw)
         q, r = torch.linalg.qr(draw)
         vh = torch.cat((vh[:rank], (q * r.diagonal().sign()).t()))
-    return (u @ vh).to(matrix.dtype)
+    factor: Tensor = (u @ vh).to(matrix.dtype)
+    return factor
 
 
 def polar_of_product(left: Tensor, right: Tensor, rng: np.random.Generator) -> Tensor:

@@ -66,10 +66,10 @@ class RunDirectory:
         self._board.add("episode/return", end.episode_return, record.env_step)
 
     def _metrics_row(self, row: dict[str, Any]) -> None:
-        """Add a line to metrics.jsonl, and the same to TensorBoard."""
+        """Add a line to metrics.jsonl, and its numbers to TensorBoard."""
         self._metrics.write(json.dumps({"time": time.time(), **row}) + "\n")
         for name, value in row.items():
-            if name != "env_step" and value is not None:
+            if name != "env_step" and isinstance(value, int | float):
                 self._board.add(f"train/{name}", value, row["env_step"])
 
     def summary(self, summary: Summary) -> None:

@@ -141,8 +141,8 @@ class Uniform:
 class Proportional:
     """P(i) = p_i^alpha / sum_k p_k^alpha, weights (size P(i))^-beta over the batch's largest (Schaul et al. 2016).
 
-    One draw from each of `count` equal shares of the sum, as there, so that one transition may be drawn twice. A priority below `PRIORITY_FLOOR` counts as
-    that, so that nothing held is out of reach.
+    One draw from each of `count` equal shares of the sum, as there, so that one transition may be drawn twice. A
+    priority below `PRIORITY_FLOOR` counts as that, so that nothing held is out of reach.
     """
 
     def __init__(self, capacity: int, rng: np.random.Generator, alpha: float, beta: float) -> None:
