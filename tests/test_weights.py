@@ -1,0 +1,118 @@
+"""An actor's networks and acting role follow the learner's, over real sessions; a layout that differs is refused."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from msgspec.structs import replace as changed
+
+from actors.cli import _networks
+from actors.policy import Policy
+from actors.weights import GRACE, WeightsFollower
+from common.errors import JoinError
+from common.messaging.keys import role_key, weights_key
+from common.messaging.messages.join import Joined
+from common.messaging.messages.weights import Role
+from common.messaging.transport import Node
+from common.networks.network import FlatNetwork, build_network
+from common.settings.config import NetworkSettings, RunConfig
+from common.types import EnvSpec
+from learner.agent import Agent
+from learner.broadcast import Broadcaster
+
+CONFIG = RunConfig(method="coop", network=NetworkSettings(hidden=(8,)))
+
+
+def make_policy(spec: EnvSpec) -> Policy:
+    """Networks of the run's layout with parameters of their own."""
+    first, second = (FlatNetwork(build_network("mlp", spec, (8,), seed=seed)) for seed in (7, 8))
+    return Policy((first, second), spec, np.random.default_rng(0))
+
+
+def refresh_until(follower: WeightsFollower, version: int, seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while follower.version != version:
+        assert time.monotonic() < deadline, f"version {follower.version} instead of {version}"
+        follower.refresh()
+        time.sleep(0.01)
+
+
+def assert_equal(policy: Policy, agent: Agent) -> None:
+    for mine, theirs in zip(policy.networks, agent.networks, strict=True):
+        np.testing.assert_array_equal(mine.snapshot(), theirs.snapshot())
+
+
+def change(agent: Agent, number: int, version: int) -> None:
+    """What an update does to the network that acts, as far as actors see it."""
+    agent.networks[number].load(agent.networks[number].snapshot() + np.float32(1))
+    agent.versions[number] = agent.updates = version
+
+
+def test_an_actor_follows_weights_and_role_through_swaps(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
+    learner, actor = nodes
+    agent = Agent(CONFIG, spec)
+    broadcaster = Broadcaster(learner, agent)
+    policy = make_policy(spec)
+    follower = WeightsFollower(actor, policy)
+    assert not follower.ready
+    refresh_until(follower, 0)  # asked for: the broadcast was before its time
+    assert follower.ready
+    assert policy.acting == 0
+    assert_equal(policy, agent)
+    for version in range(1, 7):
+        acting = version % 2
+        change(agent, acting, version)
+        agent.acting = acting
+        broadcaster.publish()
+        refresh_until(follower, version)
+        assert policy.acting == acting
+        assert_equal(policy, agent)
+
+
+def test_a_broadcast_that_was_lost_is_asked_for(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
+    learner, actor = nodes
+    agent = Agent(CONFIG, spec)
+    broadcaster = Broadcaster(learner, agent)
+    policy = make_policy(spec)
+    follower = WeightsFollower(actor, policy)
+    refresh_until(follower, 0)
+    change(agent, 0, 5)
+    publish, learner.publish = learner.publish, lambda key, payload: None  # type: ignore[method-assign]
+    broadcaster.publish()
+    learner.publish = publish  # type: ignore[method-assign]
+    began = time.monotonic()
+    broadcaster.publish_role()  # says that there is a version 5
+    refresh_until(follower, 5)
+    assert time.monotonic() - began >= GRACE
+    assert_equal(policy, agent)
+
+
+def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
+    learner, actor = nodes
+    agent = Agent(CONFIG, spec)
+    Broadcaster(learner, agent)
+    policy = make_policy(spec)
+    follower = WeightsFollower(actor, policy)
+    refresh_until(follower, 0)
+    learner.publish(role_key(learner), Role(2, (9, 9), 9).encode("test")[:20])
+    learner.publish(weights_key(learner, 1), Role(2, (9, 9), 9).encode("test"))
+    deadline = time.monotonic() + 10
+    while actor.bad_messages < 2:
+        assert time.monotonic() < deadline
+        follower.refresh()
+        time.sleep(0.01)
+    assert policy.acting == 0
+    assert_equal(policy, agent)
+
+
+def test_a_layout_that_differs_is_refused(spec: EnvSpec) -> None:
+    layout = Agent(CONFIG, spec).networks[0].layout_digest()
+    joined = Joined(CONFIG, spec, layout, 0, [], 5, 0)
+    first, second = _networks(joined)
+    assert first.layout_digest() == second.layout_digest() == layout
+    with pytest.raises(JoinError, match=f"network layout here {layout}, the learner's 0123"):
+        _networks(changed(joined, layout="0123"))
+    wider = replace(CONFIG, network=NetworkSettings(hidden=(9,)))
+    with pytest.raises(JoinError, match="network layout here"):
+        _networks(changed(joined, config=wider))
