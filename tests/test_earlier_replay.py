@@ -1,6 +1,7 @@
 """What a replay service of protocol 1 left on disk, an epoch and the journal that continues it, is gone on from.
 
-`data/replay-of-protocol-1.tar.gz` was made at commit 3dc97f6: four segments, two draws, an epoch, three segments, a draw.
+`data/replay-of-protocol-1.tar.gz` was made at commit 3dc97f6: four segments, two draws, an epoch; three segments,
+a draw.
 """
 
 import tarfile

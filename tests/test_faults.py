@@ -16,6 +16,7 @@ from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.weights import Current
 from common.messaging.transport import Node, Refused, new_incarnation, open_session
 from common.messaging.wire import Message
+from common.process.console import Console
 from common.process.lifecycle import Stop
 from common.settings.config import RunConfig
 from common.types import EnvSpec
@@ -73,7 +74,7 @@ def test_a_table_that_may_be_half_changed_is_not_used_any_more(
     core, stop = ReplayCore(RunConfig(run="test"), spec), Stop()
     service = ReplayService(server, core, ReplayEpochs(tmp_path, 5))
     service.start()
-    running = threading.Thread(target=service.run, args=(stop,))
+    running = threading.Thread(target=service.run, args=(stop, Console()))
     running.start()
     first, second = (encode_segment("test", make_segment(spec, number)) for number in range(2))
     client.ask(replay_key(client, "insert"), first)
