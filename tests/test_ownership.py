@@ -259,7 +259,7 @@ def learner(endpoint: str, spec: EnvSpec) -> Callable[..., SharedEpochs]:
 
     def receive(node: Node, *held: int, restart: bool = False) -> SharedEpochs:
         epochs = SharedEpochs(held, "runs/a", restart=restart)
-        Reception(node, CONFIG, spec, "layout", 5, epochs, Roster())
+        Reception(node, CONFIG, spec, "layout", 5, epochs, Roster(), lambda _: None)
         return epochs
 
     return receive
