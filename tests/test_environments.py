@@ -11,11 +11,13 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from common.envs import catch
+from common.envs.catch import Catch
 from common.envs.make import env_spec, make_vector_env
 from common.envs.pictures import Shrink
 from common.envs.protocol import Steps
 from common.errors import UsageError
 from common.settings.environment import EnvSettings
+from common.settings.tables import load_tables, resolve
 from common.types import Array, EnvSpec
 
 
@@ -255,6 +257,23 @@ def test_catch_rewards_once_and_can_be_caught_always() -> None:
     assert (returns == 10 * catch.MAX_RETURN).all()
     columns = {int(np.flatnonzero(row[-1, 0])[0]) for row in obs}
     assert len(columns) > 1
+
+
+def test_catch_stays_solved_under_the_preset_s_last_epsilon() -> None:
+    """A perfect player that acts at random now and then: every 100 episodes in a row return 0.9 or more."""
+    config = resolve(load_tables("catch", None))
+    env, rng = Catch(), np.random.default_rng(1)
+    env.reset(seed=1)
+    returns = []
+    for _ in range(4000):
+        env.reset()
+        over = False
+        while not over:
+            greedy = 1 + int(np.sign(env._column - env._paddle))
+            explores = rng.random() < config.actor.epsilon_final
+            _, reward, over, _, _ = env.step(int(rng.integers(3)) if explores else greedy)
+        returns.append(reward)
+    assert np.convolve(returns, np.full(100, 0.01), "valid").min() > 0.9 - 1e-9
 
 
 def test_catch_standing_still_is_paid_as_documented() -> None:
