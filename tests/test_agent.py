@@ -200,7 +200,7 @@ def test_s_is_drawn_from_a_normal_distribution_of_the_falling_rate() -> None:
 
 def test_the_learning_rate_falls_over_the_run() -> None:
     config = _config("g-coop", optimizer="sgd", learning_rate=1e-3, learning_rate_final=0.01, swap_every=1000)
-    config = replace(config, total_steps=140, replay=replace(config.replay, start=100, capacity=100))
+    config = replace(config, total_steps=140, replay=replace(config.replay, learning_starts=100, capacity=100))
     agent, batch = Agent(config, SPEC), _batches(1)[0]
     assert config.planned_updates == 40
     for update in range(41):
