@@ -18,7 +18,7 @@ LOCAL = Path(sysconfig.get_path("scripts")) / "coop-local"
         ("--env.id CartPole-v0", ["'nature' needs frames [height, width], CartPole-v0 has (4,)"]),
         (
             "--replay.capacity 1000000000 --total-steps 1000000000",
-            ["replay.capacity = 1,000,000,000: needs up to 6639.4 GiB, this machine has"],
+            ["replay.capacity = 1,000,000,000: needs up to 6640.3 GiB, this machine has"],
         ),
     ],
 )
