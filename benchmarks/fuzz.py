@@ -38,6 +38,7 @@ from common.messaging.transport import Node, Pending, Refused, new_incarnation, 
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
 
+EPOCH = 1  # a snapshot says for which it is: the same one before and after
 WINDOW = 64  # broken messages under way at once
 QUIET = 2.0  # seconds without a change that count as rest
 VALID_EVERY = 15  # broken messages for one that stays valid
@@ -155,13 +156,13 @@ class Watch:
                 state, since = now, time.monotonic()
             time.sleep(0.1)
 
-    def everything(self, number: int) -> dict[str, bytes]:
+    def everything(self) -> dict[str, bytes]:
         """The state of both roles, in bytes."""
         key = replay_key(self.node, "snapshot")
-        self.node.ask(key, Snapshot(number, []).encode(RUN), 60.0)
-        while self.node.ask(key, Written(number).encode(RUN), 60.0).kind == "retry":
+        self.node.ask(key, Snapshot(EPOCH, []).encode(RUN), 60.0)
+        while self.node.ask(key, Written(EPOCH).encode(RUN), 60.0).kind == "retry":
             pass
-        saved = self._folder / "checkpoints" / str(number) / "replay"
+        saved = self._folder / "checkpoints" / str(EPOCH) / "replay"
         state = {path.name: path.read_bytes() for path in saved.iterdir()}
         question = Current().encode(RUN)
         for key in (("weights", "1"), ("weights", "2"), ("role",)):
@@ -195,10 +196,10 @@ def fuzz(count: int, seed: int, folder: Path) -> None:
         actor.interrupt()
         actor.end(60.0)
         watch.rest()
-        state, began = watch.everything(1), time.monotonic()
+        state, began = watch.everything(), time.monotonic()
         flood.send(count - count // 2)
         seconds = time.monotonic() - began
-        changed = [name for name, value in watch.everything(2).items() if state[name] != value]
+        changed = [name for name, value in watch.everything().items() if state[name] != value]
         print(
             f"{count - count // 2:,} broken messages in {seconds:.0f} s at rest; "
             f"changed: {', '.join(changed) or 'nothing'}"
