@@ -4,6 +4,7 @@ import json
 import re
 import signal
 import socket
+import threading
 import time
 from pathlib import Path
 
@@ -61,7 +62,10 @@ def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_
     first = serve(at[0])
     with ReplayRoute("test", 7, lambda endpoints: open_session((), endpoints), at[:1]) as route:
         wait_for("the first", lambda: route.is_up)
-        inserts = InsertClient(route, Stop(), window=1)
+        stop = Stop()
+        inserts = InsertClient(route, stop, window=1)
+        given_up = threading.Timer(30, stop.set, ("nobody was found",))
+        given_up.start()
         assert inserts.submit(make_segment(spec, 0))
         assert inserts.drain()
         first.close()
@@ -71,7 +75,9 @@ def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_
             route.follow([])  # as long as the learner knows of no other
             assert not route.is_up
             route.follow(at[1:])
-            assert inserts.drain()
+            found = inserts.drain()
+            given_up.cancel()
+            assert found
             assert route.is_up
     assert core.table.inserted == 8
 
