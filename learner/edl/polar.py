@@ -140,12 +140,13 @@ def _rank(values: Tensor, dtype: torch.dtype) -> int:
 
 def _paired(m: int, n: int, rank: int, rng: np.random.Generator) -> Tensor:
     """float64 [m, n]: an identity [rank, rank], and a random signed permutation of what is left beside it."""
-    pairs = min(m, n) - rank
+    if m > n:
+        return _paired(n, m, rank, rng).t()
     paired = np.zeros((m, n))
-    diagonal = np.arange(rank)
-    paired[diagonal, diagonal] = 1
-    rows, columns = rank + rng.permutation(m - rank)[:pairs], rank + rng.permutation(n - rank)[:pairs]
-    paired[rows, columns] = rng.choice((-1.0, 1.0), pairs)
+    rows = np.arange(m)
+    columns = np.concatenate((rows[:rank], rank + rng.permutation(n - rank)[: m - rank]))
+    paired[rows, columns] = 1
+    paired[rows[rank:], columns[rank:]] -= 2 * rng.integers(0, 2, m - rank)
     return torch.from_numpy(paired)
 
 
