@@ -24,6 +24,7 @@ check: $(READY)
 # Every figure and table of results/, from the packed studies there.
 results: $(READY)
 	@for study in results/cartpole/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
+	@$(BIN)/coop-report results/pong.parquet --curves results/pong
 
 # Checks that take longer; docs/robustness.md says what each shows.
 fuzz: $(READY)

@@ -62,7 +62,10 @@ def folder(tmp_path: Path) -> Path:
             "metrics.jsonl": json.dumps({key: value for key, value in newer.items() if key != "note"}) + "\n",
         },
     )
-    write(tmp_path / "study" / "dqn-seed=4", {"config.toml": CONFIG.format(method="dqn", seed=4)})
+    write(
+        tmp_path / "study" / "dqn-seed=4",
+        {"config.toml": CONFIG.format(method="dqn", seed=4), "episodes.csv": "", "metrics.jsonl": ""},
+    )
     (tmp_path / "study" / "sweep.toml").write_text('methods = ["dqn"]\nseeds = [0, 1, 2, 3, 4, 5]\n')
     return tmp_path / "study"
 
@@ -114,6 +117,16 @@ def test_what_would_not_come_back_is_not_packed(name: str, text: str, words: str
         pack(folder, tmp_path / "study.parquet")
     assert f"{folder}/dqn-seed=1/{words}" in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["study"]
+
+
+def test_curves_of_all_runs(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pack(folder, tmp_path / "study.parquet")
+    for runs, out in ((folder, "a"), (tmp_path / "study.parquet", "b")):
+        monkeypatch.setattr("sys.argv", ["coop-report", str(runs), "--curves", str(tmp_path / out)])
+        cli.main()
+    drawn = {path.parent.name: path.read_bytes() for path in (tmp_path / "a").glob("*/learning_curve.png")}
+    assert sorted(drawn) == ["dqn-seed=0", "dqn-seed=1", "dqn-seed=2"]
+    assert drawn == {path.parent.name: path.read_bytes() for path in (tmp_path / "b").glob("*/learning_curve.png")}
 
 
 def test_what_cannot_be_packed_or_unpacked(folder: Path, tmp_path: Path) -> None:

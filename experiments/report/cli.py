@@ -24,6 +24,8 @@ class ReportOptions:
     """Folder of the report; RUNS/report if not given, without the ending where RUNS is a file."""
     pack: Path | None = None
     """Instead of a report: write the folder's runs into this one Parquet file."""
+    curves: Path | None = None
+    """Instead of a report: draw every run's learning curve, also of those not finished, into a folder each in here."""
     unpack: Path | None = None
     """Instead of a report: write the runs of a packed file into this new folder, as they were."""
 
@@ -47,6 +49,10 @@ def _run() -> None:
         from experiments.report.packed import unpack  # noqa: PLC0415
 
         print(unpack(runs, options.unpack))
+    elif options.curves is not None:
+        from experiments.report.writer import draw_curves  # noqa: PLC0415
+
+        print(*draw_curves(runs, options.curves), sep="\n")
     else:
         from experiments.report.writer import write_report  # noqa: PLC0415
 

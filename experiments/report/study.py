@@ -124,7 +124,7 @@ def load_study(path: Path) -> Study:
         state = _state(source, name)
         run = None if state else _read(source, name, path)
         if state.startswith("diverged"):
-            diverged[name] = _config(source, name, path)
+            diverged[name] = read_config(source, name, path)
             missing[name] = state
         elif run is None:
             missing[name] = state
@@ -162,7 +162,7 @@ def _state(source: Source, run: str) -> str:
 
 
 def _read(source: Source, run: str, path: Path) -> Run:
-    config = _config(source, run, path)
+    config = read_config(source, run, path)
     try:
         episodes = source.columns(run, EPISODES, ("env_step", "return", "s", "q1_mean", "q2_mean"))
         rows = source.columns(run, METRICS, SERIES)
@@ -173,7 +173,8 @@ def _read(source: Source, run: str, path: Path) -> Run:
     return Run(run, config, ends, returns, s, q1, q2, metrics)
 
 
-def _config(source: Source, run: str, path: Path) -> RunConfig:
+def read_config(source: Source, run: str, path: Path) -> RunConfig:
+    """The config of a run of the study at `path`; raises RunError."""
     try:
         return resolve(tomllib.loads(source.text(run, CONFIG) or ""))
     except (OSError, ValueError, UsageError) as error:

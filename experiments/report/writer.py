@@ -4,13 +4,46 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from common.errors import UsageError
+import numpy as np
+
+from common.errors import RunError, UsageError
 from experiments.report.figures import figures
+from experiments.report.packed import EPISODES
 from experiments.report.page import page
 from experiments.report.plots import draw
 from experiments.report.results import tables
-from experiments.report.study import load_study
+from experiments.report.sources import open_source
+from experiments.report.study import load_study, read_config
 from experiments.report.table import ResultTable
+from learner.records.curve import draw_curve
+
+
+def draw_curves(runs: Path, out: Path) -> list[Path]:
+    """Draw the learning curve of every run that has an episode, finished or not, to OUT/RUN/learning_curve.png.
+
+    Raises:
+        UsageError: there is no run, or the folder can't be written.
+        RunError: a run's file is torn.
+    """
+    source = open_source(runs)
+    drawn = []
+    for run in source.names:
+        config = read_config(source, run, runs)
+        try:
+            episodes = source.columns(run, EPISODES, ("env_step", "return"))
+            steps, returns = (np.array(values, np.float64) for values in episodes.values())
+        except (OSError, KeyError, ValueError) as error:
+            raise RunError(f"{runs / run}: {EPISODES} can't be read: {error!r}") from error
+        if len(returns):
+            path = out / run / "learning_curve.png"
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                drawn.append(draw_curve(steps, returns, f"{config.env.id}, {config.method}, seed {config.seed}", path))
+            except OSError as error:
+                raise UsageError(f"--curves {out}: {error.strerror}") from error
+    if not drawn:
+        raise UsageError(f"{runs}: holds no run with an episode")
+    return drawn
 
 
 def write_report(runs: Path, out: Path) -> tuple[Path, list[ResultTable]]:

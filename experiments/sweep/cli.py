@@ -99,6 +99,8 @@ def _work(runner: Runner, folder: Path) -> None:
     stop.on_signals()
     with SweepDisplay(runner) as display:
         display.say(f"{len(runner.folders)} cells in {folder}, {runner.tally.skipped} of them finished before")
+        for name, how in runner.tally.diverged.items():
+            display.say(f"{name}: {how}")
         try:
             while not runner.done and not stop.wait(TICK):
                 for text in runner.tick():
@@ -109,8 +111,6 @@ def _work(runner: Runner, folder: Path) -> None:
         finally:
             runner.abort()
         line = display.line()
-    for name, how in runner.tally.diverged.items():
-        print(f"{name}: {how}")
     for name, why in runner.tally.failed.items():
         print(f"failed: {name}: {why}")
     if not runner.done:

@@ -6,29 +6,34 @@ import csv
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from common.returns import RETURN_WINDOW, running_mean
 
 
 def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
-    """Draw returns against environment steps to `learning_curve.png`; None if no episode has ended."""
+    """Draw the curve of a run directory to `learning_curve.png` there; None if no episode has ended."""
     with (run_dir / "episodes.csv").open(encoding="utf-8") as file:
         rows = [(int(row["env_step"]), float(row["return"])) for row in csv.DictReader(file)]
     if not rows:
         return None
+    steps, returns = np.array(rows).T
+    return draw_curve(steps, returns, title, run_dir / "learning_curve.png")
+
+
+def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path) -> Path:
+    """Draw returns [episodes] against the environment steps [episodes] at which the episodes ended, as a PNG."""
     import matplotlib as mpl  # noqa: PLC0415 (half a second, needed once at the end)
 
     mpl.use("Agg")
     from matplotlib import pyplot as plt  # noqa: PLC0415
 
-    steps, returns = np.array(rows).T
     figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
     axes.plot(steps, returns, ".", markersize=2, alpha=0.35, label="episode")
     axes.plot(steps, running_mean(returns), linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
     axes.set(xlabel="environment steps", ylabel="return", title=title)
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
-    path = run_dir / "learning_curve.png"
     figure.savefig(path, dpi=120)
     plt.close(figure)
     return path
