@@ -5,7 +5,7 @@ from types import TracebackType
 
 
 def _quiet(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Answer a Ctrl-C that comes while a command is still importing in one line, like every later one."""
+    """Print one line for a Ctrl-C that arrives during a command's imports, as for every later one."""
     if issubclass(kind, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)
     else:

@@ -1,6 +1,6 @@
-"""Types of the numbers and texts that processes exchange, each with the bounds of what it can mean.
+"""Types of the numbers and texts that processes exchange, each with its bounds.
 
-msgspec checks them where a message is read. A not-a-number lies within no bounds.
+msgspec checks them when it reads a message. A NaN lies within no bounds.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
 """Steps, segments or episodes."""
 Updates = Annotated[int, Meta(ge=0, le=MAX_UPDATES)]
 Counter = Annotated[int, Meta(ge=0, le=MAX_INTEGER)]
-"""What a service counts or plans; it may count for longer than a run lasts."""
+"""A service's count of events, which may exceed those of one run, or a planned number of them."""
 Real = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 Float32 = Annotated[float, Meta(ge=-MAX_FLOAT32, le=MAX_FLOAT32)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]

@@ -1,10 +1,10 @@
-"""Every failure that a user can meet, and the exit status each one ends with.
+"""All failures that a user can see, and their exit statuses.
 
 CoopError
-|- UsageError      a flag, file or grid that can't be right: exit status 2, before anything starts
+|- UsageError      an invalid flag, file or grid: exit status 2, before anything starts
 |- RunError        a run that could not start or finish: exit status 1
 |  |- Interrupted  a signal has ended the work: exit status 130 or 143
-|  |- JoinError    no learner answered, or it refused us
+|  |- JoinError    no learner answered, or it refused this process
 |  '- PeerLost     a role that this one needs stopped answering
 '- BadMessage      bytes from the wire that are not a valid message (names the field)
 """
@@ -13,13 +13,13 @@ from __future__ import annotations
 
 
 class CoopError(Exception):
-    """Base of all errors whose text is meant for the user, in one line."""
+    """Base of all errors whose text, one line, is meant for the user."""
 
     exit_status = 1
 
 
 class UsageError(CoopError):
-    """A flag or file that can't be right; says the field, the value and what is allowed."""
+    """An invalid flag or file; the text names the field, the value and what is allowed."""
 
     exit_status = 2
 
@@ -33,7 +33,7 @@ class JoinError(RunError):
 
 
 class Interrupted(RunError):
-    """A signal has ended the work before its end; the exit status tells which one."""
+    """A signal has interrupted the work; the exit status says which one."""
 
     def __init__(self, text: str, exit_status: int) -> None:
         super().__init__(text)
@@ -45,7 +45,7 @@ class PeerLost(RunError):
 
 
 class BadMessage(CoopError):
-    """Bytes that are not a valid message; `field` names what is wrong."""
+    """Bytes that are not a valid message; `field` names the invalid field."""
 
     def __init__(self, field: str, problem: str) -> None:
         super().__init__(f"{field}: {problem}")

@@ -1,4 +1,4 @@
-"""How returns are reported everywhere: over the last 100 episodes, the paper's measure."""
+"""Running mean of returns over the last 100 episodes, the paper's measure."""
 
 from __future__ import annotations
 

@@ -19,11 +19,11 @@ _NOT_GIVEN: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
 class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
-    """What a network and a table must know of an environment.
+    """The properties of an environment that networks and tables need.
 
     frame_shape: shape of one stored frame, e.g. (84, 84) on Atari, (4,) on CartPole.
     frame_dtype: "uint8" or "float32".
-    stack: frames that make one observation (1: the frame is the observation).
+    stack: frames in one observation (1: the frame is the observation).
     num_actions: size of the Discrete action space.
     """
 
@@ -40,7 +40,7 @@ class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class EpisodeEnd(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """One finished episode, told by the actor inside the segment that ends it.
+    """One finished episode, which the actor reports in the segment that ends it.
 
     step_in_segment: index of the episode's last step in its segment.
     episode_return: sum of unclipped rewards. length: agent decisions.
@@ -57,17 +57,17 @@ class EpisodeEnd(Struct, frozen=True, array_like=True, forbid_unknown_fields=Tru
 
 
 class Segment(Struct, frozen=True, forbid_unknown_fields=True):
-    """Transitions that begin with consecutive steps of one emulator stream, as an actor sends them.
+    """Transitions from consecutive steps of one emulator stream, as an actor sends them.
 
     frames: <frame_dtype>[n_frames, *frame_shape], each frame once.
     obs_index, next_index: int32 [steps, stack], rows of `frames` that make obs and next_obs (oldest first).
     actions: int32 [steps]. rewards: float32 [steps], n-step returns. terminated: bool [steps].
     param_version: int64 [steps], the version of the parameters that chose each action.
-    span: uint8 [steps], environment steps from obs to next_obs; 1 each where it is not given.
+    span: uint8 [steps], environment steps from obs to next_obs (default: 1 each).
     carried: how many leading frames repeat, bit for bit, the last frames of this stream's previous segment
         (sequence numbers count per stream, so that is `sequence - 1`); a table that still holds those
         frames keeps one copy. 0 at the start of a stream.
-    acked: transitions of this incarnation that had been acknowledged when this segment was sent first.
+    acked: transitions of this incarnation that had been acknowledged when this segment was first sent.
     """
 
     incarnation: Incarnation
@@ -104,11 +104,11 @@ class Batch:
     obs_index, next_index: int32 [batch, stack], rows of `frames`.
     actions: int32 [batch]. rewards: float32 [batch], n-step returns. terminated: bool [batch].
     weights: float32 [batch], importance-sampling weights (all 1 for uniform sampling).
-    ids: int64 [batch], the number of each transition in order of insertion, from 0 (a priority update names it).
+    ids: int64 [batch], the number of each transition in order of insertion, from 0; priority updates refer to it.
     param_version: int64 [batch], version of the parameters that acted.
     age: int64 [batch], transitions inserted since this one.
-    reuse: int32 [batch], how often each had been drawn, this draw included.
-    span: uint8 [batch], environment steps from obs to next_obs; 1 each where it is not given.
+    reuse: int32 [batch], how often each has been drawn, including this draw.
+    span: uint8 [batch], environment steps from obs to next_obs (default: 1 each).
     """
 
     frames: Array
@@ -133,10 +133,10 @@ class Batch:
         return len(self.actions)
 
     def columns(self) -> dict[str, Array]:
-        """Everything but the frames, by name."""
+        """All arrays except the frames, by name."""
         return {column.name: getattr(self, column.name) for column in fields(self) if column.name != "frames"}
 
 
 def _one_each(count: int) -> NDArray[np.uint8]:
-    """What was recorded before transitions could span several steps does not say that they span one."""
+    """uint8 [count] of ones: the span of transitions recorded before n-step returns existed."""
     return np.ones(count, np.uint8)

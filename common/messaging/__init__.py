@@ -1,1 +1,1 @@
-"""How processes talk: the wire format, the messages of each conversation, and Zenoh underneath."""
+"""Communication between processes: the wire format, the messages of each conversation, and the Zenoh transport."""

@@ -1,6 +1,6 @@
-"""Clients of the replay service: acked inserts in a bounded window, and prefetched draws.
+"""Clients of the replay service: acknowledged inserts in a bounded window, and prefetched draws.
 
-Neither has a thread of its own: Zenoh works in the background, and the caller settles what has come back.
+Neither has its own thread: Zenoh works in the background, and the caller processes the answers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from common.messaging.wire import Message
 from common.process.lifecycle import Stop
 from common.types import Batch, EnvSpec, Segment
 
-# Seconds. A segment may wait behind its whole window while the limiter lets them in one by one; that a peer has gone is
+# Seconds. A segment may wait behind its whole window while the limiter admits segments one by one; a lost peer is
 # noticed sooner, by its link.
 INSERT_TIMEOUT = 60.0
 NO_ANSWER = "the replay service does not answer"
@@ -33,7 +33,7 @@ BAD_ANSWER = "the replay service's answer is bad"
 
 
 class Line(Place, Protocol):
-    """What queries to the replay service are sent by: a `Node`, or an actor's `ReplayRoute`."""
+    """The connection that carries queries to the replay service: a `Node`, or an actor's `ReplayRoute`."""
 
     run: str
 
@@ -42,19 +42,19 @@ class Line(Place, Protocol):
 
 
 class Backoff:
-    """Pauses that double from `first` to `longest` seconds, until `reset`."""
+    """Pauses that double from `first` up to `longest` seconds, until `reset`."""
 
     def __init__(self, first: float = 0.02, longest: float = 1.0) -> None:
         self._first = self._next = first
         self._longest = longest
 
     def pause(self, stop: Stop) -> bool:
-        """Sleep; True if the stop came."""
+        """Sleep; return True if a stop was requested."""
         pause, self._next = self._next, min(self._longest, 2 * self._next)
         return stop.wait(pause)
 
     def reset(self) -> None:
-        """Begin with the shortest pause again."""
+        """Return to the shortest pause."""
         self._next = self._first
 
 
@@ -66,15 +66,15 @@ class _Sent:
 
 
 class InsertClient:
-    """Sends segments until each is acknowledged, at most `window` of them at a time.
+    """Sends each segment until it is acknowledged, with at most `window` segments in flight.
 
     Args:
-        on_wait: called again and again while nothing moves.
+        on_wait: called repeatedly while inserts wait.
 
     Attributes:
         acked: transitions acknowledged.
-        inserted: the table's count of accepted transitions, as last told.
-        waiting: why nothing moves, in words; empty while it does.
+        inserted: the table's count of accepted transitions, as of the last acknowledgement.
+        waiting: why inserts wait, in words; empty while they do not.
     """
 
     def __init__(self, node: Line, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
@@ -90,10 +90,10 @@ class InsertClient:
         self._backoff = Backoff()
 
     def submit(self, segment: Segment) -> bool:
-        """Send a segment, waiting for a place in the window; False if the stop came first.
+        """Send a segment once there is room in the window; return False if a stop was requested first.
 
         Raises:
-            Refused: the replay service found a segment bad.
+            Refused: the replay service rejected a segment as invalid.
         """
         self._settle_ready()
         while len(self._outstanding) >= self._window:
@@ -105,7 +105,7 @@ class InsertClient:
         return True
 
     def drain(self) -> bool:
-        """Wait until everything sent is acknowledged; False if the stop came first."""
+        """Wait until all segments are acknowledged; return False if a stop was requested first."""
         while self._outstanding:
             if not self._settle(self._outstanding[0]):
                 return False
@@ -113,7 +113,7 @@ class InsertClient:
         return True
 
     def _settle_ready(self) -> None:
-        """Take the acknowledgements that are there, without waiting."""
+        """Process the acknowledgements that have arrived, without waiting."""
         while self._outstanding:
             sent = self._outstanding[0]
             try:
@@ -122,14 +122,14 @@ class InsertClient:
                     return
                 accepted = self._accept(message, sent)
             except (NoAnswer, BadMessage):
-                return  # the next full window will send it again
+                return  # it is sent again when the window is full
             if not accepted:
                 sent.pending = self._send(sent.payload)
                 return
             self._outstanding.popleft()
 
     def _settle(self, sent: _Sent) -> bool:
-        """Wait for one acknowledgement, sending again as often as it takes; False if the stop came first."""
+        """Wait for one acknowledgement, sending again as often as necessary; return False if a stop was requested."""
         while True:
             try:
                 message = self._wait(sent.pending)
@@ -147,7 +147,7 @@ class InsertClient:
             sent.pending = self._send(sent.payload)
 
     def _wait(self, pending: Pending) -> Message | None:
-        """The answer, None if the stop came first; raises as `Pending.ready`."""
+        """The answer, or None if a stop was requested first; raises as `Pending.ready`."""
         looks = Backoff(0.001, 0.05)
         while (message := pending.ready()) is None:
             if looks.pause(self._stop):
@@ -170,15 +170,15 @@ class InsertClient:
 
 
 class SampleClient:
-    """Draws batches, keeping `prefetch` requests under way.
+    """Draws batches, with `prefetch` requests in flight.
 
     Args:
-        first: number of the first batch: updates that the learner has done before.
-        episodes: episodes that the learner has been told of before.
+        first: number of the first batch, the learner's count of updates at the start.
+        episodes: number of episodes that the learner has received before.
 
     Attributes:
-        episodes: episodes told so far.
-        waiting: why no batch comes, in words; empty while they do.
+        episodes: number of episodes received so far.
+        waiting: why no batch arrives, in words; empty while batches arrive.
     """
 
     def __init__(
@@ -205,12 +205,12 @@ class SampleClient:
         self._next = first
         self._done = first
         self._pinned: int | None = None
-        self._trained: list[tuple[int, float]] = []  # priorities that no request has taken along yet
-        self._carried: dict[int, tuple[tuple[int, float], ...]] = {}  # by number of the request that takes them
+        self._trained: list[tuple[int, float]] = []  # priorities that no request contains yet
+        self._carried: dict[int, tuple[tuple[int, float], ...]] = {}  # by number of the request that contains them
         self._backoff = Backoff()
 
     def pin(self) -> int:
-        """Keep every batch after the last one taken repeatable until `release`; the number of batches taken."""
+        """Keep all later batches repeatable until `release`; return the number of batches received."""
         self._pinned = self._done
         return self._done
 
@@ -219,14 +219,14 @@ class SampleClient:
         self._pinned = None
 
     def prioritise(self, batch: Batch, priorities: NDArray[np.float32]) -> None:
-        """Let the next request set the priorities, float32 [batch], of the transitions of a batch."""
+        """Set the priorities, float32 [batch], of a batch's transitions with the next request."""
         self._trained.extend(zip(batch.ids.tolist(), priorities.tolist(), strict=True))
 
     def next(self) -> tuple[Batch, Drawn] | None:
-        """The next batch and the episodes that are new since the last one; None if there is none for now.
+        """The next batch and the episodes that ended since the last one; None if no batch is available yet.
 
         Raises:
-            Refused: the replay service found a request bad, or serves another learner now.
+            Refused: the replay service rejected a request as invalid, or now serves another learner.
         """
         while len(self._outstanding) < self._prefetch and self._next < self._base + MAX_AHEAD:
             self._carried[self._next], self._trained = tuple(self._trained), []

@@ -1,4 +1,4 @@
-"""Endpoints as people write them, and in words what is wrong with one."""
+"""Checks endpoints that users write, and explains invalid ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WORDS = {
 
 
 def check_endpoints(endpoints: Sequence[str]) -> None:
-    """Raises UsageError for the first one that is not PROTOCOL/ADDRESS; says what may be meant."""
+    """Raise UsageError for the first endpoint that is not PROTOCOL/ADDRESS, with a suggestion."""
     for endpoint in endpoints:
         protocol, slash, address = endpoint.partition("/")
         if not slash:
@@ -38,7 +38,7 @@ def check_endpoints(endpoints: Sequence[str]) -> None:
 
 
 def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
-    """Names of hosts in `endpoints` that can't be resolved now."""
+    """Names of hosts in `endpoints` that cannot be resolved now."""
     unknown = []
     for endpoint in endpoints:
         protocol, _, address = endpoint.partition("/")
@@ -52,7 +52,7 @@ def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
 
 
 def why_not(listen: Sequence[str], error: Exception) -> str:
-    """In words why Zenoh, which raised `error`, can't listen."""
+    """Explain why Zenoh, which raised `error`, cannot listen."""
     if hosts := unknown_hosts(listen):
         return f"the host {hosts[0]!r} is not known"
     found = _OS_ERROR.search(str(error))
@@ -63,7 +63,7 @@ def why_not(listen: Sequence[str], error: Exception) -> str:
 
 
 def first_line(error: Exception) -> str:
-    """What Zenoh says, without the places in its source."""
+    """The text of Zenoh's error without its source locations."""
     return str(error).splitlines()[0].split(" at /")[0]
 
 

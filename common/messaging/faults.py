@@ -1,4 +1,4 @@
-"""Errors of this program in threads that nobody waits for: no thread ends of one, and none goes by unseen."""
+"""Handles bugs of this program in background threads: each is counted and printed, and no thread ends because of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Faults:
-    """Counts such errors; prints each sort at each place once, with its traceback. Safe for threads."""
+    """Counts such errors, and prints each exception type at each place once, with its traceback. Thread-safe."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -21,12 +21,12 @@ class Faults:
 
     @property
     def count(self) -> int:
-        """How many there have been."""
+        """Number of errors so far."""
         with self._lock:
             return self._count
 
     def note(self, place: str, error: Exception) -> None:
-        """Count one, and print it if it is the first of its sort there."""
+        """Count an error; print it if it is the first of its type at this place."""
         sort = (place, type(error).__name__)
         with self._lock:
             self._count += 1
@@ -36,7 +36,7 @@ class Faults:
             print(f"error of this program, {place}:\n{traceback.format_exc()}", end="", file=sys.stderr, flush=True)
 
     def guarded(self, place: str, call: Callable[[T], None]) -> Callable[[T], None]:
-        """A callback for Zenoh's threads that notes what `call` raises."""
+        """Wrap `call` as a callback for Zenoh's threads that notes the exceptions of `call`."""
 
         def guard(value: T) -> None:
             try:

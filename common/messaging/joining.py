@@ -1,4 +1,4 @@
-"""How a replay service or an actor becomes part of a run: it asks the learner for everything."""
+"""Joining a run: a replay service or an actor asks the learner for all that it needs."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from common.process.lifecycle import Stop
 from common.settings.tables import first_difference, identity
 
 RETRY_PAUSE = 0.1  # seconds
-OCCUPIED = 5.0  # seconds that a replay service waits for the end of another one: a dead one is given up sooner
-ASK_EVERY = 0.4  # seconds between a member's questions, where its work depends on the answer
-LEAVE_WITHIN = 25.0  # seconds that a process which was told to stop stays because the learner needs it
-SELDOM = 5.0  # seconds between those of one to which nothing has happened
+OCCUPIED = 5.0  # seconds that a replay service waits for another one to end; the learner gives up a dead one sooner
+ASK_EVERY = 0.4  # seconds between a member's requests while its work depends on the answer
+LEAVE_WITHIN = 25.0  # seconds that a stopping process stays because the learner still needs it
+SELDOM = 5.0  # seconds between requests otherwise
 
 
 def join(
@@ -36,14 +36,14 @@ def join(
     need_replay: bool = False,
     event: Callable[[str], None] = lambda text: None,
 ) -> Joined | None:
-    """Ask the learner until it answers; None if the stop came first.
+    """Ask the learner until it answers; return None if a stop was requested first.
 
-    need_replay: wait also until the learner knows where the replay service listens.
-    event: told once in words what a long wait is for.
+    need_replay: also wait until the learner knows where the replay service listens.
+    event: called once, with a line that says what a long wait is for.
 
     Raises:
-        JoinError: no learner (or no replay service) within `timeout` seconds, or the learner refused this process, or
-            another replay service serves the run.
+        JoinError: no learner (or no replay service) answered within `timeout` seconds, the learner refused this
+            process, or another replay service serves the run.
     """
     where = ", ".join(connect) or "no endpoint (give --connect)"
     deadline = time.monotonic() + timeout
@@ -78,11 +78,11 @@ def join(
 
 
 def ask_to_join(node: Node, request: Join) -> Joined | str:
-    """Ask the learner once; a string says why it has no place for this process now.
+    """Ask the learner once; return its answer, or the reason why this process cannot join now.
 
     Raises:
         NoAnswer: the learner does not answer.
-        JoinError: it refused this process.
+        JoinError: the learner refused this process.
     """
     try:
         message = node.ask(join_key(node, request.role), request.encode(node.run), timeout=1.0)
@@ -92,9 +92,9 @@ def ask_to_join(node: Node, request: Join) -> Joined | str:
 
 
 def take_leave(node: Node, request: Join) -> None:
-    """Tell the learner that this process was told to stop, and stay until that has saved what it needs of it.
+    """Tell the learner that this process stops, and wait until the learner no longer needs it.
 
-    Ends after `LEAVE_WITHIN` seconds, or where there is no learner.
+    Returns after `LEAVE_WITHIN` seconds at the latest, and at once if there is no learner.
     """
     deadline = time.monotonic() + LEAVE_WITHIN
     payload = Leave(request.incarnation).encode(node.run)
@@ -117,16 +117,16 @@ def other_runs(node: Node) -> list[str]:
 
 
 class Membership:
-    """Asks the learner again and again for what may have changed, in a thread of its own.
+    """Asks the learner repeatedly, in its own thread, for changes of the run's members.
 
-    Stops the process where the learner is another run's or refuses it, or has been gone for `patience` seconds.
+    Stops the process if the learner belongs to another run, refuses it, or has been gone for `patience` seconds.
 
     Args:
-        request: as this process joined first. joined: the answer that it got then.
-        learned: called with each answer, and with the time at which it was asked for.
-        event: told in words who does not answer, and who is back.
-        replay_there: tells whether a replay service is connected; while there is none, where the next one listens is
-            waited for, and otherwise asked now and then. None: this is the replay service, which asks all the time.
+        request: the request with which this process first joined. joined: the learner's answer to it.
+        learned: called with each answer and with the time of the request.
+        event: called with a line when a member stops answering, and when it is back.
+        replay_there: returns whether a replay service is connected; while none is, this thread asks often for the
+            next one's endpoints, otherwise seldom. None: this process is the replay service, which always asks often.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class Membership:
                     self._event(text)
 
     def _ask(self, now: float) -> bool:
-        """Ask the learner once; True if it answered."""
+        """Ask the learner once; return True if it answered."""
         try:
             answer = ask_to_join(self._node, self._request)
             problem = answer if isinstance(answer, str) else difference(self._joined, answer)
@@ -197,7 +197,7 @@ class Membership:
 
 
 def difference(mine: Joined, theirs: Joined) -> str | None:
-    """What keeps a process that has joined from following another learner, with both values; None if nothing does."""
+    """The first difference that keeps a member from following another learner, with both values; None if none does."""
     found = first_difference(_identity(mine), _identity(theirs))
     return found and f"{found[0]} here {found[1]}, the learner's {found[2]}"
 

@@ -1,4 +1,4 @@
-"""Where everything is in Zenoh: the keys of a run, all below coop/RUN."""
+"""The Zenoh keys of a run, all below coop/RUN."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ REPLAY_SHARD = "0"
 
 
 class Place(Protocol):
-    """A process's place in a run."""
+    """A process's place in a run, which determines its keys."""
 
     def key(self, *parts: str) -> str:
         """A key of this run."""
@@ -20,22 +20,22 @@ def run_key(run: str, *parts: str) -> str:
 
 
 def replay_key(node: Place, what: str) -> str:
-    """Key of one of the replay service's queryables: insert, sample, stats, limits or snapshot."""
+    """Key of one of the replay service's queryables; `what`: insert, sample, stats, limits or snapshot."""
     return node.key("replay", REPLAY_SHARD, what)
 
 
 def join_key(node: Place, role: str) -> str:
-    """Where a role asks: the replay service, which all others are sent to, at a key that access control can keep."""
+    """Key for joining as a role; the replay service has its own, which access control can reserve for it."""
     return node.key("config", "replay") if role == "replay" else node.key("config")
 
 
 def weights_key(node: Place, network: int) -> str:
-    """Key of network 1 or 2: its parameters as a broadcast, and as the answer to a question."""
+    """Key of the parameters of network 1 or 2, both for broadcasts and for queries."""
     return node.key("weights", str(network))
 
 
 def role_key(node: Place) -> str:
-    """Key of the acting role, broadcast and answered like the weights."""
+    """Key of the acting role, for broadcasts and queries like the weights' keys."""
     return node.key("role")
 
 
@@ -45,5 +45,5 @@ def stop_key(node: Place) -> str:
 
 
 def status_key(node: Place, role: str, incarnation: str = "*") -> str:
-    """Key of what a process tells displays; of all processes of its role where no incarnation is given."""
+    """Key of a process's status for displays; of all processes of the role if no incarnation is given."""
     return node.key("metrics", role, incarnation)

@@ -1,8 +1,8 @@
-"""Keeps a dead link from holding up the others: Zenoh must not wait when it closes a TCP connection.
+"""Keeps a dead link from blocking the others: Zenoh must not wait when it closes a TCP connection.
 
-Zenoh sets SO_LINGER to 10 s on its sockets. Where a peer freezes or its cable is cut with something still to send, the
-closing thread of Zenoh then stands still for that long, and there is one for all links: nothing goes to or comes from
-any other peer meanwhile. Zenoh has no setting for it, so each new link's socket is told otherwise here.
+Zenoh sets SO_LINGER to 10 s on its sockets. If a peer freezes or its cable is cut while data is unsent, Zenoh's closing
+thread blocks for that long, and since all links share this thread, no other peer can send or receive meanwhile. Zenoh
+has no setting for it, so this module switches lingering off on each new link's socket.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LINGER_OFF = struct.pack("ii", 0, 0)
 
 
 def never_linger(session: zenoh.Session) -> None:
-    """Have every link of this session, now and later, closed at once; the kernel still delivers what it can."""
+    """Make Zenoh close all present and future links of this session at once; the kernel still delivers what it can."""
 
     def changed(event: zenoh.LinkEvent) -> None:
         if event.kind == zenoh.SampleKind.PUT:

@@ -1,6 +1,6 @@
-"""Who of a run is connected to this process, and who has gone: told by Zenoh's liveliness tokens.
+"""Tracks which members of a run are connected to this process, by Zenoh's liveliness tokens.
 
-A token disappears within milliseconds of its process, and within the lease of a process that is frozen or cut off.
+A token disappears within milliseconds after its process ends, or within the lease if the process is frozen or cut off.
 """
 
 from __future__ import annotations
@@ -20,61 +20,61 @@ from common.bounded import Name
 from common.messaging.faults import Faults
 
 ROLES = ("learner", "replay", "actor")
-JOINING = ("replay", "actor", "watch")  # roles that ask the learner for the run; one that watches takes no part in it
-LEASE = 1.5  # seconds of silence after which a link is given up, and the learner's word no longer holds
+JOINING = ("replay", "actor", "watch")  # roles that ask the learner for the run's data; "watch" takes no part
+LEASE = 1.5  # seconds of silence after which a link is given up and the learner's last answer expires
 
 
 class Origin(NamedTuple):
-    """The host and the process id of a member of a run."""
+    """The host and the process id of a run's member."""
 
     host: Name
     pid: Annotated[int, Meta(ge=0, le=2**31)]
 
     @classmethod
     def here(cls) -> Origin:
-        """This very process."""
+        """The origin of this process."""
         return cls(socket.gethostname()[:256], os.getpid())
 
     def __str__(self) -> str:
-        """As consoles show it."""
+        """The text for consoles."""
         return f"{self.host} (pid {self.pid})"
 
 
 class Presence:
-    """The tokens of a run.
+    """The liveliness tokens of a run's members.
 
     Args:
-        prefix: key under which the tokens are, as ROLE/INCARNATION.
-        faults: told of errors of this program in Zenoh's threads.
+        prefix: key of the tokens, which is followed by ROLE/INCARNATION.
+        faults: records bugs of this program in Zenoh's threads.
     """
 
     def __init__(self, session: zenoh.Session, prefix: str, faults: Faults) -> None:
         self._there: set[str] = set()
-        self._gone: dict[str, float] = {}  # by role, when the last of it went
+        self._gone: dict[str, float] = {}  # by role, when its last member disappeared
         self._lock = threading.Lock()
         self._on_change: Callable[[int, bool], None] = lambda incarnation, there: None
         self._began = time.monotonic()
-        for role in ROLES:  # one subscriber each: access control may let a process see some roles only
+        for role in ROLES:  # one subscriber each: access control may let a process see only some roles
             session.liveliness().declare_subscriber(
                 f"{prefix}/{role}/*", faults.guarded("watching who is there", self._tell), history=True
             )
 
     def on_change(self, call: Callable[[int, bool], None]) -> None:
-        """Have `call(incarnation, there)` called whenever somebody comes or goes, in a thread of Zenoh's."""
+        """Call `call(incarnation, there)`, in one of Zenoh's threads, whenever a member appears or disappears."""
         self._on_change = call
 
     def counts(self) -> dict[str, int]:
-        """How many processes of each role are connected."""
+        """Number of connected processes by role."""
         with self._lock:
             return dict(Counter(name.split("/")[0] for name in self._there))
 
     def members(self, role: str) -> set[str]:
-        """Incarnations of a role that are connected."""
+        """Incarnations of a role's connected processes."""
         with self._lock:
             return {name.split("/")[1] for name in self._there if name.startswith(f"{role}/")}
 
     def absence(self, role: str) -> float:
-        """Seconds for which nobody of this role has been connected; 0 while somebody is."""
+        """Seconds for which no process of this role has been connected; 0 while one is."""
         with self._lock:
             if any(name.startswith(f"{role}/") for name in self._there):
                 return 0.0

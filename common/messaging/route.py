@@ -1,4 +1,4 @@
-"""The way from an actor to the replay service: a session of its own, for Zenoh takes no new endpoints at run time."""
+"""An actor's connection to the replay service: a separate session, for Zenoh accepts no new endpoints at run time."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from common.messaging.transport import Node, Pending
 
 
 class ReplayRoute:
-    """Carries queries to the replay service; a new session takes over when that listens elsewhere than before.
+    """Carries queries to the replay service; opens a new session when the service listens elsewhere.
 
-    What was under way on the old session remains without an answer, and is to be sent again.
+    Queries in flight on the old session remain unanswered, and the caller must send them again.
 
     Args:
-        open_route: opens a session with these endpoints.
+        open_route: opens a session with the given endpoints.
         endpoints: where the replay service listens now.
     """
 
@@ -50,7 +50,7 @@ class ReplayRoute:
             return self._node.begin(key, payload, timeout)
 
     def follow(self, endpoints: Sequence[str]) -> None:
-        """Take another way if the replay service listens elsewhere now."""
+        """Open a new session if the replay service now listens at other endpoints."""
         if not endpoints or set(endpoints) == self._endpoints:
             return
         node = self._open(endpoints)

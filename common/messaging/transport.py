@@ -1,7 +1,7 @@
-"""Zenoh as this system uses it: one session per process, queries that are answered, puts where the latest value wins.
+"""The transport over Zenoh: one session per process, queries with answers, and puts of which the latest value wins.
 
-A `Node` is one process's place in a run. Everything that must not be lost is a query (`ask`, `begin`) answered by a
-`serve` loop in a thread of its own; weights, role and status are `publish`ed and read as `latest`.
+A `Node` is one process's place in a run. Data that must not be lost goes as queries (`ask`, `begin`), which a `serve`
+loop answers in its own thread; weights, role and status are `publish`ed and read as `latest`.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ _QUIET = {
 
 
 class NoAnswer(RunError):
-    """Nobody answered a query in time; asking again is the caller's choice."""
+    """No process answered a query in time; the caller decides whether to ask again."""
 
 
 class Refused(RunError):
-    """The peer found our message bad or could not do what it asks, and said why."""
+    """The peer rejected the message as invalid or could not fulfil the request, and gave the reason."""
 
 
 def new_incarnation() -> int:
-    """A random id that a process draws at its start: 63 bits."""
+    """Draw a random id of 63 bits for a process."""
     return secrets.randbits(63)
 
 
@@ -71,8 +71,8 @@ def open_session(
     """Open a peer session with explicit endpoints, no scouting and quick reconnection.
 
     Raises:
-        UsageError: a Zenoh config file or an endpoint that can't be read.
-        RunError: an endpoint that can't be listened on, for example because its port is in use.
+        UsageError: a Zenoh config file or an endpoint is invalid.
+        RunError: it cannot listen on an endpoint, for example because the port is in use.
     """
     zenoh.init_log_from_env_or("off")
     check_endpoints((*listen, *connect))
@@ -94,7 +94,7 @@ def open_session(
 
 
 def locators(session: zenoh.Session) -> list[str]:
-    """The endpoints that this session really listens on (a port of 0 resolved)."""
+    """The endpoints that this session listens on, with a port of 0 resolved."""
     for reply in session.get(f"@/{session.zid()}/peer", timeout=2.0):
         if reply.ok is not None:
             return [str(locator) for locator in json.loads(reply.ok.payload.to_string())["locators"]]
@@ -102,14 +102,14 @@ def locators(session: zenoh.Session) -> list[str]:
 
 
 class Pending:
-    """A query under way."""
+    """A query in flight."""
 
     def __init__(self, handler: Any, key: str) -> None:  # noqa: ANN401 (zenoh's handler of replies)
         self._handler = handler
         self._key = key
 
     def ready(self) -> Message | None:
-        """The answer if it is there, else None; raises as `wait`."""
+        """The answer if it has arrived, else None; raises as `wait`."""
         try:
             reply = self._handler.try_recv()
         except zenoh.ZError as error:
@@ -120,8 +120,8 @@ class Pending:
         """Wait for the answer.
 
         Raises:
-            NoAnswer: nobody serves this key, or the time-out passed.
-            Refused: the peer found the message bad, or could not do what it asks.
+            NoAnswer: no process serves this key, or the time-out passed.
+            Refused: the peer rejected the message as invalid, or could not fulfil the request.
         """
         try:
             return _answer(self._handler.recv())
@@ -138,8 +138,8 @@ class Node:
         incarnation: the random id drawn at start.
 
     Attributes:
-        presence: who else is connected.
-        faults: errors of this program in the threads of this node.
+        presence: the run's other connected members.
+        faults: bugs of this program in this node's threads.
     """
 
     def __init__(self, session: zenoh.Session, run: str, role: str, incarnation: int) -> None:
@@ -176,11 +176,11 @@ class Node:
         return self.begin(key, payload, timeout).wait()
 
     def serve(self, key: str, answer: Callable[[Message], bytearray], depth: int = 64) -> None:
-        """Answer the queries on `key`, one after the other, in a thread of its own, until the session closes.
+        """Answer the queries on `key`, one after another, in a new thread, until the session closes.
 
-        A message that does not decode, names another run, or that `answer` refuses with BadMessage gets an error
-        reply, is counted, and changes nothing. Any other CoopError of `answer` becomes an error reply too, and so does
-        an error of this program, which is noted.
+        A message that cannot be decoded, names another run, or makes `answer` raise BadMessage gets an error reply, is
+        counted, and changes nothing. Any other CoopError of `answer` also becomes an error reply, and so does any
+        other exception, which is a bug and is noted in `faults`.
         """
         queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(depth), complete=True)
         thread = threading.Thread(target=self._serve, args=(queryable, key, answer), name=f"serve {key}", daemon=True)
@@ -204,7 +204,7 @@ class Node:
                     with contextlib.suppress(zenoh.ZError):
                         query.reply_err(Error.of(error).encode(self.run))
                     continue
-                with contextlib.suppress(zenoh.ZError):  # the asker may be gone, and will ask again if it is not
+                with contextlib.suppress(zenoh.ZError):  # the asker may be gone; otherwise it asks again
                     query.reply(key, reply)
 
     def read(self, payload: zenoh.ZBytes | None) -> Message:
@@ -215,7 +215,7 @@ class Node:
         return message
 
     def count_bad(self) -> None:
-        """Count a message that was refused; safe for threads."""
+        """Count a refused message; thread-safe."""
         with self._counting:
             self.bad_messages += 1
 
@@ -224,19 +224,19 @@ class Node:
         self.session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
 
     def announce(self, key: str, payload: bytearray) -> None:
-        """Broadcast a value that should reach everybody who listens; may block for a moment."""
+        """Broadcast a value that should reach all subscribers; may block for a moment."""
         self.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def publish_status(self, status: dict[str, Any]) -> None:
-        """Tell displays what this process does."""
+        """Publish this process's status for displays."""
         self._status.put(encode_status(self.run, status))
 
     def latest(self, key: str) -> Latest:
-        """Follow a key of which only the latest value matters."""
+        """Subscribe to a key of which only the latest value matters."""
         return Latest(self, self.session.declare_subscriber(key, zenoh.handlers.RingChannel(1)))
 
     def follow_stop(self, stop: Stop) -> None:
-        """Stop when the learner says so."""
+        """Set `stop` when the learner ends the run."""
 
         def stopped(sample: zenoh.Sample) -> None:
             try:
@@ -270,7 +270,7 @@ class Latest:
         self._subscriber = subscriber
 
     def take(self) -> Message | None:
-        """The newest value that has not been taken yet; None if there is none or it is not a valid message."""
+        """The newest value not yet taken; None if there is none or it is not a valid message."""
         sample = self._subscriber.try_recv()
         if sample is None:
             return None

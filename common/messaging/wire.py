@@ -1,7 +1,7 @@
 """The wire format: `[u32 magic][u32 header length][msgpack header][raw little-endian arrays, 64-byte aligned]`.
 
-Decoding views the arrays in place and allocates nothing that the sender names: every length is checked against the
-bytes that arrived. What the fields of each kind of message mean is `common.messaging.messages`' concern.
+Decoding views the arrays in place and never allocates a size that the sender states: it checks every length against the
+bytes that arrived. `common.messaging.messages` gives the fields of each kind of message their meaning.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from common.errors import BadMessage
 from common.types import Array
 
 PROTOCOL = 2
-ON_DISK = frozenset({1, 2})  # protocols whose segments and batches, as journals and snapshots hold them, are ours
+ON_DISK = frozenset({1, 2})  # protocols whose segments and batches in journals and snapshots can be read
 MAGIC = 0x434F4F50  # "COOP"
 ALIGNMENT = 64
 MAX_HEADER = 1 << 20
@@ -30,7 +30,7 @@ MAX_ARRAYS = 64
 MAX_DIMENSIONS = 8
 MAX_NAME = 64
 DTYPES = frozenset({"uint8", "bool", "int32", "int64", "uint64", "float32", "float64"})
-# Looked up, because numpy works out the name of a dtype anew each time, in the time of a small message.
+# A table, because numpy derives a dtype's name anew each time, which takes as long as a small message.
 _DTYPES = {name: np.dtype(name).newbyteorder("<") for name in DTYPES}
 _NAMES = {np.dtype(name): name for name in DTYPES}
 
@@ -50,22 +50,22 @@ class Message:
 
 
 class Source(Protocol):
-    """An array that lies elsewhere, and that is copied straight into its place in a message."""
+    """An array stored elsewhere that `encode` copies straight into its place in a message."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of its elements, one of `DTYPES`."""
+        """Of the elements, one of `DTYPES`."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """As it will be read back."""
+        """Shape of the decoded array."""
 
     @property
     def nbytes(self) -> int:
-        """That it takes in the message."""
+        """Bytes in the message."""
 
     def copy_to(self, out: Array) -> None:
-        """Copy it to `out`, contiguous memory of this dtype and shape."""
+        """Copy the array to `out`, contiguous memory of this dtype and shape."""
 
 
 def encode(
@@ -77,7 +77,7 @@ def encode(
 ) -> bytearray:
     """Build one message; each array is copied once, into its place.
 
-    into: a message of before, whose memory is used again: what is in the processor's caches need not be fetched anew.
+    into: an earlier message whose memory is reused, because it is in the processor's caches.
     """
     arrays = arrays or {}
     table: list[tuple[str, str, tuple[int, ...], int]] = []
@@ -116,10 +116,10 @@ def _sized(memory: bytearray | None, size: int) -> bytearray:
 
 
 def decode(payload: bytes, protocols: frozenset[int] | None = None) -> Message:
-    """View a message of this protocol, or of one of `protocols`.
+    """Decode a message of this protocol, or of one of `protocols`, without copying.
 
     Raises:
-        BadMessage: anything that is not a whole, well-formed message of this protocol; names the field.
+        BadMessage: the bytes are not a whole, well-formed message of this protocol; names the field.
     """
     header, start = _header(payload, protocols or {PROTOCOL})
     arrays: dict[str, Array] = {}

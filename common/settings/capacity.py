@@ -1,4 +1,4 @@
-"""What a run needs of this machine and of the messages between its roles, for the environment that it plays."""
+"""Checks that a run fits into this machine's memory and its data into the messages between roles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from common.types import EnvSpec
 
 # actions, rewards, terminated, span, param_version, ids, reuse; three counters of the frame's slot.
 ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4 + 3 * 4
-HEADER_BYTES = 1 << 20  # of a message, its arrays' alignment included
+HEADER_BYTES = 1 << 20  # of a message, including the alignment of its arrays
 
 
 def frame_bytes(spec: EnvSpec) -> int:
@@ -24,14 +24,14 @@ def frame_bytes(spec: EnvSpec) -> int:
 
 
 def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
-    """Memory of a full table whose transitions add one frame each, with the frames' counters and uniform sampling."""
+    """Bytes of a full table with one frame per transition, including the frames' counters; uniform sampling."""
     return capacity * (frame_bytes(spec) + ROW_BYTES + 2 * 4 * spec.stack)
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Raise UsageError for a table that this machine can't hold.
+    """Raise UsageError for a table that does not fit into this machine's memory.
 
-    Other evictions than fifo may keep stack + 1 frames for a transition.
+    Eviction policies other than fifo may keep stack + 1 frames per transition.
     """
     capacity = config.replay.capacity
     copies = 1 if config.replay.eviction == "fifo" else spec.stack + 1
@@ -45,10 +45,10 @@ def check_memory(config: RunConfig, spec: EnvSpec) -> None:
 
 
 def check_messages(config: RunConfig, spec: EnvSpec) -> None:
-    """Raise UsageError for a batch, a segment or parameters that may not fit into one message.
+    """Raise UsageError if a batch, a segment or the parameters may not fit into one message.
 
-    The frames of a batch's transitions may all differ, stack + 1 for each. A step adds one frame to its segment, and
-    two where an episode ends with it; n_step - 1 steps may wait for the segment.
+    A batch may hold stack + 1 different frames per transition. A step adds one frame to its segment, or two if an
+    episode ends with it; a segment may also contain n_step - 1 steps that waited for it.
     """
     row = ROW_BYTES + 2 * 4 * spec.stack
     room = MAX_PAYLOAD - HEADER_BYTES

@@ -1,4 +1,4 @@
-"""The configuration of a run: nested dataclasses whose fields say what they may hold."""
+"""The configuration of a run: nested dataclasses whose field types give the allowed values."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class NetworkSettings:
 
     __pydantic_config__ = _STRICT
     kind: Literal["mlp", "nature", "nips2013"] = "mlp"
-    """mlp: Linear layers with ReLU; nature: 3 conv + 2 linear; nips2013: 2 conv + 2 linear."""
+    """mlp: linear layers with ReLU; nature: 3 convolutions + 2 linear; nips2013: 2 convolutions + 2 linear."""
     hidden: Annotated[tuple[Positive, ...], Field(max_length=MAX_LAYERS)] = (128, 128, 128)
-    """Widths of the hidden layers of the mlp."""
+    """Widths of the mlp's hidden layers."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16: actor processes, targets, and all passes of the gradient methods, with half the bits; parameters and
+    """bfloat16 halves the bits of acting, of the targets, and of all passes of the gradient methods; parameters and
     optimizers stay in float32."""
 
 
@@ -53,20 +53,20 @@ class LearnerSettings:
     swap_every: Positive = 30
     """C: updates between swaps of the acting role."""
     target_update_every: Positive | None = None
-    """Updates between copies to the target network (dqn, edql); as swap_every if not given, so that all methods have
-    one C."""
+    """Updates between copies to the target network (dqn, edql); equals swap_every if not given, so that all methods
+    share one C."""
     swap_unit: Literal["updates", "steps"] = "updates"
-    """What these two count; environment steps in lockstep runs only."""
+    """Unit of swap_every and target_update_every; "steps" means environment steps, in lockstep runs only."""
     reset_role_at_episode: bool = False
-    """Let network 1 act at the start of each episode, as Algorithm 1 writes it; lockstep runs only."""
+    """Make network 1 the acting one at the start of each episode, as Algorithm 1 writes; lockstep runs only."""
     gamma: Share = 0.99
     loss: Literal["squared", "mse", "huber"] = "squared"
-    """squared: 1/2 e^2, the paper's; mse: e^2, as PyTorch's and the authors' code, so s weighs half as much beside it;
-    huber: 1/2 e^2 with its slope clipped to [-1, 1]."""
+    """squared: 1/2 e^2, as in the paper; mse: e^2, as in PyTorch and the authors' code, which halves the relative
+    weight of s; huber: 1/2 e^2 with its slope clipped to [-1, 1]."""
     double: bool = False
-    """Take the target's value at the action that the trained network prefers, as in double Q-learning."""
+    """Double Q-learning: the trained network chooses the action at which the target network is evaluated."""
     optimizer: OptimizerName = "rmsprop"
-    """rmsprop is PyTorch's; rmsprop-mnih is centred, with eps inside the root, beside gradients summed over the
+    """rmsprop: PyTorch's; rmsprop-mnih: centred, with eps inside the square root and gradients summed over the
     batch."""
     learning_rate: PositiveFloat = 1e-3
     learning_rate_final: PositiveShare = 1.0
@@ -75,7 +75,7 @@ class LearnerSettings:
     """The learning rate is also multiplied by this after every `learning_rate_decay_every` updates."""
     learning_rate_decay_every: Positive = 1000
     momentum: Decay = 0.0
-    """Of the steps (sgd, rmsprop)."""
+    """Momentum of the parameter steps (sgd, rmsprop)."""
     alpha: Decay = 0.99
     """Smoothing constant of the squared gradients' running mean (rmsprop, rmsprop-mnih)."""
     gradient_alpha: Decay = 0.95
@@ -87,14 +87,14 @@ class LearnerSettings:
     eps: PositiveFloat = 1e-8
     """Added to the optimizer's denominator; not for sgd."""
     weight_decay: Annotated[tuple[NonNegative, ...], Field(max_length=MAX_LAYERS + 1)] = ()
-    """lambda(i) of each layer, input first; one value holds for all layers; none means 0."""
+    """lambda(i) of each layer, starting at the input; one value applies to all layers; empty means 0."""
     device: str = "cpu"
     compile: bool = False
-    """Run the passes through torch.compile, for GPUs; on a CPU that needs a C++ compiler and gains nothing."""
+    """Run the passes through torch.compile, for GPUs; on a CPU this needs a C++ compiler and gains nothing."""
     threads: Positive = 1
-    """CPU threads of torch in the learner."""
+    """CPU threads that PyTorch uses in the learner."""
     prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 4
-    """Sample requests under way at once."""
+    """Number of sample requests in flight."""
     publish_every: Positive = 10
     """Updates between broadcasts of the acting network; every swap is broadcast too."""
 
@@ -107,15 +107,15 @@ class EdlSettings:
     rate: NonNegative = 0.1
     """s at the first update, the paper's exploration rate; 0 gives the ordinary gradient."""
     decay: PositiveShare = 1.0
-    """s is multiplied by this every `decay_every` updates."""
+    """Factor by which s is multiplied every `decay_every` updates."""
     decay_every: Positive = 1000
     decay_stepwise: bool = False
-    """Multiply at once after `decay_every` updates; else a little with each update."""
+    """Apply the whole factor once every `decay_every` updates, instead of a fraction of it at each update."""
     noise: Literal["constant", "normal"] = "constant"
     """normal: s is the rate times one draw from N(0, 1) per update."""
     feedback: Literal["transform", "weight-gradient", "random"] = "transform"
     polar_dtype: Literal["float32", "bfloat16"] = "float32"
-    """What the s U V^T part of the transform feedback is computed in; T^T e is float32 always."""
+    """Precision of the s U V^T part of the transform feedback; T^T e is always float32."""
 
 
 @dataclass(frozen=True)
@@ -124,35 +124,35 @@ class ReplaySettings:
 
     __pydantic_config__ = _STRICT
     capacity: Steps = 5000
-    """Exact number of transitions held."""
+    """Exact number of transitions in the full table."""
     learning_starts: Steps = 500
-    """Transitions to collect before the first update; --total-steps cuts a preset's to a tenth of the run."""
+    """Transitions to collect before the first update; --total-steps limits a preset's value to a tenth of the run."""
     ratio: Annotated[float, Field(gt=0, le=MAX_RATIO)] = 1.0
     """Updates per environment step."""
     tolerance: Annotated[float, Field(gt=0, le=MAX_TOLERANCE)] = 64.0
-    """Environment steps that acting and learning may drift apart."""
+    """Environment steps by which acting may be ahead of learning, or behind it."""
     n_step: Annotated[int, Field(gt=0, le=MAX_N_STEP)] = 1
-    """Steps of reward that a transition sums up before it bootstraps (1: the paper); fewer at an episode's end."""
+    """Rewards that a transition sums before it bootstraps (1: the paper); fewer at the end of an episode."""
     eviction: Literal["fifo", "reservoir", "prioritized"] = "fifo"
     sampling: Literal["uniform", "prioritized"] = "uniform"
     replacement: bool = True
-    """Draw a batch with replacement; without, it holds no transition twice (uniform sampling only)."""
+    """Draw batches with replacement; without it, a batch holds no transition twice (uniform sampling only)."""
     priority_exponent: Share = 0.6
     importance_exponent: Share = 0.4
     journal: bool = False
-    """Write every accepted segment and every draw to disk before anybody is answered: a kill loses nothing."""
+    """Write each accepted segment and each draw to disk before answering, so that a kill loses nothing."""
     journal_keep: bool = False
-    """Keep journal files that an epoch covers, so that the run can be re-executed from its beginning."""
+    """Keep journal files that an epoch has made redundant, so that the run can be re-executed from its beginning."""
 
     @property
     def prioritized(self) -> bool:
-        """Whether the table wants to be told of TD errors."""
+        """Whether the table uses TD errors as priorities."""
         return "prioritized" in (self.eviction, self.sampling)
 
 
 @dataclass(frozen=True)
 class ActorSettings:
-    """Acting: exploration and segments."""
+    """Exploration and segments."""
 
     __pydantic_config__ = _STRICT
     envs: Annotated[int, Field(gt=0, le=MAX_STREAMS)] = 1
@@ -161,11 +161,11 @@ class ActorSettings:
     epsilon_final: Share = 0.05
     epsilon_decay: Literal["exponential", "linear"] = "exponential"
     epsilon_steps: Steps = 10_000
-    """Environment steps: time constant of the exponential, length of the linear decay."""
+    """Environment steps: time constant of the exponential decay, or length of the linear decay."""
     segment_steps: Annotated[int, Field(gt=0, le=MAX_SEGMENT_STEPS)] = 16
-    """Steps of one emulator that travel together."""
+    """Steps of one emulator that are sent together."""
     window: Annotated[int, Field(gt=0, le=MAX_GAPS)] = 2
-    """Segments an actor may have under way unacknowledged."""
+    """Unacknowledged segments that an actor may have in flight."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class RunConfig:
     method: Method = "coop"
     seed: Count = 0
     total_steps: Steps = 50_000
-    """Environment steps after which the run is complete."""
+    """Environment steps of the complete run."""
     total_updates: Count = 0
     """Stop after this many updates; 0: no limit."""
     total_episodes: Count = 0
@@ -186,7 +186,7 @@ class RunConfig:
     target_return: Annotated[float, Field(allow_inf_nan=False)] | None = None
     """Stop once the mean return of the last 100 episodes reaches this."""
     checkpoint_every: Count = 10_000
-    """Updates between epochs, the checkpoints of the whole system; 0: only the closing one."""
+    """Updates between epochs, the checkpoints of the whole system; 0: only at the end."""
     env: EnvSettings = field(default_factory=EnvSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
     learner: LearnerSettings = field(default_factory=LearnerSettings)
@@ -196,11 +196,11 @@ class RunConfig:
     methods: Annotated[dict[Method, dict[str, Any]], tyro.conf.Fixed, tyro.conf.Suppress] = field(
         default_factory=dict, compare=False
     )
-    """What the preset or file sets differently for other methods, for a run of theirs with this config."""
+    """Settings that the preset or file changes for other methods, kept for running them with this config."""
 
     @property
     def planned_updates(self) -> int:
-        """Updates of a run that goes through all its steps: the ratio holds from `learning_starts` on."""
+        """Updates of a run of all `total_steps`: the ratio applies from `learning_starts` on."""
         return round(self.replay.ratio * (self.total_steps - self.replay.learning_starts))
 
     @property
@@ -210,7 +210,7 @@ class RunConfig:
 
     @property
     def swap_period(self) -> int:
-        """C of this method, in `learner.swap_unit`: between swaps of the roles, or copies to the target network."""
+        """C of this method, in `learner.swap_unit`: the period of role swaps, or of copies to the target network."""
         settings = self.learner
         return settings.swap_every if self.two_networks else settings.target_update_every or settings.swap_every
 
@@ -221,7 +221,7 @@ class RunConfig:
 
 
 def check_distributed(config: RunConfig) -> None:
-    """Raises UsageError for what only lockstep runs can do: with many actors there is no single step or episode."""
+    """Raise UsageError for settings of lockstep runs only: with many actors there is no single step or episode."""
     if config.learner.swap_unit == "steps":
         raise UsageError("learner.swap_unit = 'steps': in lockstep runs only; the roles' processes count updates")
     if config.learner.reset_role_at_episode:

@@ -1,4 +1,4 @@
-"""Which settings matter only beside others: whoever gives one as a flag where it has no effect should hear of it."""
+"""Settings that have an effect only together with others; commands warn of flags without effect."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from common.settings.config import RunConfig
 class _Condition:
     """Settings that have an effect only where a condition holds.
 
-    names: dotted; "edl." stands for the whole section. otherwise: why they have none, a format string of the config c.
+    names: dotted; "edl." stands for the whole section.
+    otherwise: why the settings have no effect if it does not hold, a format string over the config c.
     """
 
     names: tuple[str, ...]
@@ -25,7 +26,7 @@ class _Condition:
 
 
 _OPTIMIZER = "learner.optimizer = {c.learner.optimizer!r} has none"
-# The first condition that does not hold is the one that is said.
+# The warning gives the first condition that does not hold.
 _CONDITIONS = (
     _Condition(("edl.",), lambda c: c.feedback != "none", "{c.method} takes the ordinary gradient"),
     _Condition(
@@ -96,7 +97,7 @@ _OF_PROCESSES = (
 
 
 def without_effect(config: RunConfig, given: Collection[str], *, lockstep: bool) -> Iterator[str]:
-    """A line for each setting of `given`, dotted names, that changes nothing in a run of `config`."""
+    """Yield a line for each setting in `given` (dotted names) that has no effect in a run of `config`."""
     for name in sorted(given):
         flag = f"--{name.replace('_', '-')}"
         if lockstep and name in _OF_PROCESSES:

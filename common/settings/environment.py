@@ -1,4 +1,4 @@
-"""The settings of the environment that a run plays."""
+"""Settings of a run's environment."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ class EnvSettings:
     id: Annotated[str, Field(min_length=1, max_length=MAX_ENV_ID)] = "CartPole-v0"
     """A gymnasium id ("CartPole-v0", "coop/Catch-v0") or an ALE game ("breakout", "ALE/Breakout-v5")."""
     noop_max: Annotated[int, Field(ge=0, le=MAX_NOOPS)] = 30
-    """No-ops at the start of a game are drawn from 0..noop_max; ALE only."""
+    """Largest number of no-ops at the start of a game, which is drawn from 0..noop_max; ALE only."""
     episodic_life: bool = False
-    """A lost life is terminal for learning while the game goes on (Mnih et al. 2015, training); ALE only."""
+    """Treat a lost life as terminal for learning while the game goes on (Mnih et al. 2015, training); ALE only."""
     clip_rewards: bool = False
     """Learn from rewards clipped to [-1, 1]; reported returns are unclipped."""
     frame_skip: Annotated[int, Field(gt=0, le=MAX_FRAME_SKIP)] = 4
-    """Emulator frames of one step, the last two of them max-pooled; ALE only."""
+    """Emulator frames per step, of which the last two are max-pooled; ALE only."""
     stack: Annotated[int, Field(gt=0, le=MAX_STACK)] = 4
-    """Frames of one observation; pictures only, a vector is its own observation."""
+    """Frames per observation, for pictures only; a vector is an observation by itself."""
     repeat_action_probability: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Sticky actions; ALE only."""
+    """Probability that the emulator repeats the previous action (sticky actions); ALE only."""
     full_action_space: bool = False
-    """All 18 actions in place of the game's own; ALE only."""
+    """Use all 18 actions instead of the game's minimal set; ALE only."""
     max_episode_steps: Annotated[int, Field(ge=0, le=MAX_GAME_STEPS)] = 0
-    """Truncate after so many steps; 0 keeps the environment's own limit (ALE: 108,000 frames)."""
+    """Truncate episodes after this many steps; 0 keeps the environment's own limit (ALE: 108,000 frames)."""
     time_limit_terminal: bool = False
-    """An episode that its time limit ends counts as terminal for learning, as in old gym; else its last state has a
-    value."""
+    """Treat the end of an episode by its time limit as terminal for learning, as old gym did; otherwise the last
+    state bootstraps."""
 
     @property
     def atari(self) -> bool:
-        """Whether the id means an ALE game: gymnasium's have a slash or a version, ALE's own namespace excepted."""
+        """Whether the id names an ALE game: in namespace ALE/, or with neither a slash nor a version."""
         return self.id.startswith("ALE/") or not ("/" in self.id or "-v" in self.id)

@@ -1,4 +1,4 @@
-"""What single settings may hold, as types that pydantic checks."""
+"""Types of single settings, with the bounds that pydantic checks."""
 
 from __future__ import annotations
 

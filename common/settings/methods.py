@@ -1,4 +1,4 @@
-"""What a preset or a file sets for one method alone, and how a resolved config keeps it for the other methods."""
+"""Settings of a preset or file for single methods, and how a resolved config keeps those of other methods."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """`base` with the values of `over`, table by table.
 
     Raises:
-        UsageError: a value stands in a table's place.
+        UsageError: a value stands where a table is expected.
     """
     result = dict(base)
     for key, value in over.items():
@@ -30,7 +30,7 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def leaves(tables: Mapping[str, Any], at: _FieldPath = ()) -> Iterator[tuple[_FieldPath, Any]]:
-    """The values of nested tables with their paths."""
+    """Yield the values of nested tables with their paths."""
     for key, value in tables.items():
         if isinstance(value, Mapping):
             yield from leaves(value, (*at, key))
@@ -39,16 +39,16 @@ def leaves(tables: Mapping[str, Any], at: _FieldPath = ()) -> Iterator[tuple[_Fi
 
 
 def nested(path: _FieldPath, value: Any) -> dict[str, Any]:  # noqa: ANN401 (a value of any field)
-    """Tables that hold one value."""
+    """Nested tables with a single value at `path`."""
     for key in reversed(path):
         value = {key: value}
     return dict(value)
 
 
 def of_method(tables: Mapping[str, Any], method: str | None) -> dict[str, Any]:
-    """The tables of one method (None: the one that they name), those of `[methods.NAME]` over the rest.
+    """The tables of one method (None: the one that they name): `[methods.NAME]` overrides the rest.
 
-    What another method would have otherwise stays in `methods`, so that a resolved config still says it.
+    The settings in which other methods differ stay in `methods`, so that a resolved config still has them.
 
     Raises:
         UsageError: `methods` does not hold tables.
@@ -72,7 +72,7 @@ def of_method(tables: Mapping[str, Any], method: str | None) -> dict[str, Any]:
 
 
 def _value(tables: Any, path: _FieldPath) -> Any:  # noqa: ANN401
-    """What stands at `path`; the default where nothing does."""
+    """The value at `path`, or its default if there is none."""
     default: Any = asdict(RunConfig())
     for key in path:
         tables = tables.get(key) if isinstance(tables, Mapping) else None

@@ -23,38 +23,38 @@ from common.settings.tables import load_tables, resolve, validated
 
 @dataclass(frozen=True)
 class RoleOptions:
-    """What a process needs to find its run."""
+    """Where and how a process finds its run."""
 
     run: str = "coop"
     """Name of the run."""
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints of the learner, for example tcp/head:7447."""
     join_timeout: float = 30.0
-    """Seconds to look for the learner before giving up."""
+    """Seconds to search for the learner before giving up."""
     patience: float = 60.0
-    """Seconds to wait for a learner that has gone before giving up."""
+    """Seconds to wait for a lost learner before giving up."""
     zenoh_config: Path | None = None
-    """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
+    """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
-    """Carry messages between processes of one machine in shared memory."""
+    """Use shared memory for messages between processes on one machine."""
 
 
 @dataclass(frozen=True)
 class RunOptions(RunConfig):
-    """The fields of a run's config, and where they come from and go to."""
+    """The fields of a run's config, their source, and the run directory."""
 
     preset: str | None = None
-    """Settings that come with the package (cartpole if neither this nor --config is given, and no run resumed)."""
+    """Settings that come with the package (default: cartpole, unless --config or a resumed run gives them)."""
     config: Path | None = None
-    """A TOML file with the fields below, for example the config.toml of another run."""
+    """A TOML file with the fields of a run, for example the config.toml of another run."""
     run_dir: Path | None = None
-    """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
+    """Folder for the run's files (default: runs/ENV-METHOD-sSEED-TIME)."""
     resume: bool = False
-    """Go on with the run in --run-dir and its config, from its newest epoch; start it where there is none yet."""
+    """Continue the run in --run-dir, with its config, from its newest epoch; start it if there is none yet."""
     zenoh_config: Path | None = None
-    """A Zenoh configuration file (TLS, access control); the endpoints given here still hold."""
+    """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
-    """Carry messages between processes of one machine in shared memory."""
+    """Use shared memory for messages between processes on one machine."""
 
     def run_config(self) -> RunConfig:
         """The checked config of the run; raises UsageError."""
@@ -64,8 +64,8 @@ class RunOptions(RunConfig):
         """The run directory.
 
         Raises:
-            UsageError: there is a run in it already; or, with --resume, flags that contradict its config.
-            RunError: it is another run's.
+            UsageError: it already holds a run; or, with --resume, flags contradict the run's config.
+            RunError: it belongs to another run.
         """
         if self.resume:
             return self._resumed()
@@ -89,12 +89,12 @@ class RunOptions(RunConfig):
 
 
 def holds_run(path: Path) -> bool:
-    """True where a run has begun in a folder."""
+    """True if a run has begun in a folder."""
     return has_run_id(path) or (path / "episodes.csv").exists()
 
 
 def beginning(path: Path) -> str:
-    """What to say where --resume finds no epoch in a run directory."""
+    """The line to print if --resume finds no epoch in a run directory."""
     there = "the run there has no epoch yet" if holds_run(path) else "there is no run there yet"
     return f"starts in {path}: {there}"
 
@@ -103,12 +103,12 @@ OptionsT = TypeVar("OptionsT", bound=RunOptions)
 
 
 def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep: bool = False) -> OptionsT:
-    """Parse flags over the config that `--preset`, `--config` or `--resume` names; warn of those that change nothing.
+    """Parse flags over the config that `--preset`, `--config` or `--resume` names; warn of flags without effect.
 
-    lockstep: the run will be one process.
+    lockstep: the run will be a single process.
 
     Raises:
-        UsageError: whatever is wrong with them, in one line.
+        UsageError: the flags are invalid; the text, one line, says how.
     """
     args = sys.argv[1:]
     base = base_config(args)

@@ -1,4 +1,4 @@
-"""Settings under the names that they had in earlier versions, in tables and on command lines."""
+"""Reads settings under their names of earlier versions, in tables and on command lines."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ _RENAMED = {
     "replay": {"start": "learning_starts"},
     "learner": {"denominator": "eps", "swap_by": "swap_unit"},
 }
-# What these meant depends on the optimizer; a name that is not listed keeps its meaning.
+# The meaning of these depended on the optimizer; a name that is not listed keeps its meaning.
 _OF_OPTIMIZER = {
     "sgd": {"squared_decay": "alpha"},
     "rmsprop": {"squared_decay": "alpha"},
     "rmsprop-mnih": {"squared_decay": "alpha", "momentum": "gradient_alpha"},
     "adam": {"squared_decay": "beta2", "momentum": "beta1"},
 }
-_ONLY_NOW = {"eps", "alpha", "beta1", "beta2", "gradient_alpha"}  # momentum beside one of these is momentum
+_ONLY_NOW = {"eps", "alpha", "beta1", "beta2", "gradient_alpha"}  # with one of these, momentum is today's momentum
 _VALUES = {"swap_unit": {"plays": "steps"}}
 
 
 def current(tables: Mapping[str, Any], optimizer: str = LearnerSettings.optimizer) -> dict[str, Any]:
-    """Nested tables with the settings' present names; one line on stderr says which were given by former ones.
+    """Rename the settings of nested tables to their present names; one line on stderr lists those renamed.
 
-    optimizer: in use where the tables name none.
+    optimizer: the one in use if the tables name none.
 
     Raises:
-        UsageError: a setting is given by both names.
+        UsageError: a setting is given under both names.
     """
     found: dict[str, str] = {}
     renamed = _sections(tables, optimizer, found)
@@ -39,9 +39,9 @@ def current(tables: Mapping[str, Any], optimizer: str = LearnerSettings.optimize
 
 
 def current_flags(args: Sequence[str], optimizer: str) -> list[str]:
-    """A command line with the flags' present names; as `current`.
+    """Rename the flags of a command line to their present names; otherwise like `current`.
 
-    optimizer: in use where the command line names none.
+    optimizer: the one in use if the command line names none.
     """
     for token, following in zip(args, [*args[1:], ""], strict=True):
         flag, equals, value = token.partition("=")

@@ -1,4 +1,4 @@
-"""Which settings a run may be given anew when it goes on."""
+"""Which settings may change when a run is resumed."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _LIMITS = ("total_updates", "total_episodes")  # 0: none
 
 
 def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
-    """Refuse what would make the run another one.
+    """Refuse changes that would make it a different run.
 
     A run may be made longer: `total_steps`, `total_updates` and `total_episodes` may grow, and `target_return` and
-    `checkpoint_every` may be anything. Schedules that span the run (`learner.learning_rate_final`) are then those of
-    the longer run.
+    `checkpoint_every` may take any value. Schedules that span the run (`learner.learning_rate_final`) then follow the
+    longer run.
 
     Args:
-        config: what the command line asks for. saved: what the run has been so far. source: the file that says so.
+        config: the config that the command line asks for. saved: the run's config so far. source: the file of `saved`.
 
     Raises:
-        RunError: it is another run, of another name, method, seed or environment.
-        UsageError: names every other field that must stay as it is, with both values.
+        RunError: the run has another name, method, seed or environment.
+        UsageError: another field that must not change has changed; names each such field with both values.
     """
     here, there = (dict(leaves(to_tables(each))) for each in (config, saved))
     for path in _TELLS_APART:

@@ -1,4 +1,4 @@
-"""Rules between the fields of a config; what single fields may hold is said by their types."""
+"""Rules between the fields of a config; the types of single fields give their own bounds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from common.settings.config import RunConfig
 
 
 def check_rules(config: RunConfig) -> None:
-    """Raise UsageError for the first rule that the config breaks: the field, its value and what is allowed."""
+    """Raise UsageError for the first rule that the config breaks; names the field, its value and what is allowed."""
     if problem := next(_problems(config), None):
         raise UsageError(problem)
 

@@ -1,4 +1,4 @@
-"""Schedules as plain functions of a count: epsilon, s and the learning rate."""
+"""Schedules of epsilon, s and the learning rate, as pure functions of a count."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def epsilon(settings: ActorSettings, env_step: int) -> float:
 
 
 def exploration_rate(settings: EdlSettings, update: int) -> float:
-    """The paper's s before any N(0, 1) draw: rate * decay^(update / decay_every), whole powers only if stepwise."""
+    """The paper's s before any N(0, 1) draw: rate * decay^(update / decay_every), with integer powers if stepwise."""
     power = update // settings.decay_every if settings.decay_stepwise else update / settings.decay_every
     return settings.rate * float(settings.decay**power)
 
@@ -24,8 +24,8 @@ def exploration_rate(settings: EdlSettings, update: int) -> float:
 def learning_rate(settings: LearnerSettings, update: int, planned: int) -> float:
     """Learning rate of an update, counted from 0, in a run of `planned` updates.
 
-    An exponential fall to learning_rate_final of itself over the run, times learning_rate_decay for every
-    learning_rate_decay_every updates done.
+    It falls exponentially to the share learning_rate_final over the run, and is multiplied by learning_rate_decay
+    every learning_rate_decay_every updates.
     """
     progress = min(1.0, update / max(1, planned))
     steps = update // settings.learning_rate_decay_every

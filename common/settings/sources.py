@@ -1,4 +1,4 @@
-"""The config that a command line starts from: a preset, a file, or the run that goes on."""
+"""The config that a command line starts from: a preset, a file, or the run to be resumed."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from common.settings.tables import load_tables, resolve, shortened
 
 
 def base_config(args: Sequence[str] | None = None) -> RunConfig:
-    """The config that `--preset`, `--config`, `--method` and `--total-steps` name; the other flags override it.
+    """The config given by `--preset`, `--config`, `--method` and `--total-steps`; the other flags override it.
 
-    With `--resume` and neither a preset nor a file it is that of the run in `--run-dir`.
+    With `--resume` and neither a preset nor a file, it is the config of the run in `--run-dir`.
 
     Raises:
         UsageError: an unknown preset, a bad file, or both given.

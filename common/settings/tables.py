@@ -1,4 +1,4 @@
-"""A run's config from tables and back: presets, TOML files, and the checks that they all pass through."""
+"""Converts a run's config from tables (presets, TOML files) and back, with all checks."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
 
 
 def _preset(*place: str) -> dict[str, Any]:
-    """A file under presets/, laid over the one in presets/bases/ that it extends."""
+    """Read a file under presets/, merged over the one in presets/bases/ that it extends."""
     tables = tomllib.loads(files("common.settings").joinpath("presets", *place).read_text(encoding="utf-8"))
     base = tables.pop("extends", None)
     return tables if base is None else merged(_preset("bases", f"{base}.toml"), tables)
 
 
 def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
-    """A preset for a run of another length.
+    """Fit a preset to a run of another length.
 
-    Its `replay.learning_starts` is at most a tenth of the run, so that it learns. In a shorter run the learning rate
-    falls as it does in the preset's own: to the share that it would have reached by then.
+    `replay.learning_starts` becomes at most a tenth of the run, so that learning begins. In a shorter run the learning
+    rate follows the preset's own schedule: it ends at the share that the full run would have reached by then.
     """
     replay, learner = tables.get("replay", {}), tables.get("learner", {})
     start = min(replay.get("learning_starts", ReplaySettings.learning_starts), max(1, total_steps // 10))
@@ -71,10 +71,10 @@ def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
 def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     """Turn tables into a checked config; a `[methods.NAME]` table overrides the rest for that method.
 
-    Names of settings of earlier versions are read, too.
+    It also reads settings under their names of earlier versions.
 
     Raises:
-        UsageError: a misspelt field or a value out of range; names the field, the value and what is allowed.
+        UsageError: an unknown field or a value out of range; names the field, the value and what is allowed.
     """
     return validated(of_method(current(tables), method))
 
@@ -94,7 +94,7 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
 
 
 def to_toml(config: RunConfig) -> str:
-    """The resolved config as TOML; `--config` takes it back."""
+    """The resolved config as TOML, which `--config` reads."""
     return tomli_w.dumps(_without_none(asdict(config)))
 
 
@@ -104,12 +104,15 @@ def to_tables(config: RunConfig) -> dict[str, Any]:
 
 
 def identity(config: RunConfig) -> dict[str, Any]:
-    """What makes two runs the same one, as nested tables: not how often it is saved, nor what other methods have."""
+    """The settings, as nested tables, that all processes of a run must share.
+
+    These are all but the checkpoint interval and the settings of other methods.
+    """
     return {name: value for name, value in to_tables(config).items() if name not in ("checkpoint_every", "methods")}
 
 
 def first_difference(here: Mapping[str, Any], there: Mapping[str, Any], name: str = "") -> tuple[str, Any, Any] | None:
-    """(name, here, there) of the first field in which nested tables differ; None where they are equal."""
+    """(name, here, there) of the first field in which nested tables differ; None if they are equal."""
     for key in {**here, **there}:
         mine, theirs = here.get(key), there.get(key)
         if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
@@ -121,7 +124,7 @@ def first_difference(here: Mapping[str, Any], there: Mapping[str, Any], name: st
 
 
 def _without_none(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """TOML has no null: a field that is None is left out and comes back as its default."""
+    """Leave out fields that are None, for TOML has no null; they are read back as their defaults."""
     return {
         key: _without_none(value) if isinstance(value, Mapping) else value
         for key, value in tables.items()
@@ -130,9 +133,9 @@ def _without_none(tables: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def first_problem(error: pydantic.ValidationError, example: Any) -> str:  # noqa: ANN401 (any nested dataclasses)
-    """What pydantic found first, in one line: the field, the value and what is allowed.
+    """The first error that pydantic found, in one line: the field, the value and what is allowed.
 
-    example: an instance of what was to be built, for the names of its fields.
+    example: an instance of the class that was being built, for the names of its fields.
     """
     first, *rest = error.errors(include_url=False)
     name = ".".join(str(part) for part in first["loc"])
@@ -145,7 +148,7 @@ def first_problem(error: pydantic.ValidationError, example: Any) -> str:  # noqa
 
 
 def _siblings(path: tuple[int | str, ...], example: Any) -> list[str]:  # noqa: ANN401
-    """The fields that are allowed where the last name of `path` stands."""
+    """The fields allowed in place of the last name of `path`."""
     for name in path[:-1]:
         example = getattr(example, str(name))
     return [field.name for field in fields(example)]

@@ -1,16 +1,16 @@
 """The messages of a run, a module for each conversation.
 
-join      join / joined: a role asks the learner for the run; leave / farewell: a role that was told to stop
+join      join / joined: a role asks the learner for the run's data; leave / farewell: a role announces that it stops
 insert    insert: a segment for the table
-sample    sample / batch: the learner draws; also carries the episodes that ended
-answers   ack, retry, error: a receipt; not now, and why; what is wrong with a message or could not be carried out
+sample    sample / batch: the learner draws a batch; the answer also carries the episodes that ended
+answers   ack, retry, error: a receipt; a request to try again later, with the reason; a rejection or failure
 weights   weights, role: the learner's broadcasts; current: asks for the latest of them
 stats     stats: the replay service's counters
-limits    limit / limits: the limiter's settings, asked for and changed
-epoch     snapshot, written: the replay service's part of an epoch is to be begun; is it on disk?
-status    status: what a role is doing, for displays
+limits    limit / limits: reads and changes the limiter's settings
+epoch     snapshot, written: begins the replay service's part of an epoch, and asks whether it is on disk
+status    status: the state of a role, for displays
 stop      stop: the learner ends the run
 
-Each message is one struct whose fields say what they may hold. `encode` builds its bytes, `decode` reads it back and
-raises BadMessage, naming the field. body.py is what they have in common.
+Each message is a struct whose field types give the allowed values. `encode` builds its bytes; `decode` reads them and
+raises BadMessage, which names the invalid field. body.py holds the common parts.
 """

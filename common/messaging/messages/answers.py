@@ -1,4 +1,4 @@
-"""What any question may be answered with: a receipt, "not now", or what is wrong with it."""
+"""Answers to any request: a receipt, a request to try again later, or an error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LONGEST_PROBLEM = 4096  # characters
 
 
 class Ack(Body, frozen=True):
-    """The receipt of a segment, or of a request that was carried out.
+    """The receipt for a segment or for a request that succeeded.
 
     inserted: the table's count of accepted transitions.
     """
@@ -25,7 +25,7 @@ class Ack(Body, frozen=True):
 
 
 class Retry(Body, frozen=True):
-    """Not now, and why: the request is to be sent again."""
+    """Asks the sender to send its request again later, and gives the reason."""
 
     kind: ClassVar[str] = "retry"
 
@@ -33,7 +33,7 @@ class Retry(Body, frozen=True):
 
 
 class Error(Body, frozen=True):
-    """The answer to a message that is bad (`field` names what is), or that could not be carried out."""
+    """Answers a message that is invalid (`field` names the invalid field) or whose request failed."""
 
     kind: ClassVar[str] = "error"
 
@@ -42,7 +42,7 @@ class Error(Body, frozen=True):
 
     @classmethod
     def of(cls, error: Exception) -> Self:
-        """What to answer where a message led to `error`."""
+        """The answer to a message that caused `error`."""
         field = error.field if isinstance(error, BadMessage) else ""
         problem = str(error) if isinstance(error, CoopError) else f"error of this program: {error!r}"
         return cls(field[:1024], problem[:LONGEST_PROBLEM])

@@ -1,4 +1,4 @@
-"""What all messages have in common: a kind, fields with bounds in their types, and arrays of known dtype and shape."""
+"""The common parts of messages: a kind, fields with bounds in their types, and arrays of known dtype and shape."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from common.messaging.wire import Message
 
 T = TypeVar("T", bound=msgspec.Struct)
 Layout = Mapping[str, tuple[str, tuple[int | str, ...]]]
-"""Name of an array -> (dtype, shape); a word in a shape stands for any length, the same one in the whole message."""
+"""Name of an array -> (dtype, shape); a word in a shape stands for any length, equal throughout the message."""
 
 NO_ARRAYS: Layout = {}
-_PLACE = re.compile(r"^(?P<problem>.*?)(?: - at .*`\$(?P<path>[^`]*)`)?$", re.DOTALL)  # of msgspec's messages
+_PLACE = re.compile(r"^(?P<problem>.*?)(?: - at .*`\$(?P<path>[^`]*)`)?$", re.DOTALL)  # in msgspec's error texts
 
 
 class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A message without arrays; all its fields are on the wire."""
+    """A message without arrays; the wire carries all its fields."""
 
     kind: ClassVar[str]
 
@@ -40,13 +40,13 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def check_kind(message: Message, kind: str) -> None:
-    """Raises BadMessage where a message is of another kind."""
+    """Raise BadMessage if a message is of another kind."""
     if message.kind != kind:
         raise BadMessage("kind", f"{shown(message.kind)} instead of {kind!r}")
 
 
 def check_arrays(message: Message, layout: Layout, optional: Set[str] = frozenset()) -> dict[str, int]:
-    """Return the lengths that the layout's words stand for; raises BadMessage for the first array that does not fit.
+    """Return the lengths that the layout's words stand for; raise BadMessage for the first array that does not fit.
 
     optional: names of arrays that may be missing.
     """
@@ -69,7 +69,7 @@ def check_arrays(message: Message, layout: Layout, optional: Set[str] = frozense
 
 
 def typed(message: Message, kind: type[T], layout: Layout = NO_ARRAYS) -> T:
-    """A message's fields, and its arrays that were checked against `layout`, as a struct; raises BadMessage."""
+    """Convert a message's fields, and its arrays checked against `layout`, into a struct; raises BadMessage."""
     fields, expected = message.fields, _names(kind)
     if layout:
         expected = expected - layout.keys()
@@ -87,7 +87,7 @@ def _names(kind: type[msgspec.Struct]) -> frozenset[str]:
 
 
 def bad_field(error: msgspec.ValidationError, fields: Mapping[str, Any]) -> BadMessage:
-    """By name what msgspec found, which says it in its text only: "Expected `int` >= 0 - at `$.episodes[0][1]`"."""
+    """Extract the field's name from msgspec's error text, such as "Expected `int` >= 0 - at `$.episodes[0][1]`"."""
     found = _PLACE.match(str(error))
     assert found is not None
     path = (found["path"] or "").partition("[")[0]

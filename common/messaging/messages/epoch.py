@@ -1,4 +1,4 @@
-"""The replay service's part of an epoch: have it begun, and ask whether it is on disk."""
+"""The replay service's part of an epoch: begin it, and ask whether it is on disk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from common.messaging.messages.join import Epochs
 
 
 class Snapshot(Body, frozen=True):
-    """Begin the part of epoch `number`; of older ones keep `keep` alone."""
+    """Begins the part of epoch `number`; of the older epochs, only `keep` is kept."""
 
     kind: ClassVar[str] = "snapshot"
 
@@ -19,7 +19,7 @@ class Snapshot(Body, frozen=True):
 
 
 class Written(Body, frozen=True):
-    """Is the part of epoch `number` on disk?"""
+    """Asks whether the part of epoch `number` is on disk."""
 
     kind: ClassVar[str] = "written"
 

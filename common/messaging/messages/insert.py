@@ -1,4 +1,4 @@
-"""Experience on its way to the table: a segment, which is answered with a receipt or "not now"."""
+"""Inserts: a segment for the table, answered with a receipt or a request to try again later."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def encode_segment(run: str, segment: Segment) -> bytearray:
 
 
 def transitions(spec: EnvSpec, rows: str) -> Layout:
-    """The arrays that segments and batches share, one row a transition."""
+    """The arrays that segments and batches share, one row per transition."""
     return {
         "frames": (spec.frame_dtype, ("frames", *spec.frame_shape)),
         "obs_index": ("int32", (rows, spec.stack)),
@@ -40,7 +40,7 @@ def transitions(spec: EnvSpec, rows: str) -> Layout:
 
 
 def check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
-    """Check the values of the arrays that segments and batches share, at least one row; raises BadMessage."""
+    """Check the values of the arrays that segments and batches share, at least one row each; raises BadMessage."""
     frames = arrays["frames"]
     for name in ("obs_index", "next_index"):
         within(f"arrays.{name}", arrays[name], 0, len(frames) - 1)
@@ -55,7 +55,7 @@ def check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
 
 
 def within(field: str, array: Array, low: float, high: float) -> None:
-    """Raises BadMessage for a value outside [low, high], and for what is no number."""
+    """Raise BadMessage for a value outside [low, high] and for NaN."""
     least, most = array.min(), array.max()
     if not (low <= least and most <= high):
         raise BadMessage(field, f"values from {least} to {most}; allowed: {low} to {high}")
@@ -69,7 +69,7 @@ class SegmentReader:
         self._layout = transitions(spec, "steps")
 
     def __call__(self, message: Message) -> Segment:
-        """Read one; raises BadMessage for anything the table could not take."""
+        """Read one; raises BadMessage for anything that the table could not store."""
         check_kind(message, KIND)
         lengths = check_arrays(message, self._layout, OPTIONAL)
         steps, frames = lengths["steps"], lengths["frames"]

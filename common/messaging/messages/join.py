@@ -1,4 +1,4 @@
-"""Joining: a role asks the learner for the run, and takes leave of it when it was told to stop."""
+"""Joining and leaving: a role asks the learner for the run's data, and tells it before it stops."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from common.settings.tables import to_tables, validated
 from common.types import EnvSpec
 
 Endpoints = Annotated[list[Name], Meta(max_length=16)]
-MOST_EPOCHS = 16  # that are told of at once
+MOST_EPOCHS = 16  # epochs in one request
 Epochs = Annotated[list[Updates], Meta(max_length=MOST_EPOCHS)]
 
 
 class Join(Body, frozen=True):
     """A process asks to be part of the run.
 
-    endpoints: where others can reach it; none for actors, and none where a replay service only asks which run this is.
-    index: the one it was given when it joined before, or -1. epochs: those that a replay service can restore, in
-    ascending order. serving: it holds its table in memory already, and goes on from any epoch of the learner's.
-    origin: where it runs.
+    endpoints: where others can reach it; empty for actors, and if a replay service only asks which run this is.
+    index: the index from an earlier join, or -1. epochs: the epochs that a replay service can restore, in ascending
+    order. serving: its table is in memory already and can continue from any epoch of the learner's.
+    origin: its host and process id.
     """
 
     kind: ClassVar[str] = "join"
@@ -44,15 +44,15 @@ class Join(Body, frozen=True):
 
 
 class Joined(Body, frozen=True):
-    """All that a role needs.
+    """All that a role needs to take part.
 
     replay_endpoints: where the replay service listens; empty while none has joined.
-    index: how many processes of this role had joined the run before (tells actors' random streams apart).
-    layout: digest of the network layout, to be compared with one's own.
-    run_id: drawn at random when the run began; tells it from others of its name.
-    epoch: number of the newest epoch that is finished, which a replay service restores; 0 if there is none.
-    anew: the training begins anew: a replay service drops what it holds of it.
-    learner, replay: where they run; None while no replay service has joined.
+    index: number of processes of this role that joined the run before (makes actors' random streams distinct).
+    layout: digest of the network layout, which the role compares with its own.
+    run_id: random id from the run's beginning, which distinguishes it from other runs of the same name.
+    epoch: number of the newest finished epoch, which a replay service restores; 0 if there is none.
+    anew: the training starts again from the beginning, so a replay service discards its data of the run.
+    learner, replay: their hosts and process ids; `replay` is None while no replay service has joined.
     """
 
     kind: ClassVar[str] = "joined"
@@ -69,7 +69,7 @@ class Joined(Body, frozen=True):
     replay: Origin | None = None
 
     def answer(self) -> bytearray:
-        """Build the message; the config knows its run."""
+        """Build the message; the config gives the run's name."""
         return self.encode(self.config.run)
 
     def encode(self, run: str) -> bytearray:
@@ -93,7 +93,7 @@ class Joined(Body, frozen=True):
 
 
 class Leave(Body, frozen=True):
-    """The notice of a process that was told to stop; the answer is a farewell, or a retry while it is needed."""
+    """Announces that a process stops; the answer is a farewell, or a retry while the learner needs it."""
 
     kind: ClassVar[str] = "leave"
 
@@ -101,6 +101,6 @@ class Leave(Body, frozen=True):
 
 
 class Farewell(Body, frozen=True):
-    """The learner's answer to a process that may leave."""
+    """The learner's permission to leave."""
 
     kind: ClassVar[str] = "farewell"

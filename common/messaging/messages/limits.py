@@ -1,4 +1,4 @@
-"""The limiter's settings, asked for and changed while a run goes on."""
+"""Reads and changes the limiter's settings while a run goes on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class LimitsQuestion(Body, frozen=True):
 class Limit(Body, frozen=True):
     """New settings; answered like the question.
 
-    ratio: updates per environment step. tolerance: steps that acting and learning may drift apart.
+    ratio: updates per environment step. tolerance: environment steps by which acting and learning may differ.
     """
 
     kind: ClassVar[str] = "limit"
@@ -30,11 +30,11 @@ class Limit(Body, frozen=True):
 
 
 class Limits(Body, frozen=True):
-    """The limiter of a running replay service.
+    """The state of a running replay service's limiter.
 
     ratio, tolerance: see `Limit`. inserted: transitions so far.
-    drawn: batches so far, of `planned` for the complete run.
-    inserts_wait_for, samples_wait_for: why they wait, in words; empty where they do not.
+    drawn: batches so far, out of `planned` in the complete run.
+    inserts_wait_for, samples_wait_for: why they wait, in words; empty if they do not.
     """
 
     kind: ClassVar[str] = "limits"

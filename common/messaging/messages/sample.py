@@ -1,4 +1,4 @@
-"""Experience on its way to the learner: the request of a batch, and its answer, which also tells of ended episodes."""
+"""Draws: the request for a batch, and its answer, which also carries the episodes that ended."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from common.messaging.messages.insert import OPTIONAL, check_transitions, transi
 from common.messaging.wire import Message, Source
 from common.types import Array, Batch, EnvSpec, EpisodeEnd
 
-MAX_EPISODES = 1000  # told with one batch; later ones come with the next
+MAX_EPISODES = 1000  # in one answer; the next answer carries the rest
 KIND = "batch"
 
 Priority = Annotated[float, Meta(ge=0, le=MAX_FLOAT32)]
 
 
 class EpisodeRecord(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A finished episode as the replay service books it, in order of acceptance.
+    """A finished episode as the replay service records it, in order of acceptance.
 
     env_step: transitions accepted up to the episode's last step.
     """
@@ -35,9 +35,9 @@ class EpisodeRecord(Struct, frozen=True, array_like=True, forbid_unknown_fields=
 
 
 class Drawn(Struct, frozen=True):
-    """What the table says beside a batch: its counters, and the episodes from number `first_episode` on.
+    """The data that accompany a batch: the table's counters, and the episodes from number `first_episode` on.
 
-    planned: batches that the complete run will have drawn.
+    planned: draws of the complete run.
     """
 
     sequence: Counter
@@ -51,12 +51,12 @@ class Drawn(Struct, frozen=True):
 
 
 class DrawRequest(Body, frozen=True):
-    """A request for the batch of update number `sequence`; repeated, it is answered with the same batch.
+    """A request for the batch of update number `sequence`; a repeated request gets the same batch.
 
-    base: updates that the learner has done for good: it never asks again for a batch below. A replay service that
-        has drawn less than that, or that served another incarnation, takes it for its own count of draws.
-    episodes_from: number of the first episode that the learner has not been told of.
-    priorities: new priorities (id of a transition, |TD error|), to be set before the draw.
+    base: updates that the learner will not repeat: it never asks again for a batch below. A replay service that
+        has drawn fewer, or that served another incarnation, sets its own count of draws to it.
+    episodes_from: number of the first episode that the learner has not received.
+    priorities: new priorities (id of a transition, |TD error|), set before the draw.
     """
 
     kind: ClassVar[str] = "sample"
@@ -81,7 +81,7 @@ class DrawRequest(Body, frozen=True):
 def encode_batch(
     run: str, frames: Array | Source, columns: Mapping[str, Array], drawn: Drawn, into: bytearray | None = None
 ) -> bytearray:
-    """Build the answer to a draw: the frames of a batch and its other fields; into: see `wire.encode`."""
+    """Build the answer to a draw from a batch's frames and its other columns; into: see `wire.encode`."""
     return wire.encode(KIND, run, drawn, {"frames": frames, **columns}, into)
 
 

@@ -1,4 +1,4 @@
-"""The replay service's counters, for who asks."""
+"""The replay service's counters, on request."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class StatsQuestion(Body, frozen=True):
 
 
 class ReplayStats(Body, frozen=True):
-    """The replay service's counters, in transitions unless named otherwise.
+    """The replay service's counters, in transitions unless stated otherwise.
 
-    drawn: batches. lost: acknowledged to an actor and not here. duplicates: segments delivered again and refused.
-    faults: answers that failed of an error of this program.
+    drawn: batches. lost: transitions acknowledged to an actor but missing here. duplicates: segments delivered again
+    and refused. faults: answers that failed because of a bug in this program.
     """
 
     kind: ClassVar[str] = "stats"

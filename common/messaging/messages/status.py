@@ -1,4 +1,4 @@
-"""What a role tells displays of itself: plain values by name, of which a display takes what it knows."""
+"""The status of a role, for displays: plain values by name, of which a display uses those that it knows."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def encode_status(run: str, status: dict[str, Any]) -> bytearray:
 
 
 class LearnerStatus(msgspec.Struct, frozen=True):
-    """What a display needs of the learner's status.
+    """The part of the learner's status that displays need.
 
-    connected: processes by role. missing: those that are lost. events: the newest lines of its console, each with a
-    number that grows. origin: where it runs.
+    connected: number of processes by role. missing: lost processes. events: the newest lines of its console, with
+    increasing numbers. origin: its host and process id.
     """
 
     env_steps: Counter
@@ -46,7 +46,7 @@ class LearnerStatus(msgspec.Struct, frozen=True):
 
     @classmethod
     def decode(cls, message: Message) -> Self:
-        """Read it, whatever else is told; raises BadMessage."""
+        """Read it, ignoring other fields; raises BadMessage."""
         check_kind(message, KIND)
         try:
             return msgspec.convert(message.fields, cls, strict=True)

@@ -1,4 +1,4 @@
-"""The learner ends the run."""
+"""The learner's broadcast that ends the run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_REASON = 1024  # characters
 
 
 class EndOfRun(Body, frozen=True):
-    """Broadcast by the learner: the run is over, and why."""
+    """Says that the run is over, and why."""
 
     kind: ClassVar[str] = "stop"
 
@@ -19,5 +19,5 @@ class EndOfRun(Body, frozen=True):
 
     @classmethod
     def because(cls, reason: str) -> Self:
-        """With a reason that is cut where it is too long."""
+        """Build it with a reason, cut to `MAX_REASON` characters."""
         return cls(reason[:MAX_REASON])

@@ -1,4 +1,4 @@
-"""Who acts and with what: the learner's broadcasts of the networks and of the acting role."""
+"""The learner's broadcasts of the networks' parameters and of the acting role."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Network = Annotated[int, Meta(ge=1, le=2)]
 
 
 class Current(Body, frozen=True):
-    """Asks for the latest broadcast of a key."""
+    """Asks for a key's latest broadcast."""
 
     kind: ClassVar[str] = "current"
 
 
 class Weights(Struct, frozen=True):
-    """One network: float32 [P] parameters in `flat`."""
+    """One network's parameters, `flat`: float32 [P]."""
 
     network: Network
     version: Updates
@@ -42,7 +42,7 @@ class Weights(Struct, frozen=True):
 
 
 class Role(Body, frozen=True):
-    """Who acts: the network (1 or 2), the newest version of each network, and how far the run is."""
+    """The acting network (1 or 2), the newest version of each network, and the run's progress."""
 
     kind: ClassVar[str] = "role"
 
