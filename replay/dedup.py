@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import OrderedDict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any
 
 from common.bounds import MAX_GAPS, MAX_INTEGER, MAX_STREAMS
 
+_start = attrgetter("start")
+
 
 @dataclass(slots=True)
 class _Stream:
-    """Everything up to `highest` was seen, the numbers in `gaps` (in ascending order) excepted."""
+    """Everything up to `highest` was seen, the numbers in `gaps` excepted: disjoint, none empty, in ascending order.
+
+    A gap is a range, however long: what one arrival adds to a stream does not depend on how far it jumps.
+    """
 
     highest: int = -1
-    gaps: dict[int, None] = field(default_factory=dict)
+    gaps: list[range] = field(default_factory=list)
+
+    def gap_of(self, sequence: int) -> int | None:
+        """The index of the gap that a number is missing from; None where it was seen, or comes after all others."""
+        index = bisect_right(self.gaps, sequence, key=_start) - 1
+        return index if index >= 0 and sequence in self.gaps[index] else None
 
 
 class SeenWindow:
     """Sequence numbers seen of every (incarnation, stream), counted from 0.
 
-    A stream remembers its newest `max_gaps` missing numbers, and the `max_streams` streams that were used last do so;
+    A stream remembers its newest `max_gaps` gaps, and the `max_streams` streams that were used last do so;
     of the others their names alone are left. What is forgotten counts as lost, and whatever comes after it was
-    forgotten is refused, all of a stream whose name is left: never twice goes before at least once.
+    forgotten is refused, all of a stream whose name is left: never twice goes before at least once. A number that is
+    accepted adds one gap or one name at most, so memory is bounded by the number of segments.
     """
 
     def __init__(self, max_streams: int = MAX_STREAMS, max_gaps: int = MAX_GAPS) -> None:
@@ -30,14 +44,14 @@ class SeenWindow:
         self._max_gaps = max_gaps
         self._streams: OrderedDict[tuple[int, int], _Stream] = OrderedDict()
         self._closed: set[tuple[int, int]] = set()  # streams of which the name is left
-        self._forgotten = 0
+        self._missing = 0
 
     def seen(self, incarnation: int, stream: int, sequence: int) -> bool:
         """True where `accept` would refuse; records nothing."""
         if (incarnation, stream) in self._closed:
             return True
         seen = self._streams.get((incarnation, stream))
-        return seen is not None and sequence <= seen.highest and sequence not in seen.gaps
+        return seen is not None and sequence <= seen.highest and seen.gap_of(sequence) is None
 
     def accept(self, incarnation: int, stream: int, sequence: int) -> bool:
         """Record a sequence number (>= 0); False where it was seen before."""
@@ -46,43 +60,60 @@ class SeenWindow:
         seen = self._streams.setdefault((incarnation, stream), _Stream())
         self._streams.move_to_end((incarnation, stream))
         if len(self._streams) > self._max_streams:
-            name, oldest = self._streams.popitem(last=False)
-            self._closed.add(name)
-            self._forgotten += len(oldest.gaps)
+            self._closed.add(self._streams.popitem(last=False)[0])
         if sequence > seen.highest:
-            self._open_gaps(seen, sequence)
+            skipped = range(seen.highest + 1, sequence)
+            if skipped:
+                seen.gaps.append(skipped)
+                self._missing += len(skipped)
             seen.highest = sequence
-            return True
-        if sequence in seen.gaps:
-            del seen.gaps[sequence]
-            return True
-        return False
+        else:
+            index = seen.gap_of(sequence)
+            if index is None:
+                return False
+            gap = seen.gaps[index]
+            parts = range(gap.start, sequence), range(sequence + 1, gap.stop)
+            seen.gaps[index : index + 1] = [part for part in parts if part]
+            self._missing -= 1
+        del seen.gaps[: -self._max_gaps]
+        return True
 
     def missing(self) -> int:
         """Numbers skipped below the highest seen of their stream: lost, unless they still come."""
-        return self._forgotten + sum(len(seen.gaps) for seen in self._streams.values())
+        return self._missing
 
     def state(self) -> dict[str, Any]:
         """Everything seen, msgpack-able, streams in order of last use."""
+        forgotten = self._missing - sum(_lengths(self._streams.values()))
         return {
-            "forgotten": min(self._forgotten, MAX_INTEGER),
+            "forgotten": min(forgotten, MAX_INTEGER),
             "closed": sorted(self._closed),
-            "streams": [[*key, seen.highest, list(seen.gaps)] for key, seen in self._streams.items()],
+            "streams": [
+                [*key, seen.highest, [[gap.start, gap.stop] for gap in seen.gaps]]
+                for key, seen in self._streams.items()
+            ],
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Continue where `state` was taken."""
-        self._forgotten = state["forgotten"]
+        """Continue where `state` was taken, by an earlier version too."""
         self._closed = {(incarnation, stream) for incarnation, stream in state.get("closed", [])}
         self._streams = OrderedDict(
-            ((incarnation, stream), _Stream(highest, dict.fromkeys(gaps)))
+            ((incarnation, stream), _Stream(highest, _ranges(gaps)))
             for incarnation, stream, highest, gaps in state["streams"]
         )
+        self._missing = state["forgotten"] + sum(_lengths(self._streams.values()))
 
-    def _open_gaps(self, seen: _Stream, sequence: int) -> None:
-        start = max(seen.highest + 1, sequence - self._max_gaps)
-        self._forgotten += start - (seen.highest + 1)
-        seen.gaps.update(dict.fromkeys(range(start, sequence)))
-        while len(seen.gaps) > self._max_gaps:
-            del seen.gaps[next(iter(seen.gaps))]
-            self._forgotten += 1
+
+def _lengths(streams: Iterable[_Stream]) -> Iterable[int]:
+    return (len(gap) for seen in streams for gap in seen.gaps)
+
+
+def _ranges(gaps: Iterable[int | Sequence[int]]) -> list[range]:
+    """Saved gaps, each [start, stop]; earlier versions saved every missing number by itself."""
+    ranges: list[range] = []
+    for gap in gaps:
+        start, stop = (gap, gap + 1) if isinstance(gap, int) else gap
+        if ranges and ranges[-1].stop == start:
+            start = ranges.pop().start
+        ranges.append(range(start, stop))
+    return ranges

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.bounds import MAX_COUNT, MAX_GAPS
 from replay.dedup import SeenWindow
 
 arrivals = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(0, 30)), max_size=200)
@@ -39,6 +40,39 @@ def test_restored_window_goes_on_alike(before: list[tuple[int, int, int]], after
         assert twin.state() == window.state()
 
 
+@settings(max_examples=100)
+@given(arrivals=arrivals)
+def test_what_is_forgotten_is_never_accepted_twice(arrivals: list[tuple[int, int, int]]) -> None:
+    window, accepted = SeenWindow(max_streams=2, max_gaps=2), []
+    for arrival in arrivals:
+        if window.accept(*arrival):
+            accepted.append(arrival)
+        assert window.seen(*arrival)
+    assert len(accepted) == len(set(accepted))
+
+
+def test_large_jumps_take_one_gap_each() -> None:
+    """An actor's certificate is enough to skip numbers: what it makes the service hold depends on inserts alone."""
+    window, streams, each = SeenWindow(), 10, 200
+    for sequence in range(MAX_COUNT // each, MAX_COUNT, MAX_COUNT // each)[:each]:
+        for stream in range(streams):
+            assert window.accept(1, stream, sequence)
+    held = [len(gaps) for *_, gaps in window.state()["streams"]]
+    assert sum(held) <= streams * each
+    for sequence in range(2, 5 * MAX_GAPS, 2):
+        assert window.accept(2, 0, sequence)
+    assert max(len(gaps) for *_, gaps in window.state()["streams"]) == MAX_GAPS
+
+
+def test_windows_of_earlier_versions_load() -> None:
+    """They list every missing number by itself."""
+    window = SeenWindow()
+    window.load_state({"forgotten": 7, "streams": [[1, 0, 9, [2, 3, 4, 8]], [2, 0, 0, []]]})
+    assert window.missing() == 11
+    assert window.state()["streams"] == [[1, 0, 9, [[2, 5], [8, 9]]], [2, 0, 0, []]]
+    assert [window.accept(1, 0, sequence) for sequence in (3, 3, 8, 7, 10)] == [True, False, True, False, True]
+
+
 @pytest.mark.parametrize(
     ("sequences", "accepted", "missing"),
     [
@@ -46,9 +80,10 @@ def test_restored_window_goes_on_alike(before: list[tuple[int, int, int]], after
         ([0, 0, 1, 0], [True, False, True, False], 0),
         ([2, 0], [True, True], 1),
         ([2, 0, 1, 1], [True, True, True, False], 0),
-        ([6, 0, 1, 2, 5], [True, False, False, True, True], 4),  # 0 and 1 were forgotten: only four gaps are kept
-        ([2, 7, 0, 6], [True, True, False, True], 5),  # 2 comes on top of two older gaps, which are forgotten
-        ([1 << 62, 0, (1 << 62) - 1], [True, False, True], (1 << 62) - 1),
+        ([10, 0, 9, 5], [True, True, True, True], 7),  # the ends of a gap, and its middle
+        ([1, 3, 5, 7, 9, 0, 2], [True, True, True, True, True, False, True], 4),  # the oldest of five gaps is forgotten
+        ([1, 3, 5, 20, 12, 0, 2, 15], [True, True, True, True, True, False, True, True], 14),  # 12 makes five of four
+        ([1 << 62, 0, (1 << 62) - 1], [True, True, True], (1 << 62) - 2),
     ],
 )
 def test_gaps(sequences: list[int], accepted: list[bool], missing: int) -> None:
