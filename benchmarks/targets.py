@@ -23,6 +23,7 @@ from common.bounds import (
 )
 from common.errors import BadMessage
 from common.messaging.keys import join_key, replay_key, role_key, stop_key, weights_key
+from common.messaging.members import Origin
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import SegmentReader, encode_segment
 from common.messaging.messages.join import Join, Joined
@@ -31,7 +32,6 @@ from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stats import StatsQuestion
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current
-from common.messaging.presence import Origin
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 from common.types import EnvSpec, EpisodeEnd, Segment

@@ -9,9 +9,9 @@ from functools import partial
 
 from common.errors import BadMessage
 from common.messaging.keys import join_key
+from common.messaging.members import JOINING, Origin
 from common.messaging.messages.answers import Retry
 from common.messaging.messages.join import Farewell, Join, Joined, Leave
-from common.messaging.presence import JOINING, Origin
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 from common.settings.config import RunConfig

@@ -13,8 +13,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from common.errors import BadMessage, RunError
+from common.messaging.members import Origin
 from common.messaging.messages.join import Join
-from common.messaging.presence import LEASE, Origin
+from common.messaging.presence import LEASE
 from common.process.files import write_whole
 
 ROSTER = "roster.json"

@@ -10,9 +10,9 @@ import msgspec
 from common.errors import RunError
 from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key, stop_key
+from common.messaging.members import Origin
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.stop import EndOfRun
-from common.messaging.presence import Origin
 from common.messaging.transport import NoAnswer, Node
 from common.process.console import Console, progress_line
 from common.process.lifecycle import Stop

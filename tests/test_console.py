@@ -5,8 +5,8 @@ import re
 import pytest
 from msgspec.structs import replace
 
+from common.messaging.members import Origin
 from common.messaging.messages.join import Join
-from common.messaging.presence import Origin
 from common.process.console import STANDSTILL, Console, Sight, Standstill, counted, progress_line
 from learner.attendance import FORGOTTEN, Attendance
 

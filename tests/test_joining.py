@@ -11,12 +11,12 @@ from common.errors import JoinError
 from common.messaging import joining, wire
 from common.messaging.joining import difference, join, take_leave
 from common.messaging.keys import join_key, replay_key
+from common.messaging.members import Origin
 from common.messaging.messages.join import Join, Joined, Leave
 from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
 from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current
-from common.messaging.presence import Origin
 from common.messaging.transport import Node, Refused, open_session
 from common.process.lifecycle import Stop
 from common.settings.config import RunConfig

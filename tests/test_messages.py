@@ -17,6 +17,7 @@ from samples import make_segment
 from common.bounds import MAX_AHEAD, MAX_COUNT, MAX_FLOAT32, MAX_INTEGER, MAX_MAGNITUDE, MAX_STREAMS, MAX_UPDATES
 from common.errors import BadMessage, RunError
 from common.messaging import wire
+from common.messaging.members import Origin
 from common.messaging.messages.answers import Ack, Error, Retry
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import OPTIONAL, SegmentReader, encode_segment
@@ -26,7 +27,6 @@ from common.messaging.messages.sample import BatchReader, Drawn, DrawRequest, Ep
 from common.messaging.messages.stats import ReplayStats
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current, Role, Weights
-from common.messaging.presence import Origin
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.settings.tables import to_tables

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from common.errors import BadMessage, RunError
+from common.messaging.members import Origin
 from common.messaging.messages.join import Join
-from common.messaging.presence import LEASE, Origin
+from common.messaging.presence import LEASE
 from learner.roster import Occupied, Roster
 
 

@@ -5,39 +5,17 @@ A token disappears within milliseconds after its process ends, or within the lea
 
 from __future__ import annotations
 
-import os
-import socket
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
 
 import zenoh
-from msgspec import Meta
 
-from common.bounded import Name
 from common.messaging.faults import Faults
+from common.messaging.members import ROLES
 
-ROLES = ("learner", "replay", "actor")
-JOINING = ("replay", "actor", "watch")  # roles that ask the learner for the run's data; "watch" takes no part
 LEASE = 1.5  # seconds of silence after which a link is given up and the learner's last answer expires
-
-
-class Origin(NamedTuple):
-    """The host and the process id of a run's member."""
-
-    host: Name
-    pid: Annotated[int, Meta(ge=0, le=2**31)]
-
-    @classmethod
-    def here(cls) -> Origin:
-        """The origin of this process."""
-        return cls(socket.gethostname()[:256], os.getpid())
-
-    def __str__(self) -> str:
-        """The text for consoles."""
-        return f"{self.host} (pid {self.pid})"
 
 
 class Presence:

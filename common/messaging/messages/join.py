@@ -11,8 +11,8 @@ from common.bounded import Count, Incarnation, Name, Updates
 from common.bounds import MAX_COUNT
 from common.errors import BadMessage, UsageError
 from common.messaging import wire
+from common.messaging.members import JOINING, Origin
 from common.messaging.messages.body import Body
-from common.messaging.presence import JOINING, Origin
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.settings.tables import to_tables, validated

@@ -1,0 +1,30 @@
+"""Who takes part in a run: the roles, and where a member of a run lives."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import Annotated, NamedTuple
+
+from msgspec import Meta
+
+from common.bounded import Name
+
+ROLES = ("learner", "replay", "actor")
+JOINING = ("replay", "actor", "watch")  # roles that ask the learner for the run's data; "watch" takes no part
+
+
+class Origin(NamedTuple):
+    """The host and the process id of a run's member."""
+
+    host: Name
+    pid: Annotated[int, Meta(ge=0, le=2**31)]
+
+    @classmethod
+    def here(cls) -> Origin:
+        """The origin of this process."""
+        return cls(socket.gethostname()[:256], os.getpid())
+
+    def __str__(self) -> str:
+        """The text for consoles."""
+        return f"{self.host} (pid {self.pid})"
