@@ -1,3 +1,3 @@
 """The actor role: emulators, the epsilon-greedy policy and the assembly of segments."""
 
-import common  # noqa: F401 (first: it answers a Ctrl-C while the rest is imported)
+import common  # noqa: F401 (first: it handles a Ctrl-C during the other imports)

@@ -31,7 +31,7 @@ class ActorOptions(RoleOptions):
     """Flags of `coop-actor`."""
 
     envs: int | None = None
-    """Emulators in this process; the run's actor.envs if not given."""
+    """Emulators in this process (default: the run's actor.envs)."""
 
 
 def main() -> None:
@@ -63,9 +63,9 @@ def _run() -> None:
 
 
 def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined, console: Console) -> None:
-    """Play until the stop; raises JoinError where this process plays or computes something else than the learner."""
+    """Play until the stop; raises JoinError if this process's environment or network differs from the learner's."""
     config = joined.config
-    # A number is given once in a run, also across restarts of any role: no two processes play the same seeds.
+    # The learner gives each number once per run, also across restarts, so no two processes play the same seeds.
     seed = np.random.SeedSequence([config.seed, 3, joined.index])
     env_seed, policy_seed = seed.spawn(2)
     env = make_vector_env(config.env, options.envs or config.actor.envs, int(env_seed.generate_state(1)[0]))
@@ -93,10 +93,10 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
 
 
 def _networks(joined: Joined) -> tuple[FlatNetwork, FlatNetwork]:
-    """Networks of the run's layout, their parameters still to come.
+    """Networks of the run's layout, whose parameters the learner will send.
 
     Raises:
-        JoinError: this process builds another layout than the learner.
+        JoinError: this process builds another layout than the learner does.
     """
     settings = joined.config.network
     modules = [build_network(settings.kind, joined.spec, settings.hidden, seed=0) for _ in range(2)]

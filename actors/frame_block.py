@@ -1,4 +1,4 @@
-"""The frames of a round of segments: a growing row of frames for each stream, and which of them make an observation."""
+"""The frames of a round of segments: a growing row of frames per stream, and the indices that make observations."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ Rows = NDArray[np.int32]
 class FrameBlock:
     """Frames <frame_dtype>[envs, capacity, *frame_shape], filled from the front, each stream at its own pace.
 
-    A step costs one copy of one frame a stream. Indices are made at the end of the round: a stack that continues
-    is the last `stack` rows pushed, so only restarts have to be remembered.
+    A step copies one frame per stream. Indices are computed at the end of the round: a stack that continues consists
+    of the last `stack` rows pushed, so only restarts have to be recorded.
     """
 
     def __init__(self, spec: EnvSpec, num_envs: int, max_steps: int, history: int = 0) -> None:
-        """history: steps before a round whose observations it may still need."""
+        """history: steps before a round whose observations the round may still need."""
         self._spec, self._num_envs, self._history = spec, num_envs, history
-        self._capacity = history + max_steps + 4 * spec.stack  # room for some restarts; grows where that is too little
+        self._capacity = history + max_steps + 4 * spec.stack  # room for some restarts; grows if that is too little
         self._allocate()
         # Row numbers, in `_free` and `_pushed`, count through all streams: stream * capacity + row.
         self._free = self._first.copy()
         self._pushed = np.empty((max_steps, num_envs), np.int64)
         self._windows = np.arange(max_steps + 1)[:, None] + np.arange(spec.stack)
         self._steps = 0
-        self._most = 0  # at least the longest stream's rows, known without looking at arrays
+        self._most = 0  # upper bound of the rows of any stream, kept without reading arrays
         self._current: Rows = np.zeros((spec.stack, num_envs), np.int32)  # stacks at the start of the round
         self._past: Rows = np.zeros((num_envs, history, spec.stack), np.int32)  # stacks of the steps before the round
         self._restarts: list[tuple[int, int, list[int]]] = []  # steps before it, stream, rows of the new stack
 
     def push(self, obs: Array) -> None:
-        """Store the newest frame of each stream's observation <frame_dtype>[envs, *obs_shape], which continues."""
+        """Store the newest frame of each stream's continuing observation, <frame_dtype>[envs, *obs_shape]."""
         if self._most == self._capacity:
             self._reserve(1)
         self._flat[self._free] = obs[:, -1] if self._spec.stack > 1 else obs
@@ -45,7 +45,7 @@ class FrameBlock:
         self._steps += 1
 
     def restart(self, streams: Iterable[int], obs: Array) -> None:
-        """Store the whole observations of streams that do not continue; frames equal to the one before only once.
+        """Store the whole observations of streams that restarted; consecutive equal frames only once.
 
         obs: <frame_dtype>[envs, *obs_shape].
         """
@@ -66,13 +66,13 @@ class FrameBlock:
     def cut(self, waiting: list[int]) -> tuple[list[Array], Rows, Rows, list[int]]:
         """End the round; the next one begins with the frames of the current observations.
 
-        waiting: how many of each stream's last steps, at most `history`, will be needed again; their frames stay too.
+        waiting: number of each stream's last steps, at most `history`, that are needed again; their frames stay too.
 
         Returns:
-            frames: a stream's <frame_dtype>[n_frames, *frame_shape].
-            obs_index: int32 [envs, history + steps, stack], steps before the round included; meaningless for those
+            frames: of each stream, <frame_dtype>[n_frames, *frame_shape].
+            obs_index: int32 [envs, history + steps, stack], including steps before the round; meaningless for those
                 that did not wait. next_index: int32 [envs, steps, stack].
-            kept: how many of each stream's last frames begin its next round.
+            kept: number of each stream's last frames that begin its next round.
         """
         of_round, next_index = self._indices()
         obs_index = np.concatenate((self._past, of_round), axis=1) if self._history else of_round
@@ -93,14 +93,14 @@ class FrameBlock:
         return frames, obs_index[:, :-1], next_index, kept
 
     def _indices(self) -> tuple[Rows, Rows]:
-        """int32 [envs, steps + 1, stack], what each step starts from and the next one would; [envs, steps, stack]."""
+        """Rows of obs, int32 [envs, steps + 1, stack] (the last: the next step's), and next_obs, [envs, steps, stack]."""
         stack = self._spec.stack
         pushed = self._pushed[: self._steps] - self._first
         rows = np.concatenate([self._current, pushed.astype(np.int32)])
         windows = rows.T.take(self._windows[: self._steps + 1], axis=1)
         obs_index, next_index = windows, windows[:, 1:].copy()
         for steps, stream, stacked in self._restarts:
-            # After `later` more steps the stack still begins with the new stack's frames from `later` on.
+            # `later` steps after the restart, the stack still begins with the new stack's frames from `later` on.
             for later in range(min(stack, self._steps + 1 - steps)):
                 obs_index[stream, steps + later, : stack - later] = stacked[later:]
                 next_index[stream, steps + later : steps + later + 1, : stack - later - 1] = stacked[later + 1 :]

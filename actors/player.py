@@ -1,4 +1,4 @@
-"""What an actor does in a turn, without I/O of its own: choose actions, step emulators, notice episodes that end."""
+"""An actor's turn, without I/O: choose actions, step emulators, record ended episodes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from common.types import Array, EpisodeEnd
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One step of all emulators, and what chose its actions.
+    """One step of all emulators with its actions.
 
-    actions: int32 [envs]. version: of the parameters that acted. ended: by stream, the episodes that this step ended.
+    actions: int32 [envs]. version: of the parameters that chose them. ended: the episodes that ended, by stream.
     """
 
     actions: NDArray[np.int32]
@@ -30,10 +30,10 @@ class Player:
     """Plays all emulators of one process with one policy.
 
     Args:
-        epsilon: the probability of a random action after so many environment steps of the run.
+        epsilon: probability of a random action as a function of the run's environment steps.
 
     Attributes:
-        steps: played by this process, in all its emulators.
+        steps: environment steps played by this process, over all its emulators.
     """
 
     def __init__(self, env: VectorEnv, policy: Policy, epsilon: Callable[[int], float]) -> None:
@@ -47,25 +47,25 @@ class Player:
         self._chosen: tuple[NDArray[np.int32], float, int]
 
     def begin(self) -> Array:
-        """Start every emulator; the first observations, <frame_dtype>[envs, *obs_shape]."""
+        """Start every emulator; return the first observations, <frame_dtype>[envs, *obs_shape]."""
         self._obs = self._env.reset()
         return self._obs
 
     def send(self, env_step: int, version: int) -> None:
         """Choose an action for every emulator and begin to play it; `recv` must follow.
 
-        env_step: environment steps of the whole run so far, which epsilon depends on. version: of the parameters.
+        env_step: environment steps of the whole run so far, for epsilon. version: of the acting parameters.
         """
         epsilon = self._epsilon(env_step)
         self._play(self._policy.act(self._obs, epsilon), epsilon, version)
 
     def replay(self, actions: NDArray[np.int32]) -> Turn:
-        """Play actions, int32 [envs], that were chosen before: how emulators come back to where they were."""
+        """Play recorded actions, int32 [envs], to bring emulators back to an earlier state."""
         self._play(actions, 0.0, 0)
         return self.recv()
 
     def recv(self) -> Turn:
-        """What the actions sent last led to."""
+        """Wait for the result of the actions sent last."""
         actions, epsilon, version = self._chosen
         steps = self._env.recv()
         self._obs = steps.obs
@@ -83,8 +83,8 @@ class Player:
         self._env.send(actions)
 
     def _end(self, stream: int, steps: Steps, epsilon: float, version: int) -> EpisodeEnd:
-        """Close the books of a stream's episode; the segment it goes into will say where in it the episode ends."""
-        # Networks that diverge give values that are not finite, which no segment may hold; the learner ends such a run.
+        """Build a stream's episode record and reset its counters; the segment assembler sets `step_in_segment`."""
+        # Diverged networks give non-finite values, which segments must not contain; the learner ends such a run.
         q1_mean, q2_mean = np.nan_to_num(self._policy.mean_values(steps.next_obs[stream])).tolist()
         episode_return, length = float(self._returns[stream]), int(self._lengths[stream])
         self._returns[stream], self._lengths[stream] = 0.0, 0

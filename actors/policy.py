@@ -1,4 +1,4 @@
-"""Epsilon-greedy over the acting network, for all emulators of a process in one forward."""
+"""Epsilon-greedy policy over the acting network, in one forward pass for all emulators of a process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from common.types import Array, EnvSpec
 
 
 class Policy:
-    """Two networks, of which one acts.
+    """The two networks of a run, one of which acts.
 
     networks: Q1 and Q2, of any floating dtype. acting: 0 or 1.
     """
@@ -25,7 +25,7 @@ class Policy:
         self._rng = rng
 
     def act(self, obs: Array, epsilon: float) -> NDArray[np.int32]:
-        """Actions, int32 [envs], for <frame_dtype>[envs, *obs_shape]."""
+        """Choose actions, int32 [envs], for observations <frame_dtype>[envs, *obs_shape]."""
         actions = np.empty(len(obs), np.int32)
         random = (self._rng.random(len(obs)) < epsilon).nonzero()[0]
         if len(random) < len(obs):

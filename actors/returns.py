@@ -1,4 +1,4 @@
-"""n-step returns: what a transition over up to n steps earns, and with which step it ends."""
+"""n-step returns, and the last step of each transition."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from common.types import Array
 def n_step_returns(
     rewards: NDArray[np.float32], ends: NDArray[np.bool_], n: int, gamma: float
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """The transitions that begin with each of these steps.
+    """Compute the transition that begins with each of these steps.
 
-    A transition that begins at step t spans the steps t to t + n - 1, or fewer where an earlier one ends the episode:
-    its return is the sum of gamma^i r(t + i) over them.
+    A transition that begins at step t spans the steps t to t + n - 1, or fewer if an earlier one ends the episode.
+    Its return is the sum of gamma^i r(t + i) over these steps.
 
     Args:
         rewards: float32 [steps, envs].
-        ends: bool [steps, envs], no later step belongs to the same episode (it terminated, or was truncated).
+        ends: bool [steps, envs], the step is the last of its episode, terminated or truncated.
 
     Returns:
-        last: int [steps, envs], the last step that each transition spans; it never falls. A transition with `last`
-            beyond these steps is not complete, and its return means nothing yet.
+        last: int [steps, envs], the last step that each transition spans; it never decreases. A transition with `last`
+            beyond these steps is not complete, and its return has no meaning yet.
         returns: float32 [steps, envs].
     """
     steps = np.arange(len(rewards))[:, None]
     if n == 1:
         return np.broadcast_to(steps, rewards.shape), rewards
-    following = np.where(ends, steps, len(rewards) + n)[::-1]  # the episode's end, where one comes
+    following = np.where(ends, steps, len(rewards) + n)[::-1]  # the step that ends the episode, if there is one
     last = np.minimum(steps + n - 1, np.minimum.accumulate(following)[::-1])
     returns: Array = rewards.astype(np.float64)
     for i in range(1, min(n, len(rewards))):

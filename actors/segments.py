@@ -1,4 +1,4 @@
-"""Steps of many emulator streams, cut into segments that hold each frame once."""
+"""Cuts the steps of many emulator streams into segments that hold each frame once."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from common.types import Array, EnvSpec, EpisodeEnd, Segment
 class SegmentAssembler:
     """Turns the steps of `num_envs` streams into segments; stream i is emulator i. Pure: no I/O, no clock.
 
-    Each step begins one transition over `n_step` steps, fewer where its episode ends before. A transition leaves with
-    the segment in which it becomes complete; one that is not waits, through flushes too, so that every transition is
-    exact wherever segments are cut. All streams have had equally many steps, so their segments are cut together. The
-    arrays of a returned segment are never written again, but those of one round share memory: a segment that is kept
-    keeps the round.
+    Each step begins one transition over `n_step` steps, or fewer if its episode ends earlier. A transition belongs to
+    the segment in which it becomes complete; until then it waits, even across flushes, so that every transition is
+    exact wherever segments are cut. All streams have equally many steps, so their segments are cut together. The
+    arrays of a returned segment are never written again, but segments of one round share memory: keeping one segment
+    keeps the whole round.
     """
 
     def __init__(
@@ -36,32 +36,32 @@ class SegmentAssembler:
     ) -> None:
         self._num_envs, self._incarnation, self._length = num_envs, incarnation, segment_steps
         self._n_step, self._gamma = n_step, gamma
-        # Rows of a round's columns: first the steps before it whose transitions may still wait, then its own.
+        # Rows of a round's columns: first the earlier steps whose transitions may still wait, then its own steps.
         self._history = n_step - 1
         self._frames = FrameBlock(spec, num_envs, segment_steps, self._history)
         shape = (self._history + segment_steps, num_envs)
         self._actions = np.zeros(shape, np.int32)
         self._rewards = np.zeros(shape, np.float32)
         self._terminated = np.zeros(shape, np.bool_)
-        self._ends = np.ones(shape, np.bool_)  # before the first step there is none to wait
+        self._ends = np.ones(shape, np.bool_)  # no transition waits before the first step
         self._versions = np.zeros(shape[0], np.int64)
         self._episodes: dict[int, list[EpisodeEnd]] = {}
-        self._waiting = [0] * num_envs  # each stream's steps before this round whose transitions are not complete
+        self._waiting = [0] * num_envs  # number of each stream's earlier steps whose transitions are not complete
         self._carried = [0] * num_envs
         self._sequences = [0] * num_envs
         self._steps = 0
 
     def begin(self, obs: Array) -> None:
-        """Take the first observations, <frame_dtype>[envs, *obs_shape], of all streams; once, before `add`."""
+        """Store the first observations of all streams, <frame_dtype>[envs, *obs_shape]; call once, before `add`."""
         self._frames.restart(range(self._num_envs), obs)
 
     def add(
         self, actions: NDArray[np.int32], steps: Steps, param_version: int, episode_ends: Mapping[int, EpisodeEnd]
     ) -> list[Segment]:
-        """Add one step of every stream; where it fills a round, the segments, one a stream with complete transitions.
+        """Add one step of every stream; return the segments if it fills a round, one per stream with transitions.
 
         actions: int32 [envs]. param_version: of the parameters that chose them.
-        episode_ends: by stream, the episodes that this step ended; their `step_in_segment` is set here.
+        episode_ends: the episodes that this step ended, by stream; their `step_in_segment` is set here.
         """
         now = self._history + self._steps
         self._frames.push(steps.next_obs)
@@ -79,7 +79,7 @@ class SegmentAssembler:
         return self.flush() if self._steps == self._length else []
 
     def flush(self) -> list[Segment]:
-        """Cut every stream here: the segments of its complete transitions; none of a stream that has none."""
+        """Cut every stream here; return a segment for each stream that has complete transitions."""
         steps, self._steps = self._steps, 0
         if not steps:
             return []

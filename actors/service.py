@@ -1,4 +1,4 @@
-"""Carries a player's turns over Zenoh: weights in, segments out."""
+"""Connects a player to Zenoh: receives weights, sends segments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STATUS_EVERY = 0.5  # seconds
 
 
 class ActorService:
-    """Plays all emulators of one process until the stop, and sends what they gave to the replay service."""
+    """Plays all emulators of one process until the stop, and sends their segments to the replay service."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class ActorService:
         self._status_due = 0.0
 
     def run(self) -> None:
-        """Play until the stop; what has not filled a segment by then is dropped."""
+        """Play until the stop; steps that have not filled a segment by then are dropped."""
         while not self._weights.ready:
             self._weights.refresh()
             self._tell()
@@ -66,7 +66,7 @@ class ActorService:
             self._tell()
 
     def _play(self) -> None:
-        """One step of all emulators. They work while the step before leaves."""
+        """Play one step of all emulators; they work while the previous step is sent."""
         self._weights.refresh()
         self._player.send(self._inserts.inserted, self._weights.version)
         if self._turn is not None:
@@ -74,13 +74,13 @@ class ActorService:
         self._turn = self._player.recv()
 
     def _send(self, turn: Turn) -> None:
-        """Add a step to the segments, and send those that it filled."""
+        """Add a step to the segments, and send those that it completes."""
         for segment in self._segments.add(turn.actions, turn.steps, turn.version, turn.ended):
             if not self._inserts.submit(segment):
                 break
 
     def _tell(self) -> None:
-        """Publish the status if it is due; while an insert waits, too."""
+        """Publish the status if it is due; also called while an insert waits."""
         now = time.monotonic()
         if now < self._status_due:
             return
@@ -91,7 +91,7 @@ class ActorService:
         self._console.progress(self._inserts.acked, self._waiting(), self.progress)
 
     def progress(self) -> str:
-        """How far this actor is, in one line."""
+        """This actor's progress in one line."""
         return f"{self._player.steps:,} steps played, {self._inserts.acked:,} of them acknowledged"
 
     def _waiting(self) -> str:

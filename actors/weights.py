@@ -1,4 +1,4 @@
-"""Follows the learner's broadcasts: keeps a policy's networks and acting role up to date."""
+"""Follows the learner's broadcasts, and keeps a policy's networks and acting role up to date."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from common.messaging.messages.weights import Current, Role, Weights
 from common.messaging.transport import NoAnswer, Node
 from common.messaging.wire import Message
 
-GRACE = 0.5  # seconds that a broadcast may take before the weights are asked for
+GRACE = 0.5  # seconds to wait for a broadcast before asking for the weights
 
 
 class WeightsFollower:
-    """Loads new weights into a policy.
+    """Loads broadcast weights into a policy.
 
     version: of the parameters that act now.
     """
@@ -38,11 +38,11 @@ class WeightsFollower:
 
     @property
     def ready(self) -> bool:
-        """True once both networks are there."""
+        """True once both networks have been received."""
         return min(self._held) >= 0
 
     def refresh(self) -> None:
-        """Take what was broadcast; ask for what a broadcast should have brought and did not."""
+        """Load new broadcasts; ask the learner for weights whose broadcast did not arrive."""
         for follower in self._weights:
             if (message := follower.take()) is not None:
                 self._load(message)
@@ -60,7 +60,7 @@ class WeightsFollower:
                 self.fetch()
 
     def fetch(self) -> None:
-        """Ask the learner for both networks and the role; nothing changes if it does not answer."""
+        """Ask the learner for both networks and the role; if it does not answer, nothing changes."""
         question = Current().encode(self._node.run)
         try:
             for key in self._keys:

@@ -20,11 +20,11 @@ FRAME_LIMIT = 108_000  # emulator frames of an episode, half an hour of play
 class AtariEnv:
     """Emulators of one game, as `VectorEnv`.
 
-    After a reset the stack holds zeros and the first frame. A lost life does not touch the stack: with
+    After a reset the stack holds zeros and the first frame. A lost life does not change the stack: with
     `episodic_life` it is terminal for learning only. The limit on an episode's length counts from the first
-    frame after the no-ops. The emulator stops mid-skip where a game or its time ends, so the last frame of such
-    an episode is pooled from the frames seen until then.
-    An action out of range would stop the emulators' threads for good, so it is refused here.
+    frame after the no-ops. The emulator stops in the middle of a frame skip when a game or its time ends, so the last
+    frame of such an episode is pooled from the frames until then.
+    An action out of range would stop the emulators' threads for good, so `send` refuses it.
     """
 
     def __init__(self, settings: EnvSettings, game: str, seeds: list[int]) -> None:
@@ -45,7 +45,7 @@ class AtariEnv:
             frameskip=settings.frame_skip,
             noop_max=settings.noop_max + 1,  # ALE draws from 0..noop_max-1
             use_fire_reset=False,
-            # This one ends learning's episode and keeps the game; ALE's `episodic_life` would reset the emulator.
+            # This ends the episode for learning and keeps the game; ALE's `episodic_life` would reset the emulator.
             life_loss_info=settings.episodic_life,
             reward_clipping=False,
         )
@@ -58,10 +58,10 @@ class AtariEnv:
         return self._shape(obs)
 
     def send(self, actions: NDArray[np.int32]) -> None:
-        """Let the emulators' threads begin to play one action, int32 [envs], in each.
+        """Let the emulators' threads begin to play one action each, int32 [envs].
 
         Raises:
-            ValueError: an action out of range.
+            ValueError: an action is out of range.
         """
         if actions.min() < 0 or actions.max() >= self.spec.num_actions:
             raise ValueError(f"actions: {actions.tolist()}; allowed are 0..{self.spec.num_actions - 1}")
@@ -99,10 +99,10 @@ class AtariEnv:
 
 
 def atari_spec(settings: EnvSettings, game: str) -> EnvSpec:
-    """The specification of a game, named as its ROM.
+    """The specification of a game, given the name of its ROM.
 
     Raises:
-        UsageError: the ROM's file is missing or is not the known one.
+        UsageError: the ROM's file is missing or has the wrong content.
     """
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
     emulator = ale_py.ALEInterface()

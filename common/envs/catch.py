@@ -1,4 +1,4 @@
-"""Catch: a ball falls, a paddle must be under it. The smallest pixel game that shows a network learns from pictures."""
+"""Catch: a paddle must catch a falling ball. The smallest pixel game that tests learning from pictures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Catch(gymnasium.Env[NDArray[np.uint8], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        """Drop the next ball; a seed makes all drops from here repeatable."""
+        """Drop the next ball; a seed makes all following drops repeatable."""
         super().reset(seed=seed)
         self._row, self._paddle = 0, CELLS // 2
         self._column = int(self.np_random.integers(CELLS))

@@ -1,4 +1,4 @@
-"""Corridor: walk to its end. So small that its optimal action values are known, which shows that a learner is right."""
+"""Corridor: walk to its end. Its optimal action values are known, so tests can compare a learner with them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Corridor(gymnasium.Env[NDArray[np.float32], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin in a random cell; a seed makes all episodes from here repeatable."""
+        """Begin in a random cell; a seed makes all following episodes repeatable."""
         super().reset(seed=seed)
         self._cell = int(self.np_random.integers(CELLS))
         return self._observation(), {}
@@ -47,7 +47,7 @@ class Corridor(gymnasium.Env[NDArray[np.float32], np.int64]):
 
 
 def optimal_values(gamma: float) -> NDArray[np.float64]:
-    """Q*(cell, action), [5, 2]: right reaches the end in CELLS - cell steps, left begins with a step in vain."""
+    """Q*(cell, action), float64 [5, 2]: right reaches the end in CELLS - cell steps; left wastes a step first."""
     right = gamma ** np.arange(CELLS - 1, -1, -1.0)
     left = gamma * np.concatenate((right[:1], right[:-1]))
     return np.stack((left, right), axis=1)

@@ -23,8 +23,8 @@ from common.types import Array, EnvSpec
 class GymnasiumEnv:
     """Plain gymnasium environments stepped one after another, as `VectorEnv`.
 
-    A vector observation is one float32 frame. A picture becomes an 84x84 grayscale frame (unless it is one)
-    and `stack` of them one observation, zeros standing for what was before an episode's first frame.
+    A vector observation is one float32 frame. A picture becomes an 84x84 grayscale frame (unless it is one
+    already), and `stack` frames make one observation; zeros stand for frames before an episode's first.
     """
 
     def __init__(self, settings: EnvSettings, seeds: list[int]) -> None:
@@ -43,7 +43,7 @@ class GymnasiumEnv:
         self._lengths = [0] * self.num_envs
         self._obs = np.empty(0)
         self._actions = np.empty(0, np.int32)
-        # Shared by every step in which nothing ends, so it must stay as it is.
+        # Shared by all steps in which no episode ends, so it must not be written to.
         self._none = np.zeros(self.num_envs, bool)
         self._none.flags.writeable = False
 
@@ -57,11 +57,11 @@ class GymnasiumEnv:
         return self._obs
 
     def send(self, actions: NDArray[np.int32]) -> None:
-        """Note one action, int32 [envs], for every emulator."""
+        """Store one action, int32 [envs], for every emulator."""
         self._actions = actions
 
     def recv(self) -> Steps:
-        """Play the actions noted last; plain environments have no threads to do it sooner."""
+        """Play the stored actions; plain environments have no threads that could begin earlier."""
         next_obs = np.empty_like(self._obs)
         if self.spec.stack > 1:
             next_obs[:, :-1] = self._obs[:, 1:]
@@ -123,7 +123,7 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
     """The specification of a gymnasium id.
 
     Raises:
-        UsageError: an unknown id, or a space that does not fit.
+        UsageError: the id is unknown, or a space is not supported.
     """
     envs, _ = _make(settings, 1)
     try:
@@ -133,9 +133,9 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
 
 
 def _make(settings: EnvSettings, count: int) -> tuple[list[gymnasium.Env[Any, Any]], int]:
-    """Environments without gymnasium's checks and step limit, and that limit (0: none)."""
+    """Make environments without gymnasium's checks and step limit; return them and that limit (0: none)."""
     try:
-        # By the specification rather than by the id, for `make` warns about ids that have a newer version.
+        # By the specification and not by the id, because `make` warns about ids that have a newer version.
         registered = gymnasium.spec(settings.id)
         plain = dataclasses.replace(registered, order_enforce=False, disable_env_checker=True, max_episode_steps=None)
         envs = [gymnasium.make(plain) for _ in range(count)]

@@ -1,6 +1,6 @@
 """Makes the environment that the settings name.
 
-Emulators are imported where they are made, so that a process that only reads the settings does not pay for them.
+Emulators are imported only when they are made, so that a process that only reads the settings does not pay for them.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from common.types import EnvSpec
 
 
 def make_vector_env(settings: EnvSettings, num_envs: int, seed: int) -> VectorEnv:
-    """Make `num_envs` emulators, each with a seed of its own drawn from `seed`.
+    """Make `num_envs` emulators, each with its own seed derived from `seed`.
 
     Raises:
-        UsageError: unknown id or game, or a space that does not fit.
+        UsageError: the id or game is unknown, or a space is not supported.
     """
     if num_envs < 1:
         raise UsageError(f"envs: {num_envs} is not allowed; at least 1")
@@ -34,7 +34,7 @@ def make_vector_env(settings: EnvSettings, num_envs: int, seed: int) -> VectorEn
 
 
 def env_spec(settings: EnvSettings) -> EnvSpec:
-    """The specification of the environment, without starting emulators.
+    """The specification of the environment, determined without starting emulators.
 
     Raises:
         UsageError: as `make_vector_env`.
@@ -49,7 +49,7 @@ def env_spec(settings: EnvSettings) -> EnvSpec:
 
 
 def _atari_game(settings: EnvSettings) -> str | None:
-    """The ROM's name if the id means an ALE game; None leaves the id to gymnasium."""
+    """The ROM's name if the id names an ALE game; None if it is gymnasium's."""
     if not settings.atari:
         return None
     from ale_py.roms import get_all_rom_ids  # noqa: PLC0415

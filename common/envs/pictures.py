@@ -1,4 +1,4 @@
-"""Pictures of any size to the 84x84 grayscale frames that the networks take."""
+"""Converts pictures of any size to the networks' 84x84 grayscale frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
 class Shrink:
-    """uint8 pictures [height, width], [height, width, 1] or [height, width, 3] to uint8 [84, 84].
+    """Converts uint8 pictures [height, width], [height, width, 1] or [height, width, 3] to uint8 [84, 84].
 
     Each output pixel is the mean of the input area that it covers; an 84x84 gray picture passes unchanged.
     """
@@ -23,7 +23,7 @@ class Shrink:
         self._same_size = tuple(shape[:2]) == (SIDE, SIDE)
 
     def __call__(self, picture: Array) -> NDArray[np.uint8]:
-        """One frame of the picture."""
+        """Convert one picture to a frame, uint8 [84, 84]."""
         if picture.ndim == 3:
             picture = picture[..., 0] if picture.shape[2] == 1 else picture @ _LUMA
         if not self._same_size:

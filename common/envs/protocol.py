@@ -1,4 +1,4 @@
-"""What every environment gives an actor: a batch of emulators stepped together, exact about how episodes end."""
+"""The environment interface: a batch of emulators that step together and report exactly how episodes end."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from common.types import Array, EnvSpec
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """One step of every emulator. Receivers must not write into the arrays; none is reused by a later call.
+    """One step of every emulator. Callers must not write into the arrays; later calls do not reuse them.
 
-    obs: <frame_dtype>[envs, *obs_shape], what the policy acts on next (of the new episode where one began).
-    next_obs: <frame_dtype>[envs, *obs_shape], where the step led; the same object as `obs` if nothing restarted.
+    obs: <frame_dtype>[envs, *obs_shape], the next observation to act on (of the new episode where one began).
+    next_obs: <frame_dtype>[envs, *obs_shape], the result of the step; the same object as `obs` if nothing restarted.
     rewards: float32 [envs], for learning. raw_rewards: float64 [envs], unclipped, for reported returns.
-    terminated: bool [envs], for learning: no value follows. A truncated step is not terminal.
-    restarted: bool [envs], obs does not continue next_obs, for the emulator was reset.
+    terminated: bool [envs], for learning: the next state has no value. A truncated step is not terminal.
+    restarted: bool [envs], the emulator was reset, so obs does not continue next_obs.
     episode_over: bool [envs], the reported (full-game) episode ended.
     """
 
@@ -45,7 +45,7 @@ class VectorEnv(Protocol):
         """Begin to play one action, int32 [envs] in 0..num_actions-1, in every emulator; `recv` must follow."""
 
     def recv(self) -> Steps:
-        """What the actions sent last led to."""
+        """Wait for the result of the actions sent last."""
 
     def step(self, actions: NDArray[np.int32]) -> Steps:
         """`send`, then `recv`."""

@@ -1,4 +1,4 @@
-"""Networks of Linear layers with ReLUs between them, in numpy, whose calls cost a fraction of PyTorch's on the host."""
+"""Networks of Linear layers and ReLUs in numpy, whose calls cost a fraction of PyTorch's on the CPU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _DTYPES = (torch.float32, torch.float64)
 
 
 class Dense:
-    """The values of such a network, read from the parameters where they are.
+    """The forward pass of such a network, over the parameters in place.
 
     names: prefix of the parameters' names of each layer. weights: <float>[out, in]. biases: <float>[out, 1].
     """
@@ -28,7 +28,7 @@ class Dense:
 
     @staticmethod
     def fits(module: nn.Module) -> bool:
-        """Whether a network is Linear, ReLU, Linear, ..., Linear with biases, in float32 or float64 on the host."""
+        """Whether a network is Linear, ReLU, Linear, ..., Linear with biases, in float32 or float64 on the CPU."""
         steps = list(module.children()) if isinstance(module, nn.Sequential) else []
         kinds = [type(step) for step in steps]
         return (
@@ -44,14 +44,14 @@ class Dense:
         return output.T
 
     def activations(self, x: Array) -> list[Array]:
-        """x, what each ReLU makes of it, and the output: <float>[batch, n] each."""
+        """x, the output of each ReLU, and the network's output: <float>[batch, n] each."""
         return [x, *(np.ascontiguousarray(column.T) for column in self._columns(x))]
 
     def _columns(self, x: Array) -> Iterator[Array]:
-        """What each ReLU makes of x, and the output: [n, batch], a layout in which the products take half the time."""
+        """Yield the output of each ReLU and of the network: [n, batch], a layout in which products take half the time."""
         column = x.T
         last = len(self.weights) - 1
-        with np.errstate(over="ignore", invalid="ignore"):  # of networks that diverge, as PyTorch has it
+        with np.errstate(over="ignore", invalid="ignore"):  # of diverging networks, as in PyTorch
             for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
                 column = weight.dot(column)
                 column += bias

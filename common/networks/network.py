@@ -1,4 +1,4 @@
-"""Q-networks by name, and the flat buffer that holds all parameters of one of them."""
+"""Q-networks by name, and the flat buffer that holds all parameters of a network."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) ->
     """A Q-network float32 [batch, *input] -> [batch, num_actions] with PyTorch's default initialisation.
 
     kind: "mlp" (linear layers of the widths in `hidden`, ReLU between), "nature" or "nips2013" (`hidden` unused).
-    The parameters depend on `seed` alone and the global random state stays as it was.
+    The parameters depend only on `seed`; the global random state is unchanged.
 
-    Raises UsageError for an unknown kind, and for a convolutional kind where frames are not images or too small.
+    Raises UsageError for an unknown kind, and for a convolutional kind if frames are not images or are too small.
     """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
@@ -81,7 +81,7 @@ def _conv(kind: str, spec: EnvSpec) -> nn.Sequential:
 def preprocess(obs: Tensor, spec: EnvSpec) -> Tensor:
     """The network's input for stored observations: <frame_dtype>[batch, *obs_shape] -> float32 on the same device.
 
-    uint8 images are scaled to [0, 1] and get a channel axis where nothing is stacked; float32 vectors pass through.
+    uint8 images are scaled to [0, 1] and get a channel axis if frames are not stacked; float32 vectors are unchanged.
     """
     if spec.frame_dtype == "uint8":
         obs = obs.to(torch.float32).mul_(1 / 255)
@@ -91,10 +91,10 @@ def preprocess(obs: Tensor, spec: EnvSpec) -> Tensor:
 
 
 def layer_functions(layers: Iterable[nn.Module]) -> list[Callable[[Tensor], Tensor]]:
-    """Each layer as a plain function, for forward passes without gradients; a module's call costs as much as a layer.
+    """Each layer as a plain function, for forward passes without gradients; calling a module costs as much as a layer.
 
-    A ReLU overwrites its input where a layer with parameters has just made it. The functions hold the parameters
-    themselves, and so follow whatever is written into them.
+    A ReLU overwrites its input if that is the fresh output of a layer with parameters. The functions refer to the
+    parameters themselves, and so see later changes.
     """
     functions = []
     fresh = False
@@ -118,9 +118,9 @@ def _function(layer: nn.Module, fresh: bool) -> Callable[[Tensor], Tensor]:
 class FlatNetwork:
     """A network whose parameters are views of one flat buffer.
 
-    flat: float32 [P] (or the module's dtype), what is trained, published and stored.
+    flat: float32 [P] (or the module's dtype), all parameters, which the learner trains, publishes and saves.
     module: the network; its named parameters view `flat`.
-    dense: the network in numpy, over the same parameters; None where it does not fit (see `Dense.fits`).
+    dense: the network in numpy, over the same parameters; None if it does not fit (see `Dense.fits`).
     layout: (name, shape) of each parameter in the order of the buffer.
     """
 
@@ -151,17 +151,17 @@ class FlatNetwork:
 
     def load(self, flat: Tensor | NDArray[np.float32]) -> None:
         """Overwrite all parameters in place from float32 [P]; raises ValueError for another size."""
-        # A copy, because arrays from the wire are read-only and PyTorch warns of viewing those.
+        # A copy, because arrays from the wire are read-only and PyTorch warns about views of those.
         source = flat if isinstance(flat, Tensor) else torch.tensor(flat)
         if source.shape != self.flat.shape:
             raise ValueError(f"flat parameters: got shape {tuple(source.shape)}, the network has {self.flat.numel()}")
         self.flat.copy_(source)
 
     def snapshot(self) -> NDArray[np.float32]:
-        """A copy of all parameters on the host: float32 [P]."""
+        """A copy of all parameters on the CPU: float32 [P]."""
         array: NDArray[np.float32] = self.flat.to("cpu", copy=True).numpy()
         return array
 
     def layout_digest(self) -> str:
-        """16 hex digits that two networks share exactly if their layouts are equal (checked at join)."""
+        """16 hex digits, equal for two networks if and only if their layouts are equal; compared when a role joins."""
         return hashlib.sha256(repr(self.layout).encode()).hexdigest()[:16]

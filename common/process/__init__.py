@@ -1,1 +1,1 @@
-"""What every process needs: command lines, signals and stops, child processes, files, threads, memory."""
+"""Process plumbing: command lines, signals and stops, child processes, files, threads, memory."""

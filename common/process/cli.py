@@ -1,4 +1,4 @@
-"""Command lines by tyro; whatever is wrong with them comes out as one line."""
+"""Parses command lines with tyro, and reports errors in one line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from typing import Any, NoReturn, TypeVar, get_type_hints
 
 import tyro
-from tyro import _errors as tyro_errors  # pyproject.toml pins the version, for tyro promises nothing of this module
+from tyro import _errors as tyro_errors  # private; pyproject.toml pins the version
 
 from common.errors import UsageError
 
@@ -46,13 +46,13 @@ def flags(kind: type[Any], prefix: str = "") -> Iterator[str]:
 
 
 def given_flags(args: Sequence[str]) -> set[str]:
-    """The fields that a command line sets, as dotted names: "learner.swap_every"; `--learner.no-double` too."""
+    """The fields that a command line sets, as dotted names ("learner.swap_every"); `--learner.no-double` counts."""
     names = {token[2:].partition("=")[0].replace("-", "_") for token in args if token.startswith("--")}
     return names | {name.replace(".no_", ".") for name in names}
 
 
 def _problem(event: tyro_errors.ParseErrorEvent, known: Sequence[str]) -> str:
-    """What is wrong, in one line."""
+    """Describe a parse error in one line."""
     match event:
         case tyro_errors.UnrecognizedArgs(tokens=[first, *_]):
             flag = first.partition("=")[0].replace("_", "-")

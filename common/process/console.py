@@ -1,4 +1,4 @@
-"""What a console tells a person: one line for each event, with its time, and one on the progress now and then."""
+"""Console output of a role: one line for each event, with its time, and a progress line every 10 s."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 PROGRESS_EVERY = 10.0  # seconds
-STANDSTILL = 5.0  # seconds without progress that are worth a line
-RECENT = 16  # events that displays elsewhere can still be told
+STANDSTILL = 5.0  # seconds without progress after which a line is printed
+RECENT = 16  # events kept for displays in other processes
 
 
 class Console:
-    """The standard output of a role; safe for threads."""
+    """The standard output of a role; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -23,7 +23,7 @@ class Console:
         self._standstill = Standstill()
 
     def event(self, text: str) -> None:
-        """Print what has just happened."""
+        """Print an event."""
         with self._lock:
             line = stamped(text)
             last = self._recent[-1][0] if self._recent else 0
@@ -31,14 +31,14 @@ class Console:
             print(line, flush=True)
 
     def recent(self) -> list[list[int | str]]:
-        """The newest events, each with a number that grows, also over restarts: [number, line]."""
+        """The newest events as [number, line]; numbers increase, also across restarts."""
         with self._lock:
             return [list(event) for event in self._recent]
 
     def progress(self, count: int, reason: str, line: Callable[[], str]) -> None:
-        """Print `line()` if it is time, and an event where `count` stands still for a `reason`, or moves again.
+        """Print `line()` if it is due, and an event when `count` stops growing for a `reason` or grows again.
 
-        While it stands still, there is no progress to print.
+        While it does not grow, no progress line is printed.
         """
         now = time.monotonic()
         if text := self._standstill.look(now, count, reason):
@@ -50,9 +50,9 @@ class Console:
 
 
 class Standstill:
-    """Notices that a count stands still for longer than `STANDSTILL`, and that it moves again; time comes in.
+    """Notices that a count has not grown for longer than `STANDSTILL`, and that it grows again; time is an argument.
 
-    told: the count stands still, and that was worth a line.
+    told: the count does not grow, and a line has said so.
     """
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class Standstill:
         self._moved = 0.0
 
     def look(self, now: float, count: int, reason: str) -> str:
-        """What is worth a line now; empty if nothing is. reason: why the count may be waiting, in words."""
+        """The line to print now, empty if there is none. reason: why the count may be waiting, in words."""
         if count != self._count:
             self._count, self._moved = count, now
             told, self.told = self.told, False
@@ -73,7 +73,7 @@ class Standstill:
 
 
 class Sight:
-    """Notices that another member of the run is out of sight, and that it or another one in its place is back.
+    """Notices that another member of the run has disappeared, and that it or its successor is there again.
 
     Args:
         role: as in "the learner".
@@ -85,7 +85,7 @@ class Sight:
         self._lost = False
 
     def look(self, there: bool, where: str) -> str:
-        """What is worth a line now; empty if nothing is. where: host and process id of the one that serves now."""
+        """The line to print now, empty if there is none. where: host and process id of the present member."""
         if not there:
             told, self._lost = self._lost or not self._seen, bool(self._seen)
             return "" if told else f"{self._role} on {self._seen} does not answer"
@@ -95,7 +95,7 @@ class Sight:
 
 
 def stamped(text: str) -> str:
-    """A line with its time."""
+    """A line preceded by the time of day."""
     return f"{time.strftime('%H:%M:%S')} {text}"
 
 
@@ -113,7 +113,7 @@ def returns(mean: float, episodes: int, window: int = 100) -> str:
 
 
 def connected(counts: Mapping[str, int]) -> str:
-    """How many processes of the other roles are connected, in words."""
+    """The number of connected processes of the other roles, in words."""
     return f"{counted(counts.get('replay', 0), 'replay service')}, {counted(counts.get('actor', 0), 'actor')}"
 
 

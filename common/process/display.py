@@ -1,4 +1,4 @@
-"""Shows what goes on: a live picture on a terminal, a line now and then elsewhere."""
+"""Displays progress: a live picture on a terminal, otherwise a line from time to time."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from rich.live import Live
 
 
 class LiveDisplay(ABC):
-    """A context that is told to `update` again and again.
+    """A context manager whose `update` is called repeatedly.
 
-    plain_every: seconds between lines where the output is no terminal; none is repeated. refreshes: pictures per second
-    on a terminal.
+    plain_every: seconds between lines if the output is no terminal; a line is never repeated.
+    refreshes: pictures per second on a terminal.
     """
 
     def __init__(self, plain_every: float, refreshes: float) -> None:
@@ -33,7 +33,7 @@ class LiveDisplay(ABC):
         self._live.stop()
 
     def update(self) -> None:
-        """Show how things are now."""
+        """Show the present state."""
         if self._console.is_terminal:
             self._live.update(self.picture())
         elif time.monotonic() >= self._due:
@@ -43,13 +43,13 @@ class LiveDisplay(ABC):
                 self.say(self._plain)
 
     def say(self, text: str) -> None:
-        """Print a line that stays."""
+        """Print a permanent line."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     @abstractmethod
     def picture(self) -> RenderableType:
-        """How things are, for a terminal."""
+        """The present state, for a terminal."""
 
     @abstractmethod
     def line(self) -> str:
-        """How things are, in one line."""
+        """The present state in one line."""

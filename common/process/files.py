@@ -1,4 +1,4 @@
-"""Files that are either whole on the disk or not there under their name."""
+"""Durable files: complete on the disk, or absent under their name."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PIECE = 1 << 24  # bytes read at once
 
 
 class SyncedFile:
-    """A new file that is on the disk when `close` returns.
+    """A new file whose content is on the disk when `close` returns.
 
     size, checksum: bytes written so far, and their CRC-32.
     """
@@ -25,7 +25,7 @@ class SyncedFile:
         self.checksum = 0
 
     def write(self, data: bytes | memoryview) -> None:
-        """Append bytes; raises OSError where there is no space for all of them."""
+        """Append bytes; raises OSError if there is no space for all of them."""
         view = memoryview(data)
         self.checksum = zlib.crc32(view, self.checksum)
         self.size += view.nbytes
@@ -33,7 +33,7 @@ class SyncedFile:
             view = view[self._file.write(view) :]
 
     def close(self) -> None:
-        """Hand the file to the disk."""
+        """Flush the file to the disk and close it."""
         if not self._file.closed:
             os.fsync(self._file.fileno())
             self._file.close()
@@ -50,9 +50,9 @@ class SyncedFile:
 
 
 class LineFile:
-    """A file that grows by whole lines. What there is no space for is kept, and written as soon as there is.
+    """A file that grows by whole lines. Lines that do not fit on the disk are kept, and written once there is space.
 
-    problem: why lines are being kept; empty while none are.
+    problem: why lines are being kept; empty if none are.
     """
 
     def __init__(self, path: Path, *, go_on: bool) -> None:
@@ -61,7 +61,7 @@ class LineFile:
         self._file = path.open("ab" if go_on else "wb", buffering=0)
 
     def write(self, text: str) -> None:
-        """Append text that ends in a line's end."""
+        """Append text that ends with a newline."""
         self._late += text.encode()
         try:
             while self._late:
@@ -71,13 +71,13 @@ class LineFile:
             self.problem = error.strerror or str(error)
 
     def close(self) -> None:
-        """Try once more, and close the file."""
+        """Try once more to write kept lines, and close the file."""
         self.write("")
         self._file.close()
 
 
 def write_whole(path: Path, data: bytes) -> int:
-    """Replace a file's content; the checksum of the new one. Raises OSError, the old file being untouched then."""
+    """Replace a file atomically; return the new CRC-32. Raises OSError, and then leaves the old file untouched."""
     part = path.with_name(path.name + ".part")
     try:
         with SyncedFile(part) as file:
@@ -94,7 +94,7 @@ def cut_back(path: Path, size: int) -> None:
     """Shorten a file to `size` bytes.
 
     Raises:
-        RunError: it is shorter already: what should be there has been lost, and nothing can stand in for it.
+        RunError: it is already shorter, so data have been lost that cannot be replaced.
         OSError: it can't be written.
     """
     there = path.stat().st_size
@@ -104,7 +104,7 @@ def cut_back(path: Path, size: int) -> None:
 
 
 def measure(path: Path) -> tuple[int, int]:
-    """(size, checksum) of a file as it is; raises OSError."""
+    """(bytes, CRC-32) of a file; raises OSError."""
     size = checksum = 0
     with path.open("rb") as file:
         while piece := file.read(PIECE):
@@ -114,7 +114,7 @@ def measure(path: Path) -> tuple[int, int]:
 
 
 def sync_folder(path: Path) -> None:
-    """Hand the names in a folder to the disk."""
+    """Flush a folder's entries to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""How a process of a run starts, is asked to stop, and ends: signals, exit status, the message of its last line."""
+"""The lifecycle of a process: signals, requests to stop, exit status, and the last line of a failure."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """A request to stop, with its reason; set by a signal, by a message or by the code itself.
+    """A request to stop this process, with its reason; set by a signal, by a message or by the code itself.
 
-    failed: the process must end with exit status 1. exit_status: after a signal, as a shell tells it; else 0.
+    failed: the process must end with exit status 1. exit_status: 128 + signal number after a signal, else 0.
     """
 
     def __init__(self) -> None:
@@ -30,24 +30,24 @@ class Stop:
         self.exit_status = 0
 
     def set(self, reason: str, failed: bool = False, exit_status: int = 0) -> None:
-        """Ask for the stop; the first reason stays, and what belongs to it."""
+        """Request the stop; a later call does not change the reason, `failed` or `exit_status`."""
         if not self._event.is_set():
             self.reason, self.failed, self.exit_status = reason, failed, exit_status
         self._event.set()
 
     def is_set(self) -> bool:
-        """True once somebody asked, or once the supervisor of this process is gone."""
+        """True once a stop was requested, or once this process's supervisor has gone."""
         if self._parent is not None and os.getppid() != self._parent:
             self.set("the supervisor is gone")
         return self._event.is_set()
 
     def wait(self, seconds: float) -> bool:
-        """Sleep, unless the stop comes first; True if it has come."""
+        """Sleep until the stop or for `seconds`; return True if the stop has been requested."""
         self._event.wait(seconds)
         return self.is_set()
 
     def on_signals(self) -> None:
-        """Let SIGINT and SIGTERM ask for a clean stop; a second SIGINT interrupts at once."""
+        """Make SIGINT and SIGTERM request a clean stop; a second SIGINT interrupts at once."""
 
         def handle(number: int, frame: FrameType | None) -> None:
             if number == signal.SIGINT and self.is_set():
@@ -58,11 +58,11 @@ class Stop:
             signal.signal(number, handle)
 
     def leave(self) -> None:
-        """End the process as the reason of the stop asks.
+        """End the process with the status that the stop requires; return if that is 0.
 
         Raises:
-            PeerLost: it is a failure.
-            SystemExit: it is a signal, which schedulers must not take for the end of the work.
+            PeerLost: the stop is a failure.
+            SystemExit: a signal caused the stop; schedulers must not mistake this for completed work.
         """
         if self.failed:
             raise PeerLost(self.reason)
@@ -70,7 +70,7 @@ class Stop:
             sys.exit(self.exit_status)
 
     def on_thread_failures(self) -> None:
-        """Let a thread that ends of an error of this program end the process, which would live on without it."""
+        """Stop the process when an uncaught exception ends one of its threads."""
 
         def handle(failure: threading.ExceptHookArgs) -> None:
             threading.__excepthook__(failure)  # prints the traceback
@@ -81,15 +81,15 @@ class Stop:
 
 
 def status_after(number: int) -> int:
-    """The exit status that tells of a signal."""
+    """The exit status of a process that a signal ended."""
     return 128 + number
 
 
 def end_on_signals(program: str) -> None:
-    """Let SIGINT and SIGTERM end this process at once, which has begun nothing yet; `Stop.on_signals` takes over."""
+    """Make SIGINT and SIGTERM end this process at once, as long as `Stop.on_signals` has not taken over."""
 
     def handle(number: int, frame: FrameType | None) -> None:
-        # Not by an exception: what is being imported may swallow it.
+        # Not by an exception: a module that is being imported may swallow it.
         os.write(sys.stderr.fileno(), f"{program}: interrupted\n".encode())
         os._exit(status_after(number))
 
@@ -98,14 +98,14 @@ def end_on_signals(program: str) -> None:
 
 
 def run_main(program: str, main: Callable[[], None]) -> None:
-    """Run a command's body; a failure that the user can meet ends in one line and its exit status."""
+    """Run a command's body; print a CoopError as one line and exit with its status."""
     try:
         main()
     except CoopError as error:
         print(f"{program}: error: {error}", file=sys.stderr, flush=True)
         sys.exit(error.exit_status)
     except BrokenPipeError:
-        # Whoever read our output has gone; the interpreter must not try to flush what is left.
+        # The reader of the output has gone; the interpreter must not try to flush the rest.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""Locks of a folder that are free as soon as the processes that hold them have ended, however they ended."""
+"""Locks of a folder that the operating system releases when their holders end, however they end."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Self
 
 from common.errors import RunError
 
-INHERITED = "COOP_LOCKS"  # descriptors of locks that a process has from its supervisor, separated by commas
-HOLDER_BYTES = 512  # more than any line that names a holder
+INHERITED = "COOP_LOCKS"  # comma-separated descriptors of locks that a process inherits from its supervisor
+HOLDER_BYTES = 512  # more than any holder's line
 
 
 class FileLock:
-    """The lock of one file. A child process that inherits `descriptor` holds it too."""
+    """A lock on one file. A child process that inherits `descriptor` holds it too."""
 
     def __init__(self, path: Path) -> None:
-        """Take the lock; raises BlockingIOError where another process has it, and OSError where the file can't be."""
+        """Acquire the lock; raises BlockingIOError if another process holds it, OSError if the file cannot be made."""
         self.descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -29,12 +29,12 @@ class FileLock:
             raise
 
     def name_holder(self, holder: str) -> None:
-        """Write down who holds the lock, for those who are refused."""
+        """Write the holder into the file, for the error message of other processes."""
         os.ftruncate(self.descriptor, 0)
         os.pwrite(self.descriptor, holder.encode()[:HOLDER_BYTES], 0)
 
     def release(self) -> None:
-        """Give the lock up, unless a child process has inherited it."""
+        """Release the lock, unless a child process has inherited it."""
         os.close(self.descriptor)
 
     def __enter__(self) -> Self:
@@ -47,16 +47,16 @@ class FileLock:
 
 
 class RunLock:
-    """The places in a run directory that one process, and the children that it hands its locks to, works in.
+    """Locks the roles' places in a run directory for one process and the children that inherit its locks.
 
-    Learner and replay service may share a directory; what takes the place of both locks both.
+    Learner and replay service may share a directory; a process that acts as both locks both places.
     """
 
     def __init__(self, folder: Path, program: str, roles: Sequence[str]) -> None:
-        """Lock the places of `roles`; the folder is made if it is not there.
+        """Lock the places of `roles`; create the folder if it does not exist.
 
         Raises:
-            RunError: another process works in one of them (named), or the folder can't be written.
+            RunError: another process, which the message names, holds one of them, or the folder cannot be written.
         """
         self._locks: list[FileLock] = []
         try:
@@ -72,11 +72,11 @@ class RunLock:
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """What a child process must inherit, and be told of in `INHERITED`, to hold the locks too."""
+        """The descriptors that a child must inherit, and find in the variable `INHERITED`, to hold the locks too."""
         return tuple(lock.descriptor for lock in self._locks)
 
     def release(self) -> None:
-        """Let others in."""
+        """Release all locks."""
         for lock in self._locks:
             lock.release()
         self._locks.clear()
@@ -84,7 +84,7 @@ class RunLock:
     def _take(self, folder: Path, role: str, program: str) -> None:
         path = folder / f".{role}.lock"
         if _is_inherited(path):
-            return  # the supervisor's, which has named itself
+            return  # the supervisor holds it and is named in it
         try:
             lock = FileLock(path)
         except BlockingIOError:
@@ -103,7 +103,7 @@ class RunLock:
 
 
 def _is_inherited(path: Path) -> bool:
-    """Whether this process has the lock of `path` from its supervisor."""
+    """Whether this process inherited the lock of `path` from its supervisor."""
     for number in filter(None, os.environ.get(INHERITED, "").split(",")):
         try:
             if os.path.samestat(os.fstat(int(number)), path.stat()):

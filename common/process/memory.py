@@ -1,4 +1,4 @@
-"""What the C library does with freed memory."""
+"""How the C library treats freed memory."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _KEEP = 2**30  # bytes
 
 @cache
 def keep_freed_memory() -> None:
-    """Let this process keep what it frees; where the C library is not glibc, nothing happens.
+    """Make glibc keep freed memory in this process; does nothing with another C library.
 
-    Updates allocate and free tensors of ten megabytes and more, messages a megabyte. glibc hands them back to the
-    kernel each time, and their pages, mapped in and zeroed again, cost a third of an update of a convolutional network.
+    Updates allocate and free tensors of ten megabytes and more, messages of one. By default glibc returns them to the
+    kernel each time; mapping and zeroing their pages again takes a third of an update of a convolutional network.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

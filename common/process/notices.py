@@ -1,4 +1,4 @@
-"""Lines on stderr that a person should see although nothing is wrong enough to stop."""
+"""Warnings and notes on stderr, which do not stop the program."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ _told: set[tuple[str, str]] = set()
 
 
 def warn(text: str) -> None:
-    """Say what is likely to be a mistake."""
+    """Print a warning of a likely mistake."""
     print(f"warning: {text}", file=sys.stderr, flush=True)
 
 
 def note_renamed(names: Mapping[str, str]) -> None:
-    """Say in one line which former names were read, and the present ones; each pair once in this process's life."""
+    """Print former names that were read and their present ones in one line; each pair once per process."""
     fresh = [f"{former} is now {present}" for former, present in names.items() if (former, present) not in _told]
     _told.update(names.items())
     if fresh:

@@ -1,4 +1,4 @@
-"""Child processes on this machine, a run's roles or a sweep's runs: start, watch, interrupt, end."""
+"""Starts, watches, interrupts and ends child processes on this machine: a run's roles or a sweep's runs."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ LAST_WORDS = 400  # characters of a log's last line
 
 
 class ChildProcess:
-    """A command as a child process of its own process group, its output in a log file; it ends when this one does.
+    """A command as a child process in its own process group, with a log file; it ends when this process ends.
 
     Args:
-        name: for people, for example "actor 2".
-        inherit: file descriptors of locks that it holds with this process.
+        name: shown to users, for example "actor 2".
+        inherit: file descriptors of locks that the child holds too.
     """
 
     def __init__(self, name: str, command: list[str], log: Path, inherit: tuple[int, ...] = ()) -> None:
@@ -34,7 +34,7 @@ class ChildProcess:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start it, or start it again."""
+        """Start or restart it."""
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
                 self._command,
@@ -56,11 +56,11 @@ class ChildProcess:
         return self._process.pid if self._process is not None else 0
 
     def exit_status(self) -> int | None:
-        """None while it runs."""
+        """The exit status; None while it runs."""
         return None if self._process is None else self._process.poll()
 
     def was_interrupted(self) -> bool:
-        """True where SIGINT or SIGTERM ended it, cleanly or while it started."""
+        """True if SIGINT or SIGTERM ended it, cleanly or during its start."""
         return self.exit_status() in (*SIGNAL_STATUSES, *(-number for number in SIGNALS))
 
     def interrupt(self) -> None:
@@ -79,7 +79,7 @@ class ChildProcess:
             self._process.wait()
 
     def why(self) -> str:
-        """How it ended, with the last line of its log."""
+        """Describe how it ended, with the last line of its log."""
         status = self.exit_status() or 0
         how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
         lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
@@ -92,7 +92,7 @@ class ChildProcess:
 
 
 def command(name: str, *flags: str) -> list[str]:
-    """A console command of this very installation.
+    """The command line of a console command of this installation.
 
     Raises:
         RunError: it is not installed.
@@ -104,7 +104,7 @@ def command(name: str, *flags: str) -> list[str]:
 
 
 def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
-    """An endpoint with the protocol and address of another one (TCP on loopback if that has no port), its port free."""
+    """An endpoint with a free port and the protocol and address of `like` (TCP on loopback if that has no port)."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"{like.rpartition(':')[0] or 'tcp/127.0.0.1'}:{probe.getsockname()[1]}"

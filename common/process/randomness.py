@@ -1,4 +1,4 @@
-"""The state of a random generator as plain values that msgpack and weights_only loading take."""
+"""The state of a random generator as plain values, for msgpack and weights_only loading."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 
 def generator_state(rng: np.random.Generator) -> dict[str, Any]:
-    """What `set_generator_state` needs, of a Generator over PCG64.
+    """The state of a Generator over PCG64, for `set_generator_state`.
 
-    Numbers of 128 bits become text, for msgpack's integers end at 64.
+    128-bit numbers become text, because msgpack's integers have 64 bits.
     """
     state = rng.bit_generator.state
     return {**state, "state": {name: str(number) for name, number in state["state"].items()}}
 
 
 def set_generator_state(rng: np.random.Generator, state: Mapping[str, Any]) -> None:
-    """Let `rng` go on where `state` was taken."""
+    """Set `rng` to a state from `generator_state`."""
     rng.bit_generator.state = {**state, "state": {name: int(digits) for name, digits in state["state"].items()}}

@@ -1,4 +1,4 @@
-"""The id of the run that a directory belongs to: drawn at random when the run begins, it tells namesakes apart."""
+"""The random id of the run that a directory belongs to; it distinguishes runs of the same name."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ RUN_ID = "run-id"
 
 
 def has_run_id(folder: Path) -> bool:
-    """True where a run has begun in a directory."""
+    """True if a run has begun in a directory."""
     return (folder / RUN_ID).exists()
 
 
 def read_run_id(folder: Path) -> int:
-    """The id of the run in a directory; raises RunError."""
+    """Read the id of the run in a directory; raises RunError."""
     path = folder / RUN_ID
     try:
         return int(path.read_text(encoding="utf-8"))
@@ -26,17 +26,17 @@ def read_run_id(folder: Path) -> int:
 
 
 def draw_run_id(folder: Path) -> int:
-    """The id of the run in a directory, drawn now where no run has begun in it; raises RunError."""
+    """Read the id of the run in a directory, or draw one if no run has begun in it; raises RunError."""
     if not has_run_id(folder):
         claim(folder, secrets.randbits(63))
     return read_run_id(folder)
 
 
 def claim(folder: Path, run_id: int) -> None:
-    """Make a directory one of the run's, once and for all.
+    """Assign a directory to a run, permanently.
 
     Raises:
-        RunError: it is another run's, or it can't be written; nothing was written then.
+        RunError: it belongs to another run, or it cannot be written; then nothing was written.
     """
     if has_run_id(folder):
         check_owner(folder, read_run_id(folder), run_id)
@@ -49,6 +49,6 @@ def claim(folder: Path, run_id: int) -> None:
 
 
 def check_owner(place: Path, found: int, run_id: int) -> None:
-    """Raises RunError where what was found in `place` is of another run than the learner's."""
+    """Raise RunError if the run id found in `place` differs from the learner's, `run_id`."""
     if found != run_id:
         raise RunError(f"{place}: belongs to the run with id {found}, the learner's has {run_id}")

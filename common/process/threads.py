@@ -1,4 +1,4 @@
-"""How many threads the arithmetic of a process may use."""
+"""The number of threads for a process's arithmetic."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from threadpoolctl import threadpool_limits
 
 
 def use_threads(count: int) -> None:
-    """Let PyTorch and numpy's BLAS use `count` threads, from now on; by default both take every core."""
+    """Limit PyTorch and numpy's BLAS to `count` threads; by default both use every core."""
     torch.set_num_threads(count)
     threadpool_limits(count, user_api="blas")
