@@ -93,7 +93,7 @@ class FrameBlock:
         return frames, obs_index[:, :-1], next_index, kept
 
     def _indices(self) -> tuple[Rows, Rows]:
-        """Rows of obs, int32 [envs, steps + 1, stack] (the last: the next step's), and next_obs, [envs, steps, stack]."""
+        """Rows of obs, int32 [envs, steps + 1, stack] (last: the next step's), and next_obs, [envs, steps, stack]."""
         stack = self._spec.stack
         pushed = self._pushed[: self._steps] - self._first
         rows = np.concatenate([self._current, pushed.astype(np.int32)])

@@ -48,7 +48,7 @@ class Dense:
         return [x, *(np.ascontiguousarray(column.T) for column in self._columns(x))]
 
     def _columns(self, x: Array) -> Iterator[Array]:
-        """Yield the output of each ReLU and of the network: [n, batch], a layout in which products take half the time."""
+        """Yield each ReLU's and the network's output: [n, batch], a layout in which products take half the time."""
         column = x.T
         last = len(self.weights) - 1
         with np.errstate(over="ignore", invalid="ignore"):  # of diverging networks, as in PyTorch
