@@ -1,6 +1,6 @@
-"""Algorithm 1's learner: two networks, one of them acting and trained, and the swap of their roles.
+"""The learner of Algorithm 1: two networks, one of which acts and is trained, and the swap of their roles.
 
-The four methods differ by config only:
+The four methods differ only in their config:
 
     method   second network   target             feedback
     dqn      copy of first    copied every C     none
@@ -34,10 +34,10 @@ from learner.qnetwork import make_q_network, on_host
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """What one update measured.
+    """The measurements of one update.
 
     td_errors: float32 [batch], e of the taken actions before clipping and weighting.
-    s: the exploration rate used. swapped: the roles changed after this update.
+    s: the value of s in this update. swapped: the roles changed after it.
     """
 
     td_errors: NDArray[np.float32]
@@ -46,20 +46,20 @@ class Update:
 
 
 class Agent:
-    """Both networks with their optimizers, the acting role and the update.
+    """Both networks with their optimizers, the acting role, and the update.
 
     Args:
-        config: the run; `spec`: its environment.
+        config: of the run. spec: of its environment.
 
     Attributes:
         acting: 0 or 1, index of the network that acts and is trained.
-        updates: updates done.
-        networks: the parameters of both networks. versions: updates done when each was changed last.
-        loss: the cost of a TD error.
+        updates: number of updates done.
+        networks: the parameters of both networks. versions: `updates` at each network's last change.
+        loss: the loss of a TD error.
     """
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
-        """Raises UsageError for a device that is not there or weight decays that do not fit the layers."""
+        """Raise UsageError for a missing device, or weight decays that do not match the layers."""
         self.config = config
         self.spec = spec
         self.device = _device(config.learner.device)
@@ -83,10 +83,10 @@ class Agent:
         settings, size = self.config.learner, len(batch)
         online, target = self._networks[self.acting], self._networks[1 - self.acting]
         s = self._draw_s()
-        # What is not finite is found by whoever reads the TD errors: numpy says no more of it than PyTorch.
+        # The trainer finds TD errors that are not finite; numpy, like PyTorch, does not warn of them here.
         with torch.inference_mode(), np.errstate(all="ignore"):
             inputs = online.inputs(batch, self.spec)
-            # With `double` the acting network chooses the next actions: one pass over obs and next_obs serves both.
+            # With `double` the acting network chooses the next actions, so one pass covers obs and next_obs.
             tape = online.forward(inputs if settings.double else inputs[:size])
             values, next_values = on_host(tape.output), target.values(inputs[size:])
             best = (values[size:] if settings.double else next_values).argmax(1)
@@ -108,7 +108,7 @@ class Agent:
             self.versions[1] = self.updates
 
     def exploration_rate(self) -> float:
-        """The rate that s is now drawn from; 0 for the gradient methods."""
+        """The present scale of s; 0 for the gradient methods."""
         return 0.0 if self.config.feedback == "none" else schedules.exploration_rate(self.config.edl, self.updates)
 
     def finite(self) -> bool:
@@ -122,7 +122,7 @@ class Agent:
             return self.networks[0](x), self.networks[1](x)
 
     def state(self) -> dict[str, Any]:
-        """Everything that `load_state` needs; loads with weights_only."""
+        """The state for `load_state`; torch.load reads it with weights_only."""
         return {
             "networks": [network.flat.cpu().clone() for network in self.networks],
             "optimizers": [optimizer.state() for optimizer in self.optimizers],
@@ -133,7 +133,7 @@ class Agent:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Continue where `state` was taken."""
+        """Restore a state from `state`."""
         for network, flat in zip(self._networks, state["networks"], strict=True):
             network.load(flat)
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
@@ -149,7 +149,7 @@ class Agent:
         return schedules.learning_rate(self.config.learner, self.updates, self.config.planned_updates)
 
     def _count(self) -> bool:
-        """Count an update; True where the roles change after it."""
+        """Count an update; return True if the roles change after it."""
         self.updates += 1
         self.versions[self.acting] = self.updates
         settings = self.config.learner
@@ -169,7 +169,7 @@ def _device(name: str) -> torch.device:
 
 
 def _decay_vector(decay: tuple[float, ...], layout: Sequence[tuple[str, tuple[int, ...]]]) -> Tensor | None:
-    """lambda(i) of every parameter of a network's layout, float32 [P]; biases share their layer's."""
+    """lambda(i) of each parameter in a network's layout, float32 [P]; a bias has its layer's."""
     if not any(decay):
         return None
     layers = list(dict.fromkeys(name.rsplit(".", 1)[0] for name, _ in layout))

@@ -1,4 +1,4 @@
-"""Who of a run is there, by name: joins, farewells and liveliness tokens become events. Time comes in."""
+"""The run's members by name: joins, farewells and liveliness tokens become events. Time is an argument."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from collections.abc import Callable
 
 from common.messaging.messages.join import Join
 
-FORGOTTEN = 60.0  # seconds after which one that is lost is no longer missed
+FORGOTTEN = 60.0  # seconds after which a lost member is no longer listed as missing
 
 
 class Attendance:
-    """Names the members of a run; safe for threads.
+    """Names the members of a run and reports their coming and going; thread-safe.
 
     Args:
-        event: told each event, in words.
+        event: called with a line for each event.
     """
 
     def __init__(self, event: Callable[[str], None]) -> None:
         self._event = event
-        self._lock = threading.RLock()  # events come in the order in which things happen
+        self._lock = threading.RLock()  # keeps events in order
         self._names: dict[int, str] = {}
         self._leaving: set[int] = set()
         self._away: set[int] = set()
         self._roles: dict[int, str] = {}
-        self._lost: dict[int, float] = {}  # those away that nobody has replaced, and since when
+        self._lost: dict[int, float] = {}  # members away that no other has replaced, and since when
 
     def joined(self, request: Join, name: str) -> None:
-        """Note a join, the first of this process or one after a restart of the learner."""
+        """Note a join: the first of a process, or one after the learner's restart."""
         with self._lock:
             who = request.incarnation
             if who in self._names:
@@ -40,12 +40,12 @@ class Attendance:
             self._event(f"{self._names[who]} {'joined' if request.index < 0 else 'is back'}{listens}")
 
     def leaving(self, incarnation: int) -> None:
-        """Note that a process is about to end well."""
+        """Note that a process is about to end properly."""
         with self._lock:
             self._leaving.add(incarnation)
 
     def token(self, incarnation: int, there: bool, now: float) -> None:
-        """Note that the liveliness token of a process has come or gone."""
+        """Note that a process's liveliness token has appeared or disappeared."""
         with self._lock:
             name = self._names.get(incarnation)
             if name is None:
@@ -64,6 +64,6 @@ class Attendance:
                 self._event(f"{name} does not answer")
 
     def missing(self, now: float) -> list[str]:
-        """Names of those that are lost, and that no other of their role has replaced."""
+        """Names of the lost members that no other of their role has replaced."""
         with self._lock:
             return [self._names[who] for who, since in self._lost.items() if now - since < FORGOTTEN]

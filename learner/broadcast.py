@@ -1,4 +1,4 @@
-"""How the learner tells who acts: weights and role as broadcasts, and as answers to those who come late."""
+"""Broadcasts the weights and the acting role, and answers queries for them from late joiners."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from learner.agent import Agent
 
 
 class Broadcaster:
-    """Publishes the networks of an agent, and answers queries with what was published last."""
+    """Publishes an agent's networks and role, and answers queries with the values published last."""
 
     def __init__(self, node: Node, agent: Agent) -> None:
         self._node = node
@@ -24,7 +24,7 @@ class Broadcaster:
         node.serve(role_key(node), lambda message: self._answer(message, self._role))
 
     def publish(self) -> None:
-        """Broadcast the networks that changed since they were published, then the role."""
+        """Broadcast the networks that changed since their last broadcast, then the role."""
         agent, node = self._agent, self._node
         for number, version in enumerate(agent.versions):
             if version != self._published[number]:
@@ -35,7 +35,7 @@ class Broadcaster:
         self.publish_role()
 
     def publish_role(self) -> None:
-        """Broadcast who acts, and with which versions of the networks as they were published last."""
+        """Broadcast the acting role with the versions of the networks as published last."""
         agent, node = self._agent, self._node
         role = Role(agent.acting + 1, (self._published[0], self._published[1]), agent.updates)
         self._role = role.encode(node.run)

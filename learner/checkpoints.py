@@ -1,4 +1,4 @@
-"""The epochs of a distributed run: begun between two updates, written in a thread while training goes on."""
+"""Saves the epochs of a distributed run: begins them between two updates, writes them while training goes on."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from common.messaging.wire import Message
 from learner.records.epochs import complete_epochs, save_epoch
 from learner.shared_epochs import SharedEpochs
 
-PATIENCE = 5.0  # seconds that the replay service may take to answer
-PAUSE = 0.05  # seconds between questions
+PATIENCE = 5.0  # seconds to wait for the replay service's answer
+PAUSE = 0.05  # seconds between requests
 
 
 class Checkpoints:
     """Saves epochs, one at a time.
 
-    An epoch that can't be saved is given up, with one event, and the run goes on to the next.
+    If an epoch cannot be saved, one event says so, and the run continues without it.
 
     Args:
-        epochs: are told of those that are finished.
-        event: told the same in words.
+        epochs: notes the finished epochs.
+        event: called with a line for each epoch.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Checkpoints:
         self._writer: threading.Thread | None = None
 
     def begin(self, state: Callable[[], dict[str, Any]]) -> bool:
-        """Begin an epoch between two updates; False, and nothing done, while the last one is being written."""
+        """Begin an epoch between two updates; do nothing and return False while the last one is being written."""
         if self._writing():
             return False
         number, frozen = self._samples.pin(), state()
@@ -52,16 +52,16 @@ class Checkpoints:
         return True
 
     def save(self, state: dict[str, Any]) -> None:
-        """Save an epoch now and wait for it.
+        """Save an epoch and wait until it is written.
 
         Raises:
-            RunError: it could not be saved; says why.
+            RunError: it could not be saved; the message gives the reason.
         """
         self.wait()
         self._save(self._samples.pin(), state)
 
     def wait(self) -> None:
-        """Wait for the epoch that is being written, if there is one."""
+        """Wait for the epoch being written, if there is one."""
         if self._writer is not None:
             self._writer.join()
 
@@ -95,7 +95,7 @@ class Checkpoints:
             time.sleep(PAUSE)
 
     def _ask(self, question: bytearray) -> Message:
-        """Ask the replay service, which may be restarting, until it answers or `PATIENCE` is over."""
+        """Ask the replay service, which may be restarting, until it answers or `PATIENCE` seconds have passed."""
         deadline = time.monotonic() + PATIENCE
         while True:
             try:

@@ -1,4 +1,4 @@
-"""`coop-learner`: the head of a run, which everybody else asks."""
+"""`coop-learner`: the learner of a run, which all other roles join."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LearnerOptions(RunOptions):
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints to listen on; tcp/0.0.0.0:7447 opens the run to other machines."""
     restart: bool = False
-    """With --resume: begin the training anew where learner and replay service hold no epoch in common."""
+    """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
 
 
 def main() -> None:
@@ -64,7 +64,7 @@ def _run() -> None:
 
 
 def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path, stop: Stop) -> None:
-    """One run from its beginning, or from an epoch, to its end."""
+    """Train a run from its beginning, or from an epoch, to its end."""
     console = Console()
     held = whole_epochs(path) if options.resume else []
     if options.resume and not held:
@@ -102,5 +102,5 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
     print(summary, flush=True)
     if trainer.diverged:
         raise RunError(trainer.diverged)
-    if stop.failed or summary.exit == stop.reason:  # else the run was over before a signal came
+    if stop.failed or summary.exit == stop.reason:  # otherwise the run was complete before the signal
         stop.leave()

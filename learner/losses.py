@@ -1,4 +1,4 @@
-"""The TD error of a batch, its cost, and what of it goes back through the network. Numpy on the host: few numbers."""
+"""The TD errors of a batch, their loss, and the output error for the backward pass; in numpy, as they are few."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ Values = NDArray[np.float32]
 
 
 class Loss(Protocol):
-    """A cost of single TD errors."""
+    """A loss of single TD errors."""
 
     def cost(self, errors: Values) -> Values:
-        """The cost of each TD error, float32 [batch]."""
+        """The loss of each TD error, float32 [batch]."""
 
     def slope(self, errors: Values) -> Values:
-        """The derivative of the cost of each TD error, float32 [batch]."""
+        """The derivative of the loss at each TD error, float32 [batch]."""
 
 
 class SquaredError:
@@ -35,7 +35,7 @@ class SquaredError:
 
 
 class MeanSquaredError:
-    """e^2, as PyTorch's MSELoss: twice the slope of the squared error."""
+    """e^2, like PyTorch's MSELoss: its slope is twice that of the squared error."""
 
     def cost(self, errors: Values) -> Values:
         """See `Loss`."""
@@ -67,10 +67,10 @@ def td_errors(
 ) -> Values:
     """e[a] = y[a] - (r + gamma^k (1 - terminated) Q_target(x', best)) of the actions taken, float32 [batch].
 
-    k: the steps that a transition spans, 1 but for n-step returns.
+    k: the steps that a transition spans, 1 except for n-step returns.
 
-    values: y = Q(x), float32 [batch, actions]. next_values: Q_target(x'), likewise. best: int [batch], the next actions
-    whose values the targets take.
+    values: y = Q(x), float32 [batch, actions]. next_values: Q_target(x'), float32 [batch, actions]. best: int [batch],
+    the next actions at which the targets are evaluated.
     """
     rows = np.arange(len(batch))
     discounts = np.float32(gamma) ** batch.span * ~batch.terminated
@@ -79,10 +79,11 @@ def td_errors(
 
 
 def output_error(batch: Batch, slopes: Values, outputs: Values) -> Values:
-    """The gradient of the batch's mean weighted cost with respect to the outputs, float32 [batch, actions].
+    """The gradient of the batch's mean weighted loss with respect to the outputs, float32 [batch, actions].
 
-    slopes: float32 [batch], of each transition's cost; only the action taken has an entry that is not 0.
-    outputs: of the shape and the memory layout that the gradient gets.
+    Only the entries of the actions taken are not 0.
+
+    slopes: float32 [batch], of each transition's loss. outputs: an array of the result's shape and memory layout.
     """
     error = np.zeros_like(outputs)
     error[np.arange(len(batch)), batch.actions] = slopes * batch.weights / np.float32(len(batch))

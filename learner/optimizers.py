@@ -1,6 +1,6 @@
-"""Optimizers over one flat parameter: one call of each tensor operation for the whole network, and no bookkeeping.
+"""Optimizers over one flat parameter array: each tensor operation is called once for the whole network.
 
-With a small network, the bookkeeping of `torch.optim` costs more than its arithmetic; the arithmetic here is the same.
+With a small network, the bookkeeping of `torch.optim` costs more than its arithmetic, which is the same here.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from torch import Tensor
 from common.settings.config import LearnerSettings
 from learner.edl.arrays import Array, assign, namespace
 
-_TINY = 1e-37  # below any square that counts, above the denormals
+_TINY = 1e-37  # below any square that matters, above the denormals
 
 
 class Optimizer(ABC):
     """Moves parameters theta against their gradient g.
 
     theta, gradient: float32 [P], of PyTorch or numpy, read and written in place. buffers: running means by name,
-    float32 [P]. steps: taken.
+    float32 [P]. steps: number of steps taken.
     """
 
     def __init__(self, theta: Array, gradient: Array, *buffers: str) -> None:
         self.theta, self.gradient = theta, gradient
         self._xp = namespace(theta)
-        self._fused = self._xp is torch  # numpy has no operations that do two things in one pass
+        self._fused = self._xp is torch  # numpy has no fused operations
         self.buffers = {name: self._xp.zeros_like(gradient) for name in buffers}
         self._scratch = self._xp.zeros_like(gradient)
         self.steps = 0
@@ -40,18 +40,18 @@ class Optimizer(ABC):
     def _step(self, rate: float) -> None: ...
 
     def state(self) -> dict[str, Tensor | int]:
-        """What `load_state` needs; loads with weights_only."""
+        """The state for `load_state`; torch.load reads it with weights_only."""
         copies = {name: torch.as_tensor(buffer).cpu().clone() for name, buffer in self.buffers.items()}
         return {"steps": self.steps, **copies}
 
     def load_state(self, state: dict[str, Tensor | int]) -> None:
-        """Go on where `state` was taken."""
+        """Restore a state from `state`."""
         self.steps = int(state["steps"])
         for name, buffer in self.buffers.items():
             assign(buffer, torch.as_tensor(state[name]))
 
     def _average(self, name: str, decay: float) -> Array:
-        """Let a buffer follow g: x <- decay x + (1 - decay) g."""
+        """Update the running mean `name` of g: x <- decay x + (1 - decay) g."""
         buffer = self.buffers[name]
         if self._fused:
             return buffer.lerp_(self.gradient, 1 - decay)
@@ -60,7 +60,7 @@ class Optimizer(ABC):
         return buffer
 
     def _average_square(self, decay: float) -> Array:
-        """Let the buffer "square" follow g^2: v <- decay v + (1 - decay) g^2."""
+        """Update the running mean "square" of g^2: v <- decay v + (1 - decay) g^2."""
         square = self.buffers["square"]
         square *= decay
         if self._fused:
@@ -71,7 +71,7 @@ class Optimizer(ABC):
         return square
 
     def _descend(self, direction: Array, rate: float, denominator: Array | None = None) -> None:
-        """Let theta <- theta - rate direction / denominator, which may lie in the scratch memory."""
+        """theta <- theta - rate direction / denominator; both arguments may be in the scratch memory."""
         if denominator is None:
             self.theta -= self._xp.multiply(direction, rate, out=self._scratch)
         elif self._fused:
@@ -87,7 +87,7 @@ class Optimizer(ABC):
         return self._xp.subtract(square, scratch, out=scratch)
 
     def _root(self, square: Array) -> Array:
-        """sqrt(square) in the scratch memory; off 0 and denormals, whose roots take many times as long."""
+        """sqrt(square) in the scratch memory; avoids 0 and denormals, whose roots take many times as long."""
         scratch = self._xp.add(square, _TINY, out=self._scratch)
         return self._xp.sqrt(scratch, out=scratch)
 
@@ -109,9 +109,9 @@ class SGD(Optimizer):
 
 
 class RMSProp(Optimizer):
-    """PyTorch's: v <- alpha v + (1 - alpha) g^2;  u = g / (sqrt(v) + eps).
+    """PyTorch's RMSprop: v <- alpha v + (1 - alpha) g^2;  u = g / (sqrt(v) + eps).
 
-    Then theta <- theta - rate u; with momentum, m <- momentum m + u takes the place of u.
+    Then theta <- theta - rate u; with momentum, m <- momentum m + u replaces u.
     """
 
     def __init__(self, theta: Array, gradient: Array, alpha: float, eps: float, momentum: float) -> None:
@@ -131,10 +131,10 @@ class RMSProp(Optimizer):
 
 
 class MnihRMSProp(Optimizer):
-    """Mnih et al. 2015: centred, with eps inside the root.
+    """The RMSProp of Mnih et al. 2015: centred, with eps inside the square root.
 
     m <- gradient_alpha m + (1 - gradient_alpha) g;  v <- alpha v + (1 - alpha) g^2;
-    theta <- theta - rate g / sqrt(max(v - m^2, 0) + eps). The variance v - m^2 is never negative where both constants
+    theta <- theta - rate g / sqrt(max(v - m^2, 0) + eps). The variance v - m^2 is never negative if both constants
     are equal, as theirs are.
     """
 
@@ -180,7 +180,7 @@ def make_optimizer(settings: LearnerSettings, theta: Array, gradient: Array) -> 
         case "rmsprop":
             return RMSProp(theta, gradient, alpha, eps, momentum)
         case "rmsprop-mnih":
-            # Mnih's gradients are sums over the batch, these are means; the update notices by eps alone.
+            # Mnih's gradients are sums over the batch, these are means; this affects the update only through eps.
             return MnihRMSProp(theta, gradient, alpha, eps / settings.batch_size**2, settings.gradient_alpha)
         case "adam":
             return Adam(theta, gradient, (settings.beta1, settings.beta2), eps)

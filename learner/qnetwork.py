@@ -1,4 +1,4 @@
-"""A Q-network as training sees it, wherever its arrays live: PyTorch or numpy, float32 or with a copy in bfloat16."""
+"""A Q-network for training in PyTorch or numpy, in float32 or with a copy in bfloat16."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 
 class QNetwork:
-    """One network with the passes that an update is made of.
+    """One network with the passes of an update.
 
     The parameters are float32. With network.dtype "bfloat16", target values and the passes of the gradient methods run
     on a copy in bfloat16; error-driven feedback needs the accuracy of float32.
 
     Args:
         network: the parameters, also published and saved. half: a copy in bfloat16, or None.
-        rng: what chance there is in the feedback.
+        rng: random numbers of the feedback.
 
     Attributes:
-        theta, gradient: float32 [P], of PyTorch or numpy; the optimizer moves one along the other.
+        theta, gradient: float32 [P], of PyTorch or numpy, for the optimizer.
     """
 
     def __init__(
@@ -53,25 +53,25 @@ class QNetwork:
         self.theta, self.gradient = self._trained.theta, self._trained.gradient
 
     def inputs(self, batch: Batch, spec: EnvSpec) -> Array:
-        """What both networks of a run take for a batch: [2 batch, *input], obs first, then next_obs."""
+        """The input of both networks for a batch: [2 batch, *input], obs first, then next_obs."""
         index = np.concatenate((batch.obs_index, batch.next_index)).reshape(-1)
         if self._trained.in_numpy:
             return batch.frames.take(index, axis=0)
         device = self.network.flat.device
-        # Copies: arrays from the wire are read-only, and PyTorch warns of viewing those.
+        # Copies, because arrays from the wire are read-only and PyTorch warns about views of those.
         frames, places = torch.tensor(batch.frames, device=device), torch.tensor(index, device=device)
         return preprocess(frames.index_select(0, places).view(-1, *spec.obs_shape), spec)
 
     def forward(self, inputs: Array) -> Tape:
-        """A pass that `backward` can follow."""
+        """Run a forward pass and record its activations for `backward`."""
         return self._forward(self._source.cast(inputs))
 
     def values(self, inputs: Array) -> NDArray[np.float32]:
-        """Q-values as targets take them, float32 [batch, actions] on the host."""
+        """Q-values for the targets, float32 [batch, actions] on the CPU."""
         return on_host(self._values(self._target.cast(inputs)))
 
     def backward(self, tape: Tape, output_error: NDArray[np.float32], s: float) -> None:
-        """Write the gradient that the feedback makes of an output error, float32 [batch, actions], into `gradient`."""
+        """Compute `gradient` from an output error, float32 [batch, actions], through the method's feedback."""
         self._backward(tape, self._source.cast(output_error), s, self._source.gradients)
         if self._source is not self._trained:
             assign(self.gradient, self._source.gradient)
@@ -86,7 +86,7 @@ class QNetwork:
         self.changed()
 
     def changed(self) -> None:
-        """Bring the copy in bfloat16 up to date; call after theta was written."""
+        """Update the copy in bfloat16; call after changing theta."""
         if self._half is not None:
             self._half.load(self.network.flat)
 
@@ -94,7 +94,7 @@ class QNetwork:
 def make_network(
     config: RunConfig, spec: EnvSpec, number: int, device: torch.device, dtype: torch.dtype = torch.float32
 ) -> FlatNetwork:
-    """Network 0 or 1 of a run as it starts; the same one for both where the method has one and a copy."""
+    """Make network 0 or 1 with its initial parameters; they are equal if the second network is a copy."""
     seed = int(np.random.SeedSequence([config.seed, number if config.two_networks else 0]).generate_state(1)[0])
     return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
 
@@ -102,14 +102,14 @@ def make_network(
 def make_q_network(
     config: RunConfig, spec: EnvSpec, number: int, device: torch.device, rng: np.random.Generator
 ) -> QNetwork:
-    """Network 0 or 1 of a run as it starts, ready to be trained."""
+    """Make network 0 or 1 with its initial parameters, for training."""
     in_half = config.network.dtype == "bfloat16"
     half = make_network(config, spec, number, device, torch.bfloat16) if in_half else None
     return QNetwork(make_network(config, spec, number, device), half, config, rng)
 
 
 def on_host(values: Array) -> NDArray[np.float32]:
-    """Values of either library as numpy's, float32."""
+    """Convert values of either library to a float32 numpy array."""
     return values.float().cpu().numpy() if isinstance(values, Tensor) else values
 
 

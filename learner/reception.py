@@ -1,4 +1,4 @@
-"""The learner's answers to those who join and to those who leave."""
+"""The learner's answers to roles that join or leave."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from learner.shared_epochs import SharedEpochs
 
 
 class Departure:
-    """A replay service that was told to stop, and that stays until what it holds has been saved; safe for threads."""
+    """The departure of a replay service that stops but stays until its data have been saved; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -37,32 +37,32 @@ class Departure:
             return self._asked is not None and self._asked != self._granted
 
     def ask(self, incarnation: int) -> bool:
-        """Note that a replay service wants to leave; True once it may."""
+        """Note that a replay service wants to leave; return True once it may."""
         with self._lock:
             self._asked = incarnation
             return self._over or self._granted == incarnation
 
     def grant(self) -> None:
-        """Let the one that has asked go: what there was to save is saved."""
+        """Permit the replay service that has asked to leave: its data are saved."""
         with self._lock:
             self._granted = self._asked
 
     def end(self) -> None:
-        """Let everybody go from now on: the run is over."""
+        """Permit every departure from now on: the run is over."""
         with self._lock:
             self._over = True
 
 
 class Reception:
-    """Answers join requests and farewells, and remembers where the replay service listens.
+    """Answers requests to join or leave, and remembers where the replay service listens.
 
     Args:
-        epochs: tell which epoch the run goes on from.
-        event: told who comes and goes, in words.
+        epochs: determine the epoch from which the run continues.
+        event: called with a line when a member comes or goes.
 
     Attributes:
-        attendance: who is there, by name.
-        departure: the replay service's, if it wants to leave.
+        attendance: the members by name.
+        departure: of the replay service, if it wants to leave.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Reception:
         self._roster = roster
         self._replay_endpoints: list[str] = []
         self._replay: Origin | None = None
-        for key in {join_key(node, role) for role in JOINING}:  # each answered by a thread of its own
+        for key in {join_key(node, role) for role in JOINING}:  # each with its own thread
             node.serve(key, partial(self._answer, key))
 
     def _answer(self, key: str, message: Message) -> bytearray:
@@ -100,7 +100,7 @@ class Reception:
         try:
             if request.role == "actor":
                 index = self._roster.actor(request)
-            elif request.role == "replay" and request.endpoints:  # one without them only asks which run this is
+            elif request.role == "replay" and request.endpoints:  # without endpoints it only asks which run this is
                 index = self._admit(request)
                 epoch, anew = self._epochs.offered(request)
         except Occupied as other:
@@ -122,7 +122,7 @@ class Reception:
         return joined.answer()
 
     def _admit(self, request: Join) -> int:
-        """The number of the replay service that serves, and to which actors are sent; raises as `Roster.replay`."""
+        """Admit a replay service, and send actors to it; return its number. Raises as `Roster.replay`."""
         there = {int(incarnation, 16) for incarnation in self._node.presence.members("replay")}
         index = self._roster.replay(request, time.monotonic(), there)
         self._replay_endpoints, self._replay = request.endpoints, request.origin

@@ -1,6 +1,6 @@
-"""Who has joined a run: numbers that are given once, and the one replay service that serves.
+"""The members that have joined a run: numbers that are given once, and the single active replay service.
 
-Time comes in as an argument. A roster outlives its learner: what it decides is on disk before anybody hears of it.
+Time is an argument. A roster outlives its learner: every decision is on disk before any process learns of it.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ ROSTER = "roster.json"
 
 
 class Occupied(RunError):
-    """Another replay service serves this run, or may still believe that it does."""
+    """Another replay service serves this run, or may still be serving it."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Entries:
-    """What is on disk.
+    """The roster's state on disk.
 
-    actors, replays: how many numbers have been given. serving: incarnation of the replay service that serves, which
-    has the last number; -1 before the first. host, pid: where it runs.
+    actors, replays: how many numbers have been given. serving: incarnation of the active replay service, which
+    has the last number; -1 before the first. host, pid: of that service.
     """
 
     actors: int = 0
@@ -41,17 +41,17 @@ class _Entries:
 
 
 class Roster:
-    """Numbers the members of a run, and admits one replay service at a time; safe for threads.
+    """Numbers the members of a run, and admits one replay service at a time; thread-safe.
 
-    A replay service that hears nothing from the learner for `LEASE` seconds stops acknowledging. So once the learner
+    A replay service that receives nothing from the learner for `LEASE` seconds stops acknowledging. So once the learner
     has not confirmed it for that long, and its liveliness token is gone, another one may take over.
 
     Args:
-        folder: where the roster is kept and found again; nowhere if not given.
-        now: seconds; for all that is known, the replay service admitted last has been confirmed just before.
+        folder: where the roster is saved; it is not saved if None.
+        now: seconds; the learner must assume that the last replay service was confirmed just before.
 
     Raises:
-        RunError: the file there can't be read.
+        RunError: the file in `folder` cannot be read.
     """
 
     def __init__(self, folder: Path | None = None, now: float = 0.0) -> None:
@@ -59,7 +59,7 @@ class Roster:
         self._lock = threading.Lock()
         self._entries = _Entries()
         self._confirmed = now
-        self._actors: dict[int, int] = {}  # numbers of those that this learner has met, by incarnation
+        self._actors: dict[int, int] = {}  # numbers of the actors known to this learner, by incarnation
         try:
             if self._path is not None and self._path.exists():
                 self._entries = _Entries(**json.loads(self._path.read_text(encoding="utf-8")))
@@ -68,15 +68,15 @@ class Roster:
 
     @property
     def serving(self) -> int:
-        """Incarnation of the replay service that serves; -1 before the first."""
+        """Incarnation of the active replay service; -1 before the first."""
         return self._entries.serving
 
     def actor(self, request: Join) -> int:
-        """The number of an actor: its own one again, or a new one.
+        """The number of an actor: its earlier one, or a new one.
 
         Raises:
-            BadMessage: a number that nobody has been given.
-            RunError: the roster can't be kept.
+            BadMessage: it claims a number that no actor was given.
+            RunError: the roster cannot be saved.
         """
         with self._lock:
             if request.index >= self._entries.actors:
@@ -89,13 +89,13 @@ class Roster:
             return self._actors[request.incarnation]
 
     def replay(self, request: Join, now: float, there: Collection[int]) -> int:
-        """The number of a replay service, which may serve for another `LEASE` seconds from now on.
+        """The number of a replay service, which may serve for another `LEASE` seconds.
 
-        there: incarnations of the replay services whose liveliness tokens are there.
+        there: incarnations of the replay services whose liveliness tokens exist.
 
         Raises:
-            Occupied: another one serves, or may still believe that it does.
-            RunError: another one has taken over from this one, or the roster can't be kept.
+            Occupied: another one serves, or may still be serving.
+            RunError: another one has taken over from this one, or the roster cannot be saved.
         """
         with self._lock:
             entries = self._entries
@@ -111,13 +111,13 @@ class Roster:
             return self._entries.replays - 1
 
     def dismiss(self, incarnation: int) -> None:
-        """Note that a replay service acknowledges nothing any more: another one may follow as soon as it is gone."""
+        """Note that a replay service has stopped acknowledging: another one may follow as soon as it is gone."""
         with self._lock:
             if incarnation == self._entries.serving:
                 self._confirmed = -math.inf
 
     def _keep(self, entries: _Entries) -> None:
-        """Go on with these once they are on disk; raises RunError."""
+        """Save the entries and then use them; raises RunError."""
         if self._path is not None:
             try:
                 write_whole(self._path, json.dumps(asdict(entries)).encode())

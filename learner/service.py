@@ -1,4 +1,4 @@
-"""Carries a trainer's effects out in a distributed run: draws, broadcasts, files; and how a run ends."""
+"""Runs a trainer in a distributed run: draws batches, broadcasts weights, writes files, and ends the run."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from learner.records.summary import Summary, summarise
 from learner.trainer import Effects, Trainer
 
 STATUS_EVERY = 0.5  # seconds
-REPLAY_BACK = 30.0  # seconds that a replay service may be away when the run is complete
-FAREWELL = 5.0  # seconds that the others get to leave
+REPLAY_BACK = 30.0  # seconds to wait for an absent replay service when the run is complete
+FAREWELL = 5.0  # seconds for the other roles to leave
 
 
 class LearnerService:
     """Trains from a replay service until the run is complete or stopped.
 
     Args:
-        trainer: new, or set back to an epoch like the samples.
+        trainer: new, or restored from the same epoch as the samples.
     """
 
     def __init__(
@@ -63,10 +63,10 @@ class LearnerService:
         node.presence.on_change(self._look_round)
 
     def run(self) -> Summary:
-        """Train to the end; the summary, as it is on disk.
+        """Train to the end; return the summary that was saved.
 
         Raises:
-            CoopError: the replay service found a request bad, gave an answer that is not one, or could not save itself.
+            CoopError: the replay service rejected a request, gave an invalid answer, or could not save its state.
         """
         outcome = ""
         try:
@@ -83,7 +83,7 @@ class LearnerService:
         return summary
 
     def _turn(self) -> None:
-        """One update, if there is a batch."""
+        """Do one update if a batch is available."""
         trainer = self._trainer
         got = self._samples.next()
         if got is not None:
@@ -107,7 +107,7 @@ class LearnerService:
         self._directory.record(effects.episodes, effects.metrics)
 
     def _tell(self) -> None:
-        """Publish the status that displays show, and the role once more for those who missed it."""
+        """Publish the status for displays, and repeat the role for actors that missed it."""
         now, telemetry = time.monotonic(), self._trainer.telemetry
         then, updates, speed = self._speed
         if now - then >= STATUS_EVERY:
@@ -143,13 +143,13 @@ class LearnerService:
         }
 
     def _look_round(self, incarnation: int, there: bool) -> None:
-        """Say at once who has come or gone: the loop may be waiting for one of them."""
+        """Report at once that a member has come or gone: the loop may be waiting for it."""
         self._reception.attendance.token(incarnation, there, time.monotonic())
         if self._status:
             self._node.publish_status({**self._status, **self._members()})
 
     def _save_for_departure(self) -> None:
-        """Save an epoch for the replay service that waits for it before it leaves."""
+        """Save an epoch for a replay service that waits for it before leaving."""
         try:
             if self._agent.updates and self._trainer.sound():
                 self._checkpoints.save(self._state())
@@ -159,7 +159,7 @@ class LearnerService:
             self._reception.departure.grant()
 
     def _save(self) -> None:
-        """Save the closing epoch, unless nothing was learned, the agent diverged or the replay service is gone."""
+        """Save the closing epoch, unless there was no update, the agent diverged or the replay service is gone."""
         if not self._agent.updates or not self._trainer.sound():
             return
         deadline = time.monotonic() + (0 if self._stop.is_set() else REPLAY_BACK)
@@ -170,7 +170,7 @@ class LearnerService:
         self._checkpoints.save(self._state())
 
     def _finish(self, outcome: str) -> Summary:
-        """Collect the last counters, write the summary, and send everybody home."""
+        """Collect the final counters, write the summary, and stop the other roles."""
         self._reception.departure.end()
         try:
             stats = self._replay_stats()
@@ -201,7 +201,7 @@ class LearnerService:
         }
 
     def _farewell(self, outcome: str) -> None:
-        """Announce the stop until the other roles have gone, or their time is up."""
+        """Announce the stop until the other roles have gone or `FAREWELL` seconds have passed."""
         deadline = time.monotonic() + FAREWELL
         while time.monotonic() < deadline:
             self._node.announce(stop_key(self._node), EndOfRun.because(outcome).encode(self._node.run))

@@ -1,4 +1,4 @@
-"""The epochs that learner and replay service both hold; a resumed run goes on from the newest of them."""
+"""The epochs that learner and replay service both hold; a resumed run continues from the newest."""
 
 from __future__ import annotations
 
@@ -10,22 +10,21 @@ from common.messaging.messages.join import Join
 from common.process.lifecycle import Stop
 
 LOOK_EVERY = 0.1  # seconds
-REFUSAL = 0.5  # seconds that the refusal gets to reach the replay service before this process leaves
+REFUSAL = 0.5  # seconds for the refusal to reach the replay service before this process ends
 
 
 class SharedEpochs:
-    """Which epochs a run can go on from.
+    """Determines the epoch from which a run continues.
 
-    Where it goes on is decided once: when the replay service has told what it holds, at once where the learner holds
-    none.
+    This is decided once: when the replay service has announced its epochs, or at once if the learner has none.
 
     Args:
-        held: numbers of the learner's whole epochs.
-        run: the run directory, for the words of a refusal.
-        restart: begin anew where no epoch is held by both.
+        held: numbers of the learner's intact epochs.
+        run: the run directory, for the message of a refusal.
+        restart: start from the beginning if no epoch is held by both.
 
     Attributes:
-        newest: number of the newest one; 0 if there is none, or while it is not decided.
+        newest: number of the newest shared epoch; 0 if there is none, or before the decision.
     """
 
     def __init__(self, held: Sequence[int], run: str, *, restart: bool = False) -> None:
@@ -34,13 +33,13 @@ class SharedEpochs:
         self._run = run
         self._restart = restart
         self._problem = ""
-        self._began_anew = -1  # incarnation of the replay service that was told to
+        self._began_anew = -1  # incarnation of the replay service that was told to start from the beginning
         self._decided = threading.Event()
         if not held:
             self._decided.set()
 
     def offered(self, request: Join) -> tuple[int, bool]:
-        """Answer a replay service that joins: the epoch to restore, and whether to begin anew.
+        """Answer a joining replay service: the epoch to restore, and whether to start from the beginning.
 
         Raises:
             RunError: no epoch is held by both.
@@ -53,11 +52,11 @@ class SharedEpochs:
         return self.newest, request.incarnation == self._began_anew
 
     def finished(self, number: int) -> None:
-        """Note a new one."""
+        """Note a newly finished epoch."""
         self.newest = number
 
     def wait(self, stop: Stop) -> int | None:
-        """Wait until it is decided; the epoch to go on from, 0 for a beginning, None where the stop came first.
+        """Wait for the decision: the epoch to continue from, 0 for the beginning, None if a stop was requested first.
 
         Raises:
             RunError: no epoch is held by both.
@@ -71,7 +70,7 @@ class SharedEpochs:
         return self.newest
 
     def _decide(self, request: Join) -> None:
-        # Who serves already has the table in memory, and a table that is ahead of the learner does no harm.
+        # A service that is already serving has its table in memory; a table ahead of the learner does no harm.
         both = set(self._held) if request.serving else set(self._held) & set(request.epochs)
         if both:
             self.newest = max(both)

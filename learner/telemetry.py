@@ -1,4 +1,4 @@
-"""What is measured over the updates of an interval, and the episodes' running return. Pure: time comes in."""
+"""Metrics over the updates of an interval, and the running return of episodes; time is an argument."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FIXED_STATES = 256
 
 
 class Telemetry:
-    """Collects from each update what one row of metrics.jsonl says of an interval.
+    """Collects from each update the values for a row of metrics.jsonl.
 
     returns: of the last 100 episodes. fixed: the first 256 states drawn, on which Q1 and Q2 are compared.
     largest_reward: the largest |reward| of all batches. q_abs_mean: mean |Q| of both networks over `fixed` at the last
@@ -41,12 +41,12 @@ class Telemetry:
             self._fix(batch, agent)
         self._errors.append(update.td_errors)
         self.largest_reward = max(self.largest_reward, float(np.abs(batch.rewards).max()))
-        # Copies: the arrays may be views that would keep a whole message alive.
+        # Copies, because views would keep a whole message alive.
         lag = agent.updates - batch.param_version
         self._batches.append((batch.age.copy(), batch.reuse.copy(), lag, batch.ids.copy()))
 
     def row(self, agent: Agent, drawn: Drawn, epsilon: float, now: float) -> dict[str, Any]:
-        """The metrics of the updates since the last row; at least one."""
+        """The metrics of the updates since the last row, of which there must be at least one."""
         errors = np.concatenate(self._errors)
         age, reuse, lag = (np.concatenate([arrays[i] for arrays in self._batches]) for i in range(3))
         distinct = sum(len(np.unique(ids)) for *_, ids in self._batches)
@@ -83,19 +83,19 @@ class Telemetry:
         }
 
     def q_bound(self, agent: Agent) -> float | None:
-        """The largest |Q| that the rewards seen allow, (largest |reward|) / (1 - gamma); None where gamma is 1."""
+        """The largest possible |Q|, (largest |reward| seen) / (1 - gamma); None if gamma is 1."""
         gamma = agent.config.learner.gamma
         return self.largest_reward / (1 - gamma) if gamma < 1 else None
 
     def warning(self, agent: Agent) -> str:
-        """That mean |Q| exceeds its bound, in words; empty while it does not."""
+        """A warning that mean |Q| exceeds its bound; empty if it does not."""
         bound = self.q_bound(agent)
         if bound is None or self.q_abs_mean <= bound:
             return ""
         return f"mean |Q| is {self.q_abs_mean:.4g}, above {bound:.4g}, the largest that the rewards seen allow"
 
     def state(self) -> dict[str, Any]:
-        """What `load_state` needs; loads with weights_only."""
+        """The state for `load_state`; torch.load reads it with weights_only."""
         fixed = None if self.fixed is None else torch.from_numpy(self.fixed.copy())
         return {
             "returns": list(self.returns),
@@ -105,14 +105,14 @@ class Telemetry:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on where `state` was taken."""
+        """Restore a state from `state`."""
         self.returns.extend(state["returns"])
         self.episodes = state["episodes"]
         self.fixed = None if state["fixed"] is None else state["fixed"].numpy()
         self.largest_reward = state.get("largest_reward", 0.0)
 
     def episode(self, episode_return: float) -> int:
-        """Note a finished episode; its number, from 0."""
+        """Note a finished episode; return its number, from 0."""
         self.returns.append(episode_return)
         self.episodes += 1
         return self.episodes - 1
@@ -134,9 +134,9 @@ class Telemetry:
 
 
 def reuse_histogram(reuse: NDArray[np.integer[Any]]) -> list[int]:
-    """Samples by how often each had been drawn, this draw included (at least 1): once, 2 to 3 times, 4 to 7, 8 to 15...
+    """Count samples by how often each has been drawn, including this draw: once, 2 to 3 times, 4 to 7, 8 to 15...
 
-    Entry b counts those drawn 2^b to 2^(b + 1) - 1 times; the last entry is not 0.
+    reuse: int [batch], at least 1. Entry b counts samples drawn 2^b to 2^(b + 1) - 1 times; the last is not 0.
     """
     counts: list[int] = np.bincount(np.frexp(reuse)[1] - 1).tolist()
     return counts

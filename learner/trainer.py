@@ -1,7 +1,7 @@
-"""What a learner does with a batch, decided without I/O: time comes in as an argument, effects go out as values.
+"""The training loop without I/O: batches and the time are arguments, effects are return values.
 
-Distributed runs and lockstep runs drive the same trainer; what differs is where batches come from and how the effects
-are carried out.
+Distributed and lockstep runs use the same trainer; they differ in where batches come from and how the effects are
+carried out.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NOTHING_DRAWN = Drawn(0, 0, 0, 0, 0, 0, ())
 
 
 class EpisodeRow(NamedTuple):
-    """One finished episode, as it is written down: its number, what the actor told, updates done, rate of s."""
+    """One finished episode for episodes.csv: its number, the actor's record, updates done, and the scale of s."""
 
     number: int
     record: EpisodeRecord
@@ -36,11 +36,11 @@ class EpisodeRow(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """What follows from one batch.
+    """The effects of one batch, for the caller to carry out.
 
-    broadcast: the networks and the role are to be sent to the actors.
-    priorities: float32 [batch], new priorities of the batch's transitions; None where sampling does not ask for them.
-    episodes: to be written down. metrics: the row of an interval that ends here.
+    broadcast: send the networks and the role to the actors.
+    priorities: float32 [batch], new priorities of the batch's transitions; None if the table does not use them.
+    episodes: rows for episodes.csv. metrics: the row of an interval that ends here, or None.
     """
 
     broadcast: bool = False
@@ -50,14 +50,14 @@ class Effects:
 
 
 class Trainer:
-    """Trains an agent and keeps the run's account.
+    """Trains an agent, and keeps the run's counters and metrics.
 
     Args:
         now: seconds of a monotonic clock, here and below.
 
     Attributes:
-        drawn: the counters of the replay side as told last, without episodes.
-        diverged: what is no longer finite, in words; empty while all is.
+        drawn: the replay side's counters as last received, without episodes.
+        diverged: which values are no longer finite, in words; empty if all are finite.
     """
 
     def __init__(self, agent: Agent, now: float) -> None:
@@ -70,7 +70,7 @@ class Trainer:
         self._next_epoch = agent.updates + self._epoch_every
 
     def train(self, batch: Batch, drawn: Drawn, now: float) -> Effects:
-        """Update the acting network from a batch; `drawn` came with it."""
+        """Update the acting network from a batch, with the counters and episodes in `drawn`."""
         agent = self.agent
         update = agent.update(batch)
         self.telemetry.add(agent, batch, update)
@@ -87,11 +87,11 @@ class Trainer:
         )
 
     def note(self, drawn: Drawn) -> Effects:
-        """Take in counters and episodes that came without a batch."""
+        """Process counters and episodes that arrived without a batch."""
         return Effects(episodes=self._book(drawn))
 
     def outcome(self) -> str:
-        """Why the run is over; empty while it goes on."""
+        """Why the run is over; empty while it continues."""
         config, agent, telemetry = self.config, self.agent, self.telemetry
         if self.diverged:
             return self.diverged
@@ -107,33 +107,33 @@ class Trainer:
         return ""
 
     def trained_out(self) -> bool:
-        """True once every planned update is done: no batch will tell of the steps that are still to come."""
+        """True once every planned update is done, so that no further batch brings the counters of the last steps."""
         return 0 < self.drawn.planned <= self.agent.updates
 
     def epoch_due(self) -> bool:
-        """True where an epoch is to be begun now; it stays due until `epoch_begun`."""
+        """True if an epoch should begin now; it stays due until `epoch_begun`."""
         return self.agent.updates >= self._next_epoch and self.sound()
 
     def epoch_begun(self) -> None:
-        """Count from here to the next epoch."""
+        """Count updates to the next epoch from here."""
         self._next_epoch = self.agent.updates + self._epoch_every
 
     def sound(self) -> bool:
-        """True while the agent may be saved: a state that diverged is no state to go on from."""
+        """True while the agent may be saved; a diverged state must not be resumed."""
         if not self.diverged and not self.agent.finite():
             self.diverged = f"diverged: parameters are not finite at update {self.agent.updates}"
         return not self.diverged
 
     def epsilon(self) -> float:
-        """The actors' epsilon after the steps told last."""
+        """The actors' epsilon at the environment steps last received."""
         return schedules.epsilon(self.config.actor, self.drawn.inserted)
 
     def seconds(self, now: float) -> float:
-        """How long the run has gone on, over all its resumptions."""
+        """Seconds that the run has taken, over all its resumptions."""
         return now - self._began
 
     def state(self, now: float) -> dict[str, Any]:
-        """Everything that `load_state` needs; loads with weights_only."""
+        """The state for `load_state`; torch.load reads it with weights_only."""
         return {
             "agent": self.agent.state(),
             "telemetry": self.telemetry.state(),
@@ -142,7 +142,7 @@ class Trainer:
         }
 
     def load_state(self, state: dict[str, Any], now: float) -> None:
-        """Go on where `state` was taken."""
+        """Restore a state from `state`."""
         self.agent.load_state(state["agent"])
         self.telemetry.load_state(state["telemetry"])
         self.drawn = Drawn(**state["drawn"], episodes=())
@@ -154,13 +154,13 @@ class Trainer:
         return self.config.checkpoint_every or math.inf
 
     def _book(self, drawn: Drawn) -> list[EpisodeRow]:
-        """Keep the counters, and number the episodes."""
+        """Store the counters, and number the episodes."""
         self.drawn = msgspec.structs.replace(drawn, episodes=()) if drawn.episodes else drawn
         number, updates, s = self.telemetry.episode, self.agent.updates, self.agent.exploration_rate()
         return [EpisodeRow(number(record.end.episode_return), record, updates, s) for record in drawn.episodes]
 
     def _metrics(self, now: float) -> dict[str, Any] | None:
-        """The row of the interval that ends here; none where the agent's values are not finite."""
+        """The row of the interval that ends here, or None if the agent's values are not finite."""
         row = self.telemetry.row(self.agent, self.drawn, self.epsilon(), now)
         bad = [name for name, value in row.items() if isinstance(value, float) and not math.isfinite(value)]
         if bad and not self.diverged:

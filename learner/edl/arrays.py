@@ -1,6 +1,6 @@
-"""Arithmetic that is written once and runs on PyTorch tensors and on numpy arrays.
+"""Arithmetic that runs both on PyTorch tensors and on numpy arrays.
 
-numpy is for small networks on the host, where a call of PyTorch costs more than what it computes.
+numpy is for small networks on the CPU, where calling PyTorch costs more than the computation.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ Namespace = Any  # torch or numpy
 
 
 def namespace(array: Array) -> Namespace:
-    """The library of `array`: torch or numpy. Of it, only what both name and mean alike may be used."""
+    """The library of `array`, torch or numpy; use only functions that both have with the same name and meaning."""
     return torch if isinstance(array, torch.Tensor) else np
 
 
 def like(values: Array, array: Array) -> Array:
-    """`values`, of either library, in the library, dtype and device of `array`; without a copy where that is so."""
-    if isinstance(values, torch.Tensor) and values.dtype == torch.bfloat16:  # which numpy does not know
+    """Convert `values`, of either library, to the library, dtype and device of `array`, without a needless copy."""
+    if isinstance(values, torch.Tensor) and values.dtype == torch.bfloat16:  # numpy lacks bfloat16
         values = values.float()
     return namespace(array).asarray(values, dtype=array.dtype, device=array.device)
 

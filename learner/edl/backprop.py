@@ -16,12 +16,12 @@ Parametrised = nn.Linear | nn.Conv2d
 
 
 class UnsupportedLayerError(ValueError):
-    """A network holds something that is neither Linear, Conv2d, ReLU nor Flatten; the message names it."""
+    """A network contains a layer other than Linear, Conv2d, ReLU and Flatten; the message names it."""
 
 
 @dataclass(slots=True)
 class Tape:
-    """What one forward pass leaves behind for the backward passes.
+    """The activations of one forward pass, for the backward passes.
 
     output: [batch, actions]. inputs: the input of each step of the chain, [batch, *shape], images channels last.
     """
@@ -34,25 +34,25 @@ class Tape:
         return Tape(self.output[:batch], [x[:batch] for x in self.inputs])
 
     def output_of(self, index: int) -> Array:
-        """The output of step `index`: [batch, *shape]; after a ReLU that follows, its shape and sign still hold."""
+        """The output of step `index`: [batch, *shape]; if a ReLU follows, only its shape and sign are valid."""
         return self.inputs[index + 1] if index + 1 < len(self.inputs) else self.output
 
 
 class Chain:
-    """The steps of a network, checked once, and the products that backpropagation is made of.
+    """The steps of a network, checked once, and the products of backpropagation.
 
     names: prefix of the parameters' names of each step. parametrised: indices of the Linear and Conv2d steps.
     """
 
     def __init__(self, network: nn.Module) -> None:
-        """Raises UnsupportedLayerError for any other layer, and for options of a known one that are not handled."""
+        """Raise UnsupportedLayerError for any other layer, and for unsupported options of a known one."""
         leaves = list(_leaves(network, ""))
         for name, step in leaves:
             _check(name.rstrip("."), step)
         self.names = [name for name, _ in leaves]
         self._steps = [step for _, step in leaves]
         self._functions = layer_functions(self._steps)
-        # Module attribute look-ups cost as much as a small product, so the parameters are held here.
+        # Looking up a module's attribute costs as much as a small product, so the parameters are kept here.
         self._weights = [step.weight if isinstance(step, Parametrised) else None for step in self._steps]
         self._biases = [step.bias if isinstance(step, Parametrised) else None for step in self._steps]
         self.parametrised = [i for i, weight in enumerate(self._weights) if weight is not None]
@@ -61,7 +61,7 @@ class Chain:
 
     @property
     def output_weight(self) -> Tensor | None:
-        """The weight [actions, n] of the last step, None where that is not Linear."""
+        """The weight [actions, n] of the last step, None if that is not Linear."""
         return self._weights[-1] if isinstance(self._steps[-1], nn.Linear) else None
 
     def forward(self, x: Tensor) -> Tape:
@@ -76,13 +76,13 @@ class Chain:
         return Tape(x, inputs)
 
     def walk(self, tape: Tape, cotangent: Tensor, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Tensor]]:
-        """Send cotangents of the output down to every pre-activation: (step, [b, k, *output of step]), last first.
+        """Propagate cotangents of the output to every pre-activation: (step, [b, k, *output of step]), last first.
 
         cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
-        share, and then stays 1 until a ReLU tells samples apart. dtype: what to compute in, the network's if None.
+        share, and then stays 1 until a ReLU makes samples differ. dtype: of the computation, the network's if None.
         """
         rows = cotangent
-        fresh = False  # whether rows is ours to overwrite
+        fresh = False  # whether `rows` may be overwritten
         first = self.parametrised[0]
         for index in range(len(self._steps) - 1, first - 1, -1):
             step, weight, h = self._steps[index], self._weights[index], tape.inputs[index]
@@ -136,7 +136,7 @@ class Chain:
 
 
 def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:
-    """Cotangents [b, k, *shape] of a ReLU's output, whose value is `activation` [batch, *shape], at its input."""
+    """Propagate cotangents [b, k, *shape] through a ReLU whose output is `activation` [batch, *shape]."""
     if rows.shape[1] == 1:
         masked: Tensor = torch.ops.aten.threshold_backward(rows, activation.unsqueeze(1), 0)
         return masked
@@ -146,7 +146,7 @@ def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:
 
 
 def _transposed(conv: nn.Conv2d, rows: Tensor, weight: Tensor, h: Tensor) -> Tensor:
-    """Cotangents [b, k, *output] of a convolution of h [batch, *input], at its input: [b, k, *input]."""
+    """Propagate cotangents [b, k, *output] through a convolution of h [batch, *input]: [b, k, *input]."""
     spare = [
         h.shape[2 + i] + 2 * int(conv.padding[i]) - conv.dilation[i] * (conv.kernel_size[i] - 1) - 1
         - (rows.shape[3 + i] - 1) * conv.stride[i]
@@ -160,7 +160,7 @@ def _transposed(conv: nn.Conv2d, rows: Tensor, weight: Tensor, h: Tensor) -> Ten
 
 
 def _leaves(module: nn.Module, prefix: str) -> Iterator[tuple[str, nn.Module]]:
-    """(prefix of parameter names, layer) in order; nested Sequentials are walked through."""
+    """Yield (prefix of parameter names, layer) in order, including those of nested Sequentials."""
     if not isinstance(module, nn.Sequential):
         yield prefix, module
         return

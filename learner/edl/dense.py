@@ -1,4 +1,4 @@
-"""Forward and backward of networks of Linear and ReLU on the host, in numpy; the counterpart of `backprop.Chain`."""
+"""Forward and backward passes of Linear and ReLU networks in numpy, the counterpart of `backprop.Chain`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from learner.edl.backprop import Tape
 
 
 class DenseChain:
-    """The products that backpropagation is made of, as `Chain` has them; a step is a Linear layer, and its ReLU."""
+    """The products of backpropagation, like `Chain`; a step is a Linear layer with its ReLU."""
 
     def __init__(self, network: Dense) -> None:
         self._network = network
@@ -37,7 +37,7 @@ class DenseChain:
             yield index, rows
             if index:
                 weight, mask = self._network.weights[index], (tape.inputs[index] > 0)[:, None]
-                # One product for each k: small ones are the faster ones.
+                # One product for each k, because small products are faster.
                 rows = np.matmul(rows.swapaxes(0, 1), weight).swapaxes(0, 1)
                 if len(rows) == len(mask):
                     rows *= mask

@@ -1,4 +1,4 @@
-"""Error-driven learning: gradients with the feedback B(i) = U (S + s I) V^T in the place of T(i) = U S V^T.
+"""Error-driven learning: gradients with the feedback B(i) = U (S + s I) V^T in place of T(i) = U S V^T.
 
 For one sample, T(i) = d y / d a(i) is the [actions, n_i] Jacobian of the output with respect to layer i's
 pre-activation. Backpropagation sends delta(i) = T(i)^T e to layer i, EDL sends sigma(i) = B(i)^T e. With the
@@ -7,7 +7,7 @@ orthogonal polar factor P(i) = U V^T,
     B(i) = T(i) + s P(i),        P(i) = G(i)^(-1/2) T(i),        G(i) = T(i) T(i)^T,
     sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e.
 
-Outside code calls `edl_gradients` and `feedback_matrices`. A learner keeps one `FeedbackRule` per network:
+Other code calls `edl_gradients` and `feedback_matrices`. A learner keeps one `FeedbackRule` per network:
 
     rule = FeedbackRule(Chain(network), feedback="transform")
     tape = rule.chain.forward(x)                # tape.output: [batch, actions]; no autograd anywhere
@@ -38,13 +38,13 @@ FEEDBACKS = ("none", "transform", "weight-gradient", "random")
 class FeedbackRule:
     """The backward pass of one network under one feedback.
 
-    chain: the network, in PyTorch or in numpy; arrays of the same library go in and come out.
+    chain: the network, in PyTorch or in numpy; all arrays are of the same library.
     feedback: "none" (backpropagation), "transform" (the equations above), "weight-gradient" (backpropagation, then
         U (S + s I) V^T of each weight gradient; biases plain) or "random" (fixed B(i), direct feedback alignment).
-    seed: draws the fixed matrices of "random".
-    rng: draws how "weight-gradient" completes a gradient that lacks rank; of its own, from `seed`, if not given.
-    polar_dtype: dtype of the passes that only the polar part needs; T(i)^T e is exact always. None: the network's.
-        Of a `Chain` only.
+    seed: of the fixed matrices of "random".
+    rng: draws the completion of rank-deficient gradients for "weight-gradient" (default: a generator from `seed`).
+    polar_dtype: dtype of the passes that only the polar part needs; T(i)^T e always has the network's. None: the
+        network's. Only for a `Chain`.
     """
 
     def __init__(
@@ -68,8 +68,8 @@ class FeedbackRule:
     def backward(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
         """Write one gradient per named parameter into `out`.
 
-        tape: of the chain's forward pass. error: [batch, actions], the output error e with the batch mean already in
-        it. s: the exploration rate. The caller keeps autograd off, and numpy from warning of what is not finite.
+        tape: of the chain's forward pass. error: [batch, actions], the output error e, already divided by the batch
+        size. s: the exploration rate. The caller disables autograd and numpy's warnings of non-finite values.
         """
         if self.feedback == "random":
             for index in self.chain.parametrised:
@@ -84,7 +84,7 @@ class FeedbackRule:
                     gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index], self._rng)
 
     def _transform(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
-        """sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e for every layer, then its gradients."""
+        """Compute sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e and the gradients of every layer."""
         transforms = Transforms(self.chain, tape, self._polar_dtype)
         if self._polar_dtype is None:
             for index, sigma in transforms.pull(error, s):
@@ -95,7 +95,7 @@ class FeedbackRule:
                 self.chain.write(tape, index, delta[:, 0] + polar_parts[index], out)
 
     def _aligned(self, tape: Tape, index: int, error: Array) -> Array:
-        """B(i)^T e with the fixed B(i) of layer `index`; the last layer's is the identity, as T(d) is."""
+        """B(i)^T e with the fixed B(i) of layer `index`; that of the last layer is the identity, like T(d)."""
         shape = tape.output_of(index).shape
         if index == self.chain.parametrised[-1]:
             return error.reshape(shape)
@@ -109,7 +109,7 @@ class FeedbackRule:
 
 
 def _polar_of_gradient(gradient: Array, delta: Array, h: Array, rng: np.random.Generator) -> Array:
-    """U V^T of a weight gradient [m, ...]; that of a Linear layer is delta^T h, which lacks rank in a small batch."""
+    """U V^T of a weight gradient [m, ...]; for a Linear layer it is delta^T h, rank-deficient in a small batch."""
     matrix = torch.as_tensor(gradient).flatten(1)
     if delta.ndim == 2 and len(delta) < min(matrix.shape):
         factor = polar_of_product(torch.as_tensor(delta), torch.as_tensor(h), rng)
@@ -130,7 +130,7 @@ def edl_gradients(
 ) -> dict[str, Tensor]:
     """One gradient per named parameter of `network`, in the parameter's shape and dtype.
 
-    obs: float [batch, *input]. output_error: [batch, actions], e with the batch mean already in it. s: the
+    obs: float [batch, *input]. output_error: [batch, actions], e, already divided by the batch size. s: the
     exploration rate. feedback, seed, polar_dtype: see FeedbackRule. Raises UnsupportedLayerError for a network that is
     not a sequence of Linear, Conv2d, ReLU and Flatten.
     """

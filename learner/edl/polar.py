@@ -1,4 +1,4 @@
-"""Orthogonal polar factors U V^T of matrices U S V^T, without an SVD wherever that is accurate."""
+"""Orthogonal polar factors U V^T of matrices U S V^T, without an SVD if that is accurate."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 
 from learner.edl.arrays import Array, like, namespace
 
-_SMALL = 8  # the shorter side up to which an SVD is quicker than the algebra around a Gram matrix
+_SMALL = 8  # the shorter side up to which an SVD is faster than the algebra with a Gram matrix
 
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
-    """Which Gram matrices can be trusted.
+    """Bounds within which the Gram matrix gives an accurate result.
 
     square: the shortest row's squared length. inflation: the largest sum of variance inflation factors (see
     `whitened`). ratio: the smallest ratio of two eigenvalues.
@@ -26,17 +26,17 @@ class _Limits:
     ratio: float
 
 
-_LIMITS = {4: _Limits(1e-31, 3e2, 1e-11), 8: _Limits(1e-292, 1e6, 1e-9)}  # by the bytes of a number
+_LIMITS = {4: _Limits(1e-31, 3e2, 1e-11), 8: _Limits(1e-292, 1e6, 1e-9)}  # by bytes per number
 
 
 def whitened(gram: Array, e: Array) -> tuple[Array, Array | None]:
-    """G^(-1/2) e, and where that is doubtful and 0 was put: ([..., m], bool [...] or None for nowhere).
+    """G^(-1/2) e [..., m], and a mask bool [...] of inaccurate results, which are set to 0 (None if there are none).
 
-    gram: float32 or float64 [..., m, m], Gram matrices of matrices in that dtype. e: [..., m], broadcast. Larger than
-    pairs, the algebra is done in float64; what limits the accuracy is the rounding of gram's entries,
-    eps |t_i| |t_j|. With C the matrix G scaled to a unit diagonal, the polar factor's relative error is about
-    eps |C^(-1)| <= eps sum_i (C^(-1))_ii: rows of very different length do no harm, rows that are nearly parallel do.
-    Those sums are the variance inflation factors of statistics.
+    gram: float32 or float64 [..., m, m], Gram matrices of matrices in that dtype. e: [..., m], broadcast. For m > 2
+    the algebra uses float64; the rounding of gram's entries, eps |t_i| |t_j|, limits the accuracy. With C the
+    matrix G scaled to a unit diagonal, the polar factor's relative error is about
+    eps |C^(-1)| <= eps sum_i (C^(-1))_ii: rows of very different length do no harm, nearly parallel rows do.
+    These sums are the variance inflation factors of statistics.
     """
     limits = _LIMITS[gram.itemsize]
     if gram.shape[-1] == 2:
@@ -52,7 +52,7 @@ def whitened(gram: Array, e: Array) -> tuple[Array, Array | None]:
 def _whitened_pairs(g: Array, e: Array, limits: _Limits) -> tuple[Array, Array | None]:
     """The closed form for 2 x 2: G^(-1/2) = ((t + d) I - G) / (d sqrt(t + 2 d)) with d^2 = det G and t = tr G.
 
-    In g's own dtype: the determinant loses no more to rounding than the limit on inflation allows.
+    Computed in g's own dtype: rounding affects the determinant no more than the limit on inflation allows.
     """
     a, b, c = g[..., 0, 0], g[..., 1, 1], g[..., 0, 1]
     first, second = e[..., 0], e[..., 1]
@@ -85,7 +85,7 @@ def _whitened_by_eigh(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Te
 def polar(matrix: Tensor, rng: np.random.Generator) -> Tensor:
     """U V^T of one matrix [m, n], by the Gram matrix of its shorter side, computed in float64; nan if not finite.
 
-    rng: draws the completion where the matrix lacks rank, see `polar_of_product`.
+    rng: draws the completion of a rank-deficient matrix, see `polar_of_product`.
     """
     if matrix.shape[0] > matrix.shape[1]:
         return polar(matrix.t(), rng).t()
@@ -100,9 +100,9 @@ def polar(matrix: Tensor, rng: np.random.Generator) -> Tensor:
         return torch.full_like(matrix, torch.nan)
     u, values, vh = torch.linalg.svd(wide, full_matrices=False)
     if missing := len(wide) - (rank := _rank(values, matrix.dtype)):
-        # Normal draws off the row space are spread evenly over the directions of its complement.
+        # Normal draws, projected off the row space, are uniform over the directions of its complement.
         draw = torch.from_numpy(rng.standard_normal((wide.shape[1], missing))).to(wide.device)
-        for _ in range(2):  # the second time takes away what rounding left
+        for _ in range(2):  # the second pass removes the rounding errors of the first
             draw -= vh[:rank].t() @ (vh[:rank] @ draw)
         q, r = torch.linalg.qr(draw)
         vh = torch.cat((vh[:rank], (q * r.diagonal().sign()).t()))
@@ -115,7 +115,7 @@ def polar_of_product(left: Tensor, right: Tensor, rng: np.random.Generator) -> T
 
     With the full QR factorisations left^T = Q R and right^T = P L, and the SVD R L^T = u s v, left^T right is
     Q u s v P^T. So U V^T is Q u K v P^T, where K is the identity for the singular values above the rounding of the
-    dtype, and pairs the null directions, u and v being extended by an identity.
+    dtype, and pairs the null directions, where u and v are extended by an identity.
 
     The pairing is a signed permutation drawn from rng, which has the mean (0) and the covariance of an orthogonal
     matrix drawn uniformly. A fixed pairing would push the weights the same way in every update.
@@ -134,12 +134,12 @@ def polar_of_product(left: Tensor, right: Tensor, rng: np.random.Generator) -> T
 
 
 def _rank(values: Tensor, dtype: torch.dtype) -> int:
-    """How many singular values, largest first, say more than the rounding of a matrix in `dtype`."""
+    """The number of singular values (in descending order) above the rounding of a matrix in `dtype`."""
     return int((values > torch.finfo(dtype).eps * values[0]).sum())
 
 
 def _paired(m: int, n: int, rank: int, rng: np.random.Generator) -> Tensor:
-    """float64 [m, n]: an identity [rank, rank], and a random signed permutation of what is left beside it."""
+    """float64 [m, n]: an identity [rank, rank], and a random signed permutation in the remaining block."""
     if m > n:
         return _paired(n, m, rank, rng).t()
     paired = np.zeros((m, n))
@@ -151,10 +151,10 @@ def _paired(m: int, n: int, rank: int, rng: np.random.Generator) -> Tensor:
 
 
 def polar_by_svd(matrices: Tensor) -> Tensor:
-    """U V^T of each matrix [batch, m, n], computed in float64; nan where a matrix is not finite.
+    """U V^T of each matrix [batch, m, n], computed in float64; nan if a matrix is not finite.
 
-    All min(m, n) singular values of the result are 1: where a matrix lacks rank, LAPACK's U and V complete it with an
-    orthonormal basis of the null directions, which depends on nothing but the matrix.
+    All min(m, n) singular values of the result are 1: LAPACK's U and V complete a rank-deficient matrix with an
+    orthonormal basis of the null directions, which depends only on the matrix.
     """
     m = matrices.double()
     broken = None if m.sum().isfinite() else ~m.isfinite().flatten(1).all(1)[:, None, None]

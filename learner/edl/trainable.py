@@ -1,4 +1,4 @@
-"""A network as training sees it: flat parameters, their gradient, and the passes that make it."""
+"""A network for training: flat parameters, their gradient, and the forward and backward passes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from learner.edl.dense import DenseChain
 
 
 class Trainable:
-    """The network's own parameters and a gradient beside them, all tensors or, `in_numpy`, all numpy arrays.
+    """The network's own parameters and their gradient, as tensors or, with `in_numpy`, as numpy arrays.
 
     theta, gradient: <float>[P], in the order of the network's layout. gradients: name -> view of `gradient`, in the
     shape of the parameter. chain: the network's forward and backward passes. values: its forward pass alone.
     """
 
     def __init__(self, network: FlatNetwork, in_numpy: bool) -> None:
-        """`in_numpy` asks for numpy, and holds where the network has that form."""
+        """in_numpy: use numpy if the network has a form in numpy."""
         dense = network.dense if in_numpy else None
         self.in_numpy = dense is not None
         self.chain = Chain(network.module) if dense is None else DenseChain(dense)
@@ -26,5 +26,5 @@ class Trainable:
         self.gradients = network.views(self.gradient)
 
     def cast(self, array: Array) -> Array:
-        """An array of either library as this network's passes take it."""
+        """Convert an array of either library for this network's passes."""
         return like(array, self.theta)

@@ -1,4 +1,4 @@
-"""The transforms T(i) of one batch and their polar factors, which error-driven learning feeds back through."""
+"""The transforms T(i) of one batch and their polar factors, through which error-driven learning feeds back."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ _SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float6
 
 
 class Transforms:
-    """T(i) = d y / d a(i) of every layer with parameters, for each sample of a batch, ready to be applied.
+    """T(i) = d y / d a(i) of every layer with parameters, for each sample of a batch.
 
-    All A cotangents of a sample go down the network as one batch. They start from the rows of an orthogonal matrix Q
-    and not from the identity, so what is held is Q T(i), which has T(i)'s singular values and V. Actions' values have
-    most of their gradient in common; Q parts that from the differences, and the Gram matrices stay accurate in the
-    network's own dtype. T of a Linear layer at the end is the identity and is not held.
+    All A cotangents of a sample pass through the network as one batch. They start from the rows of an orthogonal matrix
+    Q instead of the identity, so this object holds Q T(i), which has T(i)'s singular values and V. The actions' values
+    share most of their gradient; Q separates this part from the differences, which keeps the Gram matrices accurate in
+    the network's own dtype. T of a final Linear layer is the identity and is not held.
     """
 
     def __init__(self, chain: Chain | DenseChain, tape: Tape, dtype: torch.dtype | None = None) -> None:
-        """dtype: what to compute the T(i) in, the network's if None; their algebra is done in float32 or better."""
+        """dtype: of the computation of T(i), the network's if None; the algebra on them uses at least float32."""
         self._chain = chain
         self._batch, self._actions = tape.output.shape
         self._basis = _basis(chain.output_weight, tape.output)
         start = self._basis[None] if dtype is None else self._basis[None].to(dtype)
         walk = chain.walk(tape, start, dtype)
         self._linear_end = next(walk)[0] if chain.output_weight is not None else None
-        # The layers held, the last first: step, shape of its output, and T as [batch or 1, A, n].
+        # The layers held, last first: step, shape of its output, and T as [batch or 1, A, n].
         self._layers: list[tuple[int, tuple[int, ...]]] = []
         self._ts: list[Array] = []
         for index, t in walk:
@@ -40,9 +40,9 @@ class Transforms:
             self._ts.append(_flat(t) if dtype is None else _flat(t).to(tape.output.dtype))
 
     def pull(self, error: Array, s: float, polar_only: bool = False) -> Iterator[tuple[int, Array]]:
-        """(step, B(i)^T e) for each layer, the last first: error [batch, A] -> [batch, *shape].
+        """Yield (step, B(i)^T e) for each layer, last first: error [batch, A] -> [batch, *shape].
 
-        polar_only: s (U V^T)^T e instead of (T(i) + s U V^T)^T e.
+        polar_only: compute s (U V^T)^T e instead of (T(i) + s U V^T)^T e.
         """
         if self._linear_end is not None:
             yield self._linear_end, error * (s if polar_only else 1 + s)
@@ -59,7 +59,7 @@ class Transforms:
             yield index, _shaped(sigma, shape)
 
     def matrices(self, s: float) -> list[tuple[int, Array]]:
-        """(step, B(i) = T(i) + s U V^T), the last first: [batch, A, n_i], images in the order of channels first."""
+        """(step, B(i) = T(i) + s U V^T), last first: [batch, A, n_i], images with channels first."""
         found = []
         units = like(torch.eye(self._actions), self._basis)
         if self._linear_end is not None:
@@ -85,13 +85,13 @@ class Transforms:
         return xp.concatenate(whole).reshape(-1, *shape)
 
     def _by_svd(self, t: Array, where: Array) -> Array:
-        """Polar factors of the samples of T [batch or 1, A, n] that are true in `where`: [k, A, n]."""
+        """Polar factors of those samples of T [batch or 1, A, n] for which `where` is true: [k, A, n]."""
         chosen = namespace(t).broadcast_to(t, (self._batch, *t.shape[1:]))[where]
         return like(polar_by_svd(torch.as_tensor(chosen)), t)
 
 
 def _basis(output_weight: Array | None, output: Array) -> Array:
-    """An orthogonal Q [A, A] such that the rows of Q W, for the output weight W [A, n], are near orthogonal."""
+    """An orthogonal Q [A, A] that makes the rows of Q W nearly orthogonal, for the output weight W [A, n]."""
     actions = output.shape[1]
     if actions == 2:
         return like(_SUM_AND_DIFFERENCE, output)
@@ -103,12 +103,12 @@ def _basis(output_weight: Array | None, output: Array) -> Array:
 
 
 def _flat(t: Array) -> Array:
-    """[b, A, channels, height, width] with channels last in memory, as [b, A, n] without a copy."""
+    """View [b, A, channels, height, width], channels last in memory, as [b, A, n]."""
     return t.permute(0, 1, 3, 4, 2).flatten(2) if t.ndim == 5 else t
 
 
 def _shaped(rows: Array, shape: tuple[int, ...]) -> Array:
-    """[rows, n] of `_flat` back to [rows, *shape]."""
+    """Reverse `_flat`: [rows, n] to [rows, *shape]."""
     if len(shape) == 1:
         return rows
     channels, height, width = shape

@@ -1,1 +1,1 @@
-"""What a run leaves behind: its directory, metrics, summary, learning curve and checkpoints."""
+"""The records of a run: its directory, metrics, summary, learning curve and checkpoints."""

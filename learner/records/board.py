@@ -1,4 +1,4 @@
-"""TensorBoard's file of a run, which may end early where there is no space for it."""
+"""Writes a run's TensorBoard file, which may end early if the disk is full."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 
 class Board:
-    """Scalars for TensorBoard; written in a thread of its own, they may be given up without harm to the run."""
+    """Writes scalars for TensorBoard in a separate thread; a failure ends the file, not the run."""
 
     def __init__(self, path: Path) -> None:
         self._writer: SummaryWriter | None = SummaryWriter(str(path))
@@ -25,7 +25,7 @@ class Board:
             self.close()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining values."""
         writer, self._writer = self._writer, None
         if writer is not None:
             with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""Epochs: one consistent checkpoint of learner and replay service, under checkpoints/NUMBER/ of the run directory."""
+"""Epochs: consistent checkpoints of learner and replay service, in checkpoints/NUMBER/ of the run directory."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ KEPT = 2
 
 
 def save_epoch(run_dir: Path, number: int, learner_state: dict[str, Any], snapshot: Callable[[str], None]) -> Path:
-    """Save one epoch and drop those that are too old or torn.
+    """Save one epoch, and delete epochs that are too old or torn.
 
-    `DONE`, with size and checksum of learner.pt, is written last: without it an epoch is torn.
+    `DONE`, with size and checksum of learner.pt, is written last: an epoch without it is torn.
 
-    snapshot: has the replay service save itself under the folder it is given, relative to the run directory.
+    snapshot: makes the replay service save its state under the given folder, relative to the run directory.
 
     Raises:
-        OSError: the run directory can't be written; nothing is left of this epoch.
+        OSError: the run directory cannot be written; nothing is left of this epoch.
     """
     folder = f"checkpoints/{number}"
     path = run_dir / folder
@@ -50,12 +50,12 @@ def save_epoch(run_dir: Path, number: int, learner_state: dict[str, Any], snapsh
 
 
 def complete_epochs(run_dir: Path) -> list[int]:
-    """Numbers of the epochs that were finished, in ascending order."""
+    """Numbers of the finished epochs, in ascending order."""
     return sorted(int(path.parent.name) for path in (run_dir / "checkpoints").glob(f"*/{DONE}"))
 
 
 def whole_epochs(run_dir: Path) -> list[int]:
-    """Numbers of the epochs that were finished and whose learner.pt is as it was written, in ascending order."""
+    """Numbers of the finished epochs whose learner.pt is intact, in ascending order."""
     return [number for number in complete_epochs(run_dir) if _is_whole(run_dir / "checkpoints" / str(number))]
 
 
@@ -66,7 +66,7 @@ def newest_epoch(run_dir: Path) -> Path | None:
 
 
 def go_back(run_dir: Path, number: int) -> dict[str, Any] | None:
-    """The learner's state of epoch `number`, None for a beginning (0); what is newer is dropped."""
+    """Load the learner's state of epoch `number` (0: the beginning, None) and delete newer epochs."""
     for newer in complete_epochs(run_dir):
         if newer > number:
             shutil.rmtree(run_dir / "checkpoints" / str(newer), ignore_errors=True)
@@ -74,7 +74,7 @@ def go_back(run_dir: Path, number: int) -> dict[str, Any] | None:
 
 
 def load_learner(path: Path) -> dict[str, Any]:
-    """Read learner.pt of an epoch's folder; executes nothing that it holds."""
+    """Read learner.pt from an epoch's folder, without executing any code in it."""
     state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
     return state
 

@@ -27,10 +27,10 @@ EPISODE_FIELDS = (
 
 
 class RunDirectory:
-    """Writes a run's files as the run goes on; a line is complete when its call returns, if there is space for it."""
+    """Writes a run's files during the run; when a call returns, its lines are complete if the disk has space."""
 
     def __init__(self, path: Path, config: RunConfig, sizes: dict[str, int] | None = None) -> None:
-        """Begin a run's files, or go on with those cut back to `sizes` in bytes; RunError where that can't be."""
+        """Create a run's files, or continue them, cut back to `sizes` in bytes; raises RunError if that fails."""
         self.path = path
         try:
             settle(path, config)
@@ -47,11 +47,11 @@ class RunDirectory:
         self._problem = ""
 
     def run_id(self) -> int:
-        """The random id of this run, which tells it from others of its name; raises RunError."""
+        """The random id of this run, which distinguishes it from others of its name; raises RunError."""
         return read_run_id(self.path)
 
     def record(self, episodes: Iterable[EpisodeRow], metrics: dict[str, Any] | None) -> None:
-        """Write down what one batch gave: lines of episodes.csv, and a row of metrics.jsonl where there is one."""
+        """Write lines to episodes.csv, and a row, if there is one, to metrics.jsonl."""
         for episode in episodes:
             self._episode(episode)
         if metrics is not None:
@@ -73,11 +73,11 @@ class RunDirectory:
                 self._board.add(f"train/{name}", value, row["env_step"])
 
     def summary(self, summary: Summary) -> None:
-        """Write summary.json, whole or not at all."""
+        """Write summary.json atomically."""
         write_whole(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
 
     def sizes(self) -> dict[str, int]:
-        """How long the files that grow are now, in bytes."""
+        """The present sizes of the growing files, in bytes."""
         return {name: (self.path / name).stat().st_size for name in ("episodes.csv", "metrics.jsonl")}
 
     def close(self) -> None:
@@ -87,7 +87,7 @@ class RunDirectory:
         self._board.close()
 
     def _look(self) -> None:
-        """Say once that there is no space, and once that there is again; no line is lost between the two."""
+        """Report once that the disk is full, and once that it has space again; no line is lost in between."""
         problem = self._episodes.problem or self._metrics.problem
         if problem != self._problem:
             print(f"{self.path}: {problem or 'can be written again'}", flush=True)
@@ -103,10 +103,10 @@ class RunDirectory:
 
 
 def settle(path: Path, config: RunConfig) -> int:
-    """Make a directory this run's, or see that it is: its config and its id, which is returned.
+    """Assign a directory to this run, or check that it is assigned; write its config and return the run's id.
 
     Raises:
-        RunError: it can't be written.
+        RunError: it cannot be written.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What a run says at its end: summary.json, and one line."""
+"""The summary at a run's end: summary.json, and one line."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from learner.trainer import Trainer
 class Summary:
     """The fields of summary.json.
 
-    return_mean_100, return_sd_100: over the last 100 episodes; 0 where none has ended. transitions_lost,
-    duplicates_refused: None where the replay service could not be asked. exit: why the run ended.
+    return_mean_100, return_sd_100: over the last 100 episodes; 0 if none has ended. transitions_lost,
+    duplicates_refused: None if the replay service did not answer. exit: why the run ended.
     """
 
     method: str
@@ -31,7 +31,7 @@ class Summary:
 
     @property
     def title(self) -> str:
-        """The run in a few words."""
+        """A short title of the run."""
         return f"{self.env}, {self.method}, seed {self.seed}"
 
     def __str__(self) -> str:
@@ -45,7 +45,7 @@ class Summary:
 def summarise(
     trainer: Trainer, outcome: str, now: float, env_steps: int, lost: int | None = 0, duplicates: int | None = 0
 ) -> Summary:
-    """The summary of a run that ends at `now`, in seconds of the trainer's clock."""
+    """Summarise a run that ends at `now`, in seconds of the trainer's clock."""
     config, telemetry = trainer.config, trainer.telemetry
     return Summary(
         method=config.method,
