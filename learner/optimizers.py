@@ -71,7 +71,7 @@ class Optimizer(ABC):
         return square
 
     def _descend(self, direction: Array, rate: float, denominator: Array | None = None) -> None:
-        """theta <- theta - rate direction / denominator; both arguments may be in the scratch memory."""
+        """Apply theta <- theta - rate direction / denominator; both arguments may be in the scratch memory."""
         if denominator is None:
             self.theta -= self._xp.multiply(direction, rate, out=self._scratch)
         elif self._fused:
