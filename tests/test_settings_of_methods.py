@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.settings.config import RunConfig
 from common.settings.options import RunOptions, parse_run
 from common.settings.resuming import check_resumed
@@ -152,10 +152,11 @@ SAVED = validated({"total_steps": 1000, "total_episodes": 7, "replay": {"capacit
         ({"total_updates": 6}, "total_updates = 6, but 0"),
         ({"target_return": 5.0, "checkpoint_every": 3}, None),
         ({"methods": {"dqn": {"learner": {"gamma": 0.5}}}}, None),
-        ({"seed": 3, "replay": {"capacity": 600}}, "seed = 3, but 0; replay.capacity = 600, but 500 in c.toml"),
+        (
+            {"replay": {"capacity": 600}, "learner": {"gamma": 0.5}},
+            "learner.gamma = 0.5, but 0.99; replay.capacity = 600, but 500 in c.toml",
+        ),
         ({"learner": {"learning_rate": 0.5}, "total_steps": 2000}, "--resume: learner.learning_rate = 0.5, but 0.001"),
-        ({"method": "dqn"}, "method = dqn, but coop"),
-        ({"env": {"id": "CartPole-v1"}}, "env.id = CartPole-v1, but CartPole-v0"),
         ({"learner": {"target_update_every": 3}}, "learner.target_update_every = 3, but None"),
     ],
 )
@@ -167,6 +168,20 @@ def test_what_a_run_that_goes_on_may_be_given_anew(change: dict[str, object], wo
         with pytest.raises(UsageError) as caught:
             check_resumed(config, SAVED, Path("c.toml"))
         assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"seed": 3, "replay": {"capacity": 600}}, "another run's, whose seed is 0; here it is 3"),
+        ({"method": "dqn"}, "another run's, whose method is coop; here it is dqn"),
+        ({"env": {"id": "CartPole-v1"}}, "another run's, whose env.id is CartPole-v0; here it is CartPole-v1"),
+        ({"run": "other"}, "another run's, whose run is coop; here it is other"),
+    ],
+)
+def test_another_run_is_no_run_to_go_on_with(change: dict[str, object], words: str) -> None:
+    with pytest.raises(RunError, match=words):
+        check_resumed(resolve(base_tables_with(change)), SAVED, Path("runs/a/config.toml"))
 
 
 def base_tables_with(change: dict[str, object]) -> dict[str, object]:
