@@ -69,7 +69,7 @@ class Telemetry:
             "q1_mean": float(q1.mean()),
             "q2_mean": float(q2.mean()),
             "q_abs_mean": self.q_abs_mean,
-            "q_bound": self.q_bound(agent),
+            **self._bound(agent),
             "updates_per_s": (agent.updates - updates) / seconds,
             "env_steps_per_s": (drawn.inserted - steps) / seconds,
             "replay_size": drawn.size,
@@ -86,6 +86,10 @@ class Telemetry:
         """The largest possible |Q|, (largest |reward| seen) / (1 - gamma); None if gamma is 1."""
         gamma = agent.config.learner.gamma
         return self.largest_reward / (1 - gamma) if gamma < 1 else None
+
+    def _bound(self, agent: Agent) -> dict[str, float]:
+        bound = self.q_bound(agent)
+        return {} if bound is None else {"q_bound": bound}
 
     def warning(self, agent: Agent) -> str:
         """A warning that mean |Q| exceeds its bound; empty if it does not."""

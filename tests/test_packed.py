@@ -33,6 +33,10 @@ def folder(tmp_path: Path) -> Path:
             for n in range(19)
         )
         rows = [{**ROW, "env_step": 100 * n, "q_gap": 0.1 * n} for n in range(1, 4)]
+        if seed:  # the first is of a version that did not write these
+            rows[0] |= {"q_abs_mean": 0.5, "q_bound": 100.0}
+            rows[1] |= {"q_abs_mean": 100.5, "q_bound": 100.0}
+            rows[2] |= {"q_abs_mean": 1e6}  # gamma is 1
         lines = "".join(json.dumps(row) + "\n" for row in rows)
         write(
             tmp_path / "study" / f"dqn-seed={seed}",
@@ -84,7 +88,9 @@ def test_every_file_comes_back(folder: Path, tmp_path: Path) -> None:
     ] == [1.5 * n for n in range(19)]
 
 
-def test_the_report_is_the_same(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_report_is_the_same(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_report(folder, tmp_path / "from-folder")
     monkeypatch.setattr("sys.argv", ["coop-report", str(folder), "--pack", str(tmp_path / "study.parquet")])
     cli.main()
@@ -95,7 +101,11 @@ def test_the_report_is_the_same(folder: Path, tmp_path: Path, monkeypatch: pytes
     for name in made:
         ours, theirs = (folder / "report" / name).read_bytes(), (tmp_path / "from-folder" / name).read_bytes()
         assert ours.replace(b"study.parquet", b"study") == theirs, name
-    assert b"dqn-seed=4: begun, not finished" in (folder / "report" / "index.html").read_bytes()
+    page = (folder / "report" / "index.html").read_text()
+    assert "dqn-seed=4: begun, not finished" in page
+    above = "dqn-seed=1: mean |Q| is above the largest that the rewards seen allow in 1 of 3 rows of metrics.jsonl"
+    assert page.count("mean |Q|") == page.count(above) == 1
+    assert capsys.readouterr().err == f"warning: {above}\n" * 2
 
 
 @pytest.mark.parametrize(

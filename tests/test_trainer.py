@@ -188,6 +188,16 @@ def test_values_beyond_what_the_rewards_allow_are_told() -> None:
     assert "above" in trainer.telemetry.warning(trainer.agent)
 
 
+def test_without_discount_there_is_no_bound() -> None:
+    undiscounted = replace(CONFIG, learner=replace(CONFIG.learner, gamma=1.0))
+    trainer = Trainer(Agent(undiscounted, SPEC), 0.0)
+    row = train(trainer, 200)[-1].metrics
+    assert row is not None
+    assert None not in row.values()  # a packed study can't tell a null from a value that is not there
+    assert "q_bound" not in row
+    assert trainer.telemetry.warning(trainer.agent) == ""
+
+
 def test_a_restored_trainer_goes_on() -> None:
     first = Trainer(Agent(replace(CONFIG, checkpoint_every=5), SPEC), 100.0)
     source = batches()

@@ -67,13 +67,18 @@ class PackedStudy:
         as_json = (name for name in columns if (schema.field(f"{file}/{name}").metadata or {}).items() >= JSON.items())
         return json_text(columns, frozenset(as_json))
 
-    def columns(self, run: str, file: str, wanted: Sequence[str]) -> Columns:
-        """Some columns of a run's episodes or metrics. Raises KeyError where it lacks one."""
+    def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> Columns:
+        """Some columns of a run's episodes or metrics, None where an optional one is not there.
+
+        Raises KeyError where the run lacks a wanted one.
+        """
         columns = self._columns(run, file)
         if not columns:
-            return {name: [] for name in wanted}
+            return {name: [] for name in (*wanted, *optional)}
         read = decimal if file == EPISODES else list
-        return {name: read(columns[name].as_py()) for name in wanted}
+        lacking: list[Any] = [None] * len(next(iter(columns.values())))
+        found = {name: read(columns[name].as_py()) for name in wanted}
+        return found | {name: read(columns[name].as_py()) if name in columns else lacking for name in optional}
 
     def _columns(self, run: str, file: str) -> dict[str, pa.Scalar]:
         start = f"{file}/"

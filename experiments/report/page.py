@@ -48,6 +48,7 @@ def page(
         f"<p>{len(study.runs)} of {total} runs finished{_diverged(study)}: {html.escape(', '.join(study.methods))} on "
         f"{html.escape(', '.join(study.environments))}; they differ by {html.escape(axes)}.</p>",
         _missing(study, lacking),
+        _warnings(study),
         *(_table(table) for table in tables[:1]),
         *(_figure(figure, png) for figure, png in figures),
         *(_table(table) for table in tables[1:]),
@@ -67,6 +68,11 @@ def _missing(study: Study, lacking: Sequence[str]) -> str:
     items = "".join(f"<li>{html.escape(line)}</li>" for line in [*lacking, *lines])
     summary = f"Missing: {len(lines)} runs, {len(lacking)} figures"
     return f"<details {'open' if len(lines) < LONG else ''}><summary>{summary}</summary><ul>{items}</ul></details>"
+
+
+def _warnings(study: Study) -> str:
+    items = "".join(f"<li>{html.escape(line)}</li>" for line in study.warnings)
+    return f"<p>Q-values too large to be true:</p><ul>{items}</ul>" if items else ""
 
 
 def _table(table: ResultTable) -> str:

@@ -24,8 +24,11 @@ class Source(Protocol):
         """The content of a run's file; None where it has none."""
         ...
 
-    def columns(self, run: str, file: str, wanted: Sequence[str]) -> dict[str, list[Any]]:
-        """Some columns of a run's episodes or metrics; raises KeyError or ValueError where they are not there."""
+    def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
+        """Some columns of a run's episodes or metrics; an optional one has None where a line lacks it.
+
+        Raises KeyError or ValueError where a wanted one is not there.
+        """
         ...
 
 
@@ -44,11 +47,12 @@ class FolderSource:
         except FileNotFoundError:
             return None
 
-    def columns(self, run: str, file: str, wanted: Sequence[str]) -> dict[str, list[Any]]:
+    def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
         """See `Source`."""
         with (self._folder / run / file).open(encoding="utf-8") as lines:
             rows = list(csv.DictReader(lines) if file == EPISODES else map(json.loads, lines))
-        return {name: [row[name] for row in rows] for name in wanted}
+        found = {name: [row[name] for row in rows] for name in wanted}
+        return found | {name: [row.get(name) for row in rows] for name in optional}
 
 
 def open_source(path: Path) -> Source:

@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 Setting = tuple[Any, ...]  # a value for each axis
 
 SERIES = ("env_step", "q_gap", "sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
+Q_SIZE, Q_BOUND = "q_abs_mean", "q_bound"  # runs of earlier versions do not have them
 NOT_AXES = {"run", "method", "seed"}
 PRESET = "cartpole"
 
@@ -35,6 +36,7 @@ class Run:
 
     end_steps: float64 [episodes], environment steps when each episode ended. returns, s, q1_means, q2_means: float64
     [episodes], of the columns `return`, `s`, `q1_mean` and `q2_mean`. metrics: float64 [rows] of each name of SERIES.
+    above_bound: rows of metrics.jsonl whose mean |Q| is larger than the rewards seen allow.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Run:
     q1_means: Floats
     q2_means: Floats
     metrics: Mapping[str, Floats]
+    above_bound: int = 0
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,16 @@ class Study:
     def environments(self) -> list[str]:
         """The environments played."""
         return sorted({run.config.env.id for run in self.runs})
+
+    @property
+    def warnings(self) -> list[str]:
+        """A line for each finished run whose Q-values were larger at times than they can be."""
+        return [
+            f"{run.name}: mean |Q| is above the largest that the rewards seen allow in {run.above_bound} of "
+            f"{len(run.metrics['env_step'])} rows of {METRICS}"
+            for run in self.runs
+            if run.above_bound
+        ]
 
     def setting(self, run: Run) -> Setting:
         """The run's value on each axis."""
@@ -165,12 +178,14 @@ def _read(source: Source, run: str, path: Path) -> Run:
     config = read_config(source, run, path)
     try:
         episodes = source.columns(run, EPISODES, ("env_step", "return", "s", "q1_mean", "q2_mean"))
-        rows = source.columns(run, METRICS, SERIES)
+        rows = source.columns(run, METRICS, SERIES, (Q_SIZE, Q_BOUND))
         ends, returns, s, q1, q2 = (np.array(values, np.float64) for values in episodes.values())
-        metrics = {name: np.array(values, np.float64) for name, values in rows.items()}
+        metrics = {name: np.array(rows[name], np.float64) for name in SERIES}
+        sizes = zip(rows[Q_SIZE], rows[Q_BOUND], strict=True)
+        above_bound = sum(bound is not None and size > bound for size, bound in sizes)
     except (OSError, ValueError, KeyError, UsageError) as error:
         raise RunError(f"{path / run}: a finished run with a file that can't be read: {error!r}") from error
-    return Run(run, config, ends, returns, s, q1, q2, metrics)
+    return Run(run, config, ends, returns, s, q1, q2, metrics, above_bound)
 
 
 def read_config(source: Source, run: str, path: Path) -> RunConfig:

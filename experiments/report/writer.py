@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import RunError, UsageError
+from common.process.notices import warn
 from experiments.report.figures import figures
 from experiments.report.packed import EPISODES
 from experiments.report.page import page
@@ -47,13 +48,15 @@ def draw_curves(runs: Path, out: Path) -> list[Path]:
 
 
 def write_report(runs: Path, out: Path) -> tuple[Path, list[ResultTable]]:
-    """Write the report of a folder of runs; the page's path and the tables.
+    """Write the report of a folder of runs, and warn of runs not to be trusted; the page's path and the tables.
 
     Raises:
         UsageError: the folder holds no run, or the report's can't be written.
         RunError: no run is finished, or a finished one has a torn file.
     """
     study = load_study(runs)
+    for line in study.warnings:
+        warn(line)
     made, lacking = figures(study)
     results = tables(study)
     try:
