@@ -31,12 +31,12 @@ class ReplayOptions(RoleOptions):
     """Flags of `coop-replay`."""
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
-    """Endpoints to listen on; port 0 takes a free one."""
+    """Endpoints to listen on; port 0 chooses a free port."""
     run_dir: Path | None = None
-    """Where this service's part of the epochs is written, under checkpoints/; runs/RUN-replay-ID if not given, with
-    the run's name and id."""
+    """Folder for this service's part of the epochs, under checkpoints/ (default: runs/RUN-replay-ID, with the run's
+    name and id)."""
     resume: bool = False
-    """Go on from what is in --run-dir; start where there is nothing of this run yet."""
+    """Continue from the state in --run-dir; start afresh if it holds nothing of this run yet."""
 
 
 def main() -> None:
@@ -84,7 +84,7 @@ def _serve(
     joined: Joined,
     console: Console,
 ) -> None:
-    """Serve a run that this process has joined until the stop, and then until the learner has saved what it needs."""
+    """Serve a run that this process has joined until the stop, and then until the learner has saved an epoch."""
     service = _service(node, joined, folder, console)
 
     def learned(_: Joined, asked: float) -> None:
@@ -102,11 +102,11 @@ def _serve(
 
 
 def _service(node: Node, joined: Joined, folder: ReplayFolder, console: Console) -> ReplayService:
-    """A service whose table is as the folder has it, at the learner's epoch or, where there is a journal, later.
+    """Build a service from the folder's state: the learner's epoch, and the journal after it if there is one.
 
     Raises:
-        RunError: the folder is another run's, or the journal can't be read or written.
-        UsageError: the folder is of a table with other settings.
+        RunError: the folder belongs to another run, or the journal cannot be read or written.
+        UsageError: the folder's table has other settings.
     """
     if joined.run_id != folder.run_id:
         raise RunError(f"another learner of run {node.run!r} has begun while this one joined")

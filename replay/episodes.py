@@ -1,4 +1,4 @@
-"""The episodes that ended, as far as a learner may still ask for them."""
+"""The log of ended episodes, as far back as a learner may still ask for them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Iterable, Sequence
 
 from common.messaging.messages.sample import EpisodeRecord
 
-MOST = 131_072  # that are kept; the oldest go where a run saves no epoch
+MOST = 131_072  # episodes kept; if a run saves no epoch, the oldest are dropped
 
 
 class EpisodeLog:
     """Episodes in the order in which they ended, numbered from 0.
 
-    first: number of the first one that is kept. floors: by epoch, the first one that a learner that goes back there
-    asks for.
+    first: number of the oldest episode kept. floors: by epoch, the first episode for which a learner restored from that
+    epoch asks.
     """
 
     def __init__(self) -> None:
@@ -29,34 +29,34 @@ class EpisodeLog:
     def add(self, records: Iterable[EpisodeRecord]) -> None:
         """Append episodes."""
         self._records.extend(records)
-        if len(self._records) > 2 * MOST:  # seldom, for it moves what is kept
+        if len(self._records) > 2 * MOST:  # seldom, because it copies the kept episodes
             self._drop(self.total - MOST)
 
     def since(self, number: int, most: int) -> tuple[int, tuple[EpisodeRecord, ...]]:
-        """Up to `most` episodes from `number` on, or from the first one that is kept; its number, and they."""
+        """(first, episodes): up to `most` episodes from `number` on, or from the oldest one kept if that is later."""
         first = max(number, self.first)
         start = first - self.first
         return first, tuple(self._records[start : start + most])
 
     def known_to_end_at(self, total: int) -> None:
-        """Let what is here end at `total` at least: a learner knows of that many, and their numbers stay."""
+        """Make the log end at `total` at least: a learner has received that many, and their numbers must not change."""
         self.first = max(self.first, total - len(self._records))
 
     def mark(self, epoch: int, floor: int, keep: Sequence[int]) -> None:
-        """Note from where on a learner that goes back to `epoch` asks, and drop what those of `keep` don't need.
+        """Note the first episode that a learner restored from `epoch` needs; drop those that no epoch in `keep` needs.
 
-        While there are none in `keep`, a learner that comes back begins at the first episode.
+        If `keep` is empty, a restored learner begins at the first episode.
         """
         self.floors = {number: self.floors.get(number, self.first) for number in keep} | {epoch: floor}
         if keep:
             self._drop(min(self.floors.values()))
 
     def copy(self) -> tuple[EpisodeRecord, ...]:
-        """What is kept."""
+        """The episodes kept."""
         return tuple(self._records)
 
     def load(self, first: int, records: Iterable[EpisodeRecord], floors: dict[int, int]) -> None:
-        """Go on from what was kept before."""
+        """Restore the log from saved values."""
         self.first, self._records, self.floors = first, list(records), floors
 
     def _drop(self, before: int) -> None:

@@ -1,4 +1,4 @@
-"""The replay ratio, kept by admitting or refusing inserts and samples, with the reason in words."""
+"""Keeps the replay ratio by admitting or refusing inserts and samples, with the reason in words."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from common.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class RateLimiter:
-    """Settings of the limiter; it keeps no state, so they may be replaced while a run goes on.
+    """The limiter's settings; it has no other state, so a running service may replace it.
 
     ratio: updates (batches drawn) per transition inserted after the first `start`.
     start: transitions inserted before the first sample.
-    tolerance: steps that inserts and updates may be ahead of one another. At least half of what one update is
-        worth (1 / ratio steps) is always allowed: with less, neither could move.
-    total: transitions after which no more are admitted, and updates end at round(ratio * (total - start)).
-    capacity: of the table behind it, if it should be checked.
-    origin: (inserted, drawn) from where the ratio holds; `(start, 0)` if none, see `changed`.
+    tolerance: environment steps by which inserts may be ahead of updates, or updates ahead of inserts. At least half an
+        update's worth (1 / ratio steps) is always allowed; with less, neither could proceed.
+    total: transitions after which no more are admitted; updates end at round(ratio * (total - start)).
+    capacity: of the table, to be checked against the other settings if given.
+    origin: (inserted, drawn) from which the ratio holds; `(start, 0)` if None, see `changed`.
 
     Promise, with ahead = (inserted - origin inserted) - (drawn - origin drawn) / ratio in steps, and
     slack = max(tolerance, 0.5 / ratio): from the origin on, -slack <= ahead <= slack + n where n is the number of
@@ -36,7 +36,7 @@ class RateLimiter:
     origin: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        """Raise UsageError for settings under which the run could not move or end."""
+        """Raise UsageError for settings under which the run could not proceed or end."""
         if not (isfinite(self.ratio) and self.ratio > 0):
             raise UsageError(f"ratio: {self.ratio} updates per step, must be above 0")
         if not (isfinite(self.tolerance) and self.tolerance >= 0):
@@ -50,19 +50,19 @@ class RateLimiter:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> RateLimiter:
-        """From `dataclasses.asdict` of one, as it comes back from msgpack."""
+        """Build one from its `dataclasses.asdict`, as read from msgpack."""
         return cls(**{**table, "origin": None if table["origin"] is None else tuple(table["origin"])})
 
     @property
     def draws_total(self) -> int | None:
-        """Batches that a complete run has drawn; None for a run without an end."""
+        """Draws of a complete run; None for a run without an end."""
         if self.total is None:
             return None
         inserted, drawn = self.origin or (self.start, 0)
         return drawn + max(0, round(self.ratio * (self.total - inserted)))
 
     def why_not_insert(self, inserted: int, drawn: int) -> str | None:
-        """None if a segment is admitted, else the reason."""
+        """None if an insert is admitted, otherwise the reason for refusing it."""
         if self.total is not None and inserted >= self.total:
             return self._complete()
         ahead = self._ahead(inserted, drawn)
@@ -71,7 +71,7 @@ class RateLimiter:
         return f"inserts are {ahead:,.0f} steps ahead of updates"
 
     def why_not_sample(self, inserted: int, drawn: int, size: int) -> str | None:
-        """None if a batch is admitted, else the reason. size: transitions held now."""
+        """None if a draw is admitted, otherwise the reason for refusing it. size: transitions in the table."""
         if inserted < self.start:
             return f"waiting for {self.start:,} transitions, have {inserted:,}"
         if size == 0:
@@ -91,9 +91,9 @@ class RateLimiter:
     def changed(
         self, inserted: int, drawn: int, *, ratio: float, tolerance: float | None = None, total: int | None = None
     ) -> RateLimiter:
-        """Settings for a run that has come to (inserted, drawn), the new ratio holding from there on only.
+        """New settings whose ratio holds only from the present counts (inserted, drawn) on.
 
-        Without it, a new ratio would hold for the past too, and updates would pause or rush to make up for it.
+        Otherwise the new ratio would also apply to the past, and updates would pause or rush to compensate.
         """
         origin = (inserted, drawn) if inserted >= self.start else None
         return replace(
@@ -109,7 +109,7 @@ class RateLimiter:
         return max(self.tolerance, 0.5 / self.ratio)
 
     def _ahead(self, inserted: int, drawn: int) -> float:
-        """Steps that inserts are ahead of updates."""
+        """Environment steps by which inserts are ahead of updates."""
         origin_inserted, origin_drawn = self.origin or (self.start, 0)
         return (inserted - origin_inserted) - (drawn - origin_drawn) / self.ratio
 

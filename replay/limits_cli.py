@@ -20,9 +20,9 @@ class LimitsOptions(RoleOptions):
     """Flags of `coop-limits`."""
 
     ratio: float | None = None
-    """New updates per environment step, from now on; as it is if not given."""
+    """New ratio of updates per environment step, from now on (default: unchanged)."""
     tolerance: float | None = None
-    """New environment steps that acting and learning may drift apart; as it is if not given."""
+    """New tolerance in environment steps between acting and learning (default: unchanged)."""
 
 
 def main() -> None:
@@ -34,7 +34,7 @@ def _run() -> None:
     options = cli.parse(LimitsOptions, "coop-limits", "Show, and change, how a run keeps acting and learning in step.")
     stop = Stop()
     stop.on_signals()
-    request = Join("watch", new_incarnation(), [])  # asks where the replay service is
+    request = Join("watch", new_incarnation(), [])  # asks for the replay service's endpoints
     with Node(open_session((), options.connect, options.zenoh_config), options.run, "watch", 0) as node:
         joined = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
     if joined is None:

@@ -1,7 +1,7 @@
 """The replay service: Zenoh queries in front of a `ReplayCore`.
 
-Inserts, draws and questions come in on queues of their own, each with its thread; one lock guards the core. A request
-that the limiter does not admit waits for it, but never longer than `HOLD` seconds: then the reply says retry, and why.
+Inserts, draws and other requests have separate queues, each with its thread; one lock guards the core. A request that
+the limiter does not admit waits, but never longer than `HOLD` seconds: then the reply says retry, and why.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ T = TypeVar("T")
 
 
 class _Gate:
-    """Where requests of one sort wait for the limiter.
+    """The gate at which requests of one kind wait for the limiter.
 
-    The deadline runs from the moment the gate closed, so that requests queued behind the first do not add up.
+    The deadline counts from the moment when the gate closed, so that the waits of queued requests do not add up.
     """
 
     def __init__(self) -> None:
@@ -52,8 +52,8 @@ class ReplayService:
 
     Args:
         epochs: writes the core's part of epochs; the core may have been restored from one.
-        confirmed: until when this service may acknowledge and draw, on the monotonic clock; for ever if not told.
-            Later, another one may serve: a process that was frozen or cut off does not know.
+        confirmed: the time on the monotonic clock until which this service may acknowledge and draw (default: for
+            ever). Later another one may serve, which a process that was frozen or cut off cannot know.
     """
 
     def __init__(self, node: Node, core: ReplayCore, epochs: ReplayEpochs, confirmed: float = math.inf) -> None:
@@ -66,11 +66,11 @@ class ReplayService:
         self._inserts = _Gate()
         self._draws = _Gate()
         self._leaving = False
-        self._broken = ""  # why the core must not be used any more
-        self._batch = bytearray()  # the last one answered; one thread answers, and sending has copied it
+        self._broken = ""  # why the core must no longer be used
+        self._batch = bytearray()  # the last answer; the next one reuses it: one thread answers, and sending copies
 
     def start(self) -> None:
-        """Begin to answer."""
+        """Begin to answer requests."""
         node = self._node
         node.serve(replay_key(node, "insert"), self._insert, depth=INSERT_QUEUE)
         node.serve(replay_key(node, "sample"), self._sample)
@@ -79,7 +79,7 @@ class ReplayService:
         node.serve(replay_key(node, "snapshot"), self._snapshot)
 
     def run(self, stop: Stop, console: Console) -> None:
-        """Tell displays what goes on, until the stop; then acknowledge and draw no more, but save epochs still."""
+        """Publish the status until the stop; from then on save epochs, but acknowledge and draw nothing."""
         problem = ""
         while not stop.wait(STATUS_EVERY):
             if self._broken:
@@ -106,22 +106,22 @@ class ReplayService:
             self._changed.notify_all()
 
     def progress(self) -> str:
-        """How far the run is, in one line."""
+        """The run's progress in one line."""
         stats = self.stats()
         return f"{stats.inserted:,} transitions taken, {stats.size:,} held, {stats.drawn:,} batches drawn"
 
     def close(self) -> None:
-        """Wait for what is being written."""
+        """Wait for the epoch being written."""
         self._epochs.close()
 
     def confirm(self, until: float) -> None:
-        """Acknowledge and draw until then, see `confirmed`."""
+        """Permit acknowledging and drawing until then, see `confirmed`."""
         with self._changed:
             self._confirmed = until
             self._changed.notify_all()
 
     def stats(self) -> ReplayStats:
-        """The counters, taken at one moment."""
+        """The counters at one moment."""
         with self._changed:
             core, table = self._core, self._core.table
             return ReplayStats(
@@ -156,7 +156,7 @@ class ReplayService:
         return outcome
 
     def _draw(self, request: DrawRequest) -> bytearray | Wait:
-        """A batch as a message, its frames copied from where they lie straight into it."""
+        """Draw a batch as a message, whose frames are copied straight from the table."""
         reply = self._core.draw(request)
         if isinstance(reply, Wait):
             return reply
@@ -164,9 +164,9 @@ class ReplayService:
         return encode_batch(self._node.run, batch.frames, batch.columns, drawn, into=self._batch)
 
     def _admit(self, gate: _Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
-        """Try, and try again whenever the core has changed, until the gate's deadline."""
+        """Try, and repeat whenever the core has changed, until the gate's deadline."""
         with self._changed:
-            if self._broken:  # and let others send it again, to the one that follows
+            if self._broken:  # senders repeat their requests to the next replay service
                 return Wait(self._broken)
         with self._changing():
             while isinstance(outcome := self._why_not() or attempt(), Wait):
@@ -182,10 +182,10 @@ class ReplayService:
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
-        """Hold the lock, and note where an error of this program may have left the core half changed.
+        """Hold the lock, and note if a bug in this program may have left the core half changed.
 
         Raises:
-            RunError: that has happened before, and nothing may be done with the core any more.
+            RunError: this has happened before, so the core must no longer be used.
         """
         with self._changed:
             if self._broken:
@@ -199,7 +199,7 @@ class ReplayService:
                 raise
 
     def _why_not(self) -> Wait | None:
-        """Why this service may neither acknowledge nor draw now; None while it may."""
+        """Why this service must neither acknowledge nor draw now; None if it may."""
         if self._leaving:
             return Wait(LEAVING)
         return None if time.monotonic() < self._confirmed else Wait(UNCONFIRMED)

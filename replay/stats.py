@@ -1,4 +1,4 @@
-"""What a table tells of itself: counts, reuse, and its state at one moment."""
+"""A table's statistics, and its snapshot."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ REUSE_BUCKETS = 16
 
 @dataclass(frozen=True, slots=True)
 class TableStats:
-    """Counts since the table began, and what it holds now.
+    """Counts since the table's beginning, and its present contents.
 
     inserted, evicted, evicted_unsampled: transitions (one that reservoir eviction never kept counts as evicted).
     batches, sampled: sample calls and transitions drawn.
-    reuse_mean: draws per held transition. reuse_held, reuse_evicted: transitions by how often they had been drawn;
-    entry 0 counts those never drawn, entry b those drawn 2^(b-1) to 2^b - 1 times, the last one all above.
+    reuse_mean: draws per transition held. reuse_held, reuse_evicted: transitions by how often they have been drawn;
+    entry 0 counts those never drawn, entry b those drawn 2^(b-1) to 2^b - 1 times, the last entry all above.
     """
 
     size: int
@@ -38,9 +38,9 @@ class TableStats:
 
 
 class TableSnapshot(NamedTuple):
-    """A table's state at one moment, while the table goes on.
+    """A table's state at one moment, while the table stays in use.
 
-    meta, arrays: as in `Table.state`, but for the array "frames". frames: its content, to be read in pieces of any
+    meta, arrays: as in `Table.state`, except the array "frames". frames: its content, to be read in pieces of any
     size between other calls on the table, and to be released at the end (it is a context manager).
     """
 

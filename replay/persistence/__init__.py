@@ -1,1 +1,1 @@
-"""What of a replay service is on disk: snapshots for epochs, the journal, and recovery from both."""
+"""The replay service's files: snapshots for epochs, the journal, and recovery from both."""

@@ -1,4 +1,4 @@
-"""The replay service's part in the epochs of a run: writes it beside the traffic, finds it again, drops old ones."""
+"""The replay service's parts of a run's epochs: writes them during operation, restores them, deletes old ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PART = "replay"
 
 
 class ReplayEpochs:
-    """Parts of epochs under `checkpoints/` of a folder, written one at a time in a thread of their own."""
+    """Parts of epochs under `checkpoints/` of a folder, written one at a time in a separate thread."""
 
     def __init__(self, folder: Path, run_id: int, journal: Journal | None = None) -> None:
         self._folder = folder
@@ -28,9 +28,9 @@ class ReplayEpochs:
         self._problem = ""
 
     def begin(self, core: ReplayCore, lock: threading.Condition, number: int, keep: list[int]) -> None:
-        """Freeze the core as it is now and begin to write it; returns before it is written.
+        """Freeze the core's present state and begin to write it; return before it is written.
 
-        keep: the older epochs that are still needed. Asking again for the one that is being written changes nothing.
+        keep: the older epochs that are still needed. A repeated call for the epoch being written changes nothing.
 
         Raises:
             RunError: another epoch is being written, or there is no space for the journal.
@@ -54,7 +54,7 @@ class ReplayEpochs:
                 self._on_disk = True
             except OSError as error:
                 self._problem = f"{path}: {error.strerror or error}"
-            except Exception as error:  # whatever it is, who asks must not take the part for written
+            except Exception as error:  # whatever it is, the part must not count as written
                 self._problem = f"{path}: {type(error).__name__}: {error}"
                 raise
 
@@ -63,7 +63,7 @@ class ReplayEpochs:
         self._writer.start()
 
     def written(self, number: int, seconds: float) -> bool:
-        """Wait up to `seconds`; True if the part of epoch `number` is on disk, False if it is being written.
+        """Wait up to `seconds`; return whether the part of epoch `number` is on disk (False: it is being written).
 
         Raises:
             RunError: it was not begun or could not be written.
@@ -78,14 +78,14 @@ class ReplayEpochs:
         return True
 
     def whole(self) -> list[int]:
-        """Numbers of the parts that are as they were written, in ascending order."""
+        """Numbers of the intact parts, in ascending order."""
         return [number for number in part_numbers(self._folder) if is_whole(part_path(self._folder, number))]
 
     def restore(self, core: ReplayCore, number: int) -> tuple[int, str]:
-        """Let a new core go on from the newest whole part up to epoch `number`, if there is one.
+        """Restore a new core from the newest intact part up to epoch `number`, if there is one.
 
         Returns:
-            The first file of the journal that continues it, and what was found, in words.
+            The first file of the journal that continues it, and a description of the part.
 
         Raises:
             RunError: it belongs to another run.
@@ -103,19 +103,20 @@ class ReplayEpochs:
         return 1, f"{torn}no epoch to restore"
 
     def clear(self) -> None:
-        """Drop every part."""
+        """Delete every part."""
         for number in part_numbers(self._folder):
             self._remove(number)
 
     def close(self) -> None:
-        """Wait for what is being written."""
+        """Wait for the part being written."""
         if self._writer is not None:
             self._writer.join()
 
     def _drop(self, keep: set[int], covered: list[int]) -> None:
-        """Drop the other parts, and the journal that none of those that the learner has finished needs.
+        """Delete the parts not in `keep`, and the journal's files that no finished epoch needs.
 
-        covered: their numbers. While there are none, a learner that comes back begins with the journal's first file.
+        covered: numbers of the epochs that the learner has finished. If there are none, recovery begins with the
+        journal's first file.
         """
         for number in set(part_numbers(self._folder)) - keep:
             self._remove(number)
@@ -126,16 +127,16 @@ class ReplayEpochs:
     def _remove(self, number: int) -> None:
         path = part_path(self._folder, number)
         shutil.rmtree(path, ignore_errors=True)
-        with contextlib.suppress(OSError):  # the learner's part may be there too
+        with contextlib.suppress(OSError):  # the folder may contain the learner's part
             path.parent.rmdir()
 
 
 def part_path(folder: Path, number: int) -> Path:
-    """Where the replay service's part of an epoch is in a folder."""
+    """Path of the replay service's part of an epoch in a folder."""
     return folder / "checkpoints" / str(number) / PART
 
 
 def part_numbers(folder: Path) -> list[int]:
-    """Numbers of the epochs that a folder holds parts of, in ascending order."""
+    """Numbers of the epochs of which a folder holds parts, in ascending order."""
     found = (path.parent.name for path in (folder / "checkpoints").glob(f"*/{PART}"))
     return sorted(int(name) for name in found if name.isdigit())

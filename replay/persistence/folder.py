@@ -1,4 +1,4 @@
-"""A replay service's folder: whose it is, and that one process at a time works in it."""
+"""A replay service's folder, which belongs to one run and to one process at a time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from replay.persistence.storage import read_mark
 
 
 class ReplayFolder:
-    """Where one run's replay service keeps its parts of epochs and its journal; the learner's files may be here too.
+    """The folder of a replay service's parts of epochs and journal; it may also contain the learner's files.
 
     path, run_id: of the folder, and of the run. journal: the journal's folder.
     """
@@ -24,11 +24,11 @@ class ReplayFolder:
         self.journal = path / "journal"
 
     def check(self, *, resume: bool) -> str:
-        """Look whose the folder is and what it holds, and write nothing; what was found, in words.
+        """Check the folder's run and contents, without writing; return a description of what was found.
 
         Raises:
-            RunError: it is another run's.
-            UsageError: a replay service of this run has worked here, and it is not to go on.
+            RunError: it belongs to another run.
+            UsageError: it holds data of this run, but `resume` is False.
         """
         if has_run_id(self.path):
             check_owner(self.path, read_run_id(self.path), self.run_id)
@@ -47,10 +47,10 @@ class ReplayFolder:
         return f"goes on in {self.path}"
 
     def lock(self) -> RunLock:
-        """Lock the folder and make it the run's.
+        """Lock the folder and assign it to the run.
 
         Raises:
-            RunError: another process works in it, it has become another run's, or it can't be written.
+            RunError: another process uses it, it now belongs to another run, or it cannot be written.
         """
         lock = RunLock(self.path, "coop-replay", ("replay",))
         try:

@@ -1,8 +1,8 @@
-"""The journal: every accepted segment and every draw, in order, appended to files before anybody is answered.
+"""The journal: every accepted segment and every draw, appended to files in order before the request is answered.
 
-A file is a row of records `[u32 checksum][u32 kind][u64 number][u64 length][payload]`; the first names the run and the
-file. What was handed to the operating system survives a kill -9 of this process, so records are written, not synced.
-Files that are not needed any more are written over: their pages are in memory already, which saves half of the time.
+A file is a sequence of records `[u32 checksum][u32 kind][u64 number][u64 length][payload]`; the first record names the
+run and the file. Data handed to the operating system survive a kill -9 of this process, so records are written but not
+synced. Files that are no longer needed are overwritten: their pages are in memory already, which halves the time.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from replay.limiter import RateLimiter
 
 FORMAT = 1
 BEGIN, SEGMENT, DRAW, LIMITER, END = range(5)
-BEGIN_BYTES = 64  # more than the record that names a file holds
-ROLL_AT = 1 << 28  # bytes after which a new file is begun
+BEGIN_BYTES = 64  # more than the record that names a file
+ROLL_AT = 1 << 28  # bytes after which the next file begins
 
 _HEADER = struct.Struct("<IIQQ")
-_LANES = 1024  # columns of 64 bits that a checksum adds up
-_SPARE = "spare"  # a file that is to be written over
+_LANES = 1024  # 64-bit columns that a checksum adds up
+_SPARE = "spare"  # a file to be overwritten
 
 
 class TornFile(RunError):
-    """A journal file that ends in something that is no whole record; `end` is where the whole ones end, in bytes."""
+    """A journal file that ends with an incomplete record; `end` is the offset after the last complete one."""
 
     def __init__(self, path: Path, end: int) -> None:
         super().__init__(f"{path}: no whole record at byte {end}")
@@ -55,40 +55,40 @@ class Record(NamedTuple):
 
 
 class Journal:
-    """Appends to the journal in `folder`; a `Recorder` of the replay service's core.
+    """Appends to the journal in `folder`, as the `Recorder` of the replay service's core.
 
     Args:
-        number: of the file to begin.
-        keep: never drop files.
+        number: of the first file to write.
+        keep: never delete files.
     """
 
     def __init__(self, folder: Path, run_id: int, number: int, *, keep: bool) -> None:
-        """Raises OSError where the file can't be begun."""
+        """Raise OSError if the file cannot be created."""
         self._folder = folder
         self._run_id = run_id
         self._keep = keep
-        self._late: list[tuple[int, bytes]] = []  # records of draws that there was no space for
+        self._late: list[tuple[int, bytes]] = []  # records of draws for which there was no space
         folder.mkdir(parents=True, exist_ok=True)
         self._open(number)
 
     def insert(self, payload: bytes) -> None:
-        """Take down an insert request; raises OSError, and nothing was taken down then."""
+        """Record an insert request; raises OSError, and then has recorded nothing."""
         self._append(SEGMENT, payload)
 
     def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
-        """Take down a draw. Without space it is kept and goes before whatever is taken down next."""
+        """Record a draw. If there is no space, it is kept and written before the next record."""
         self._late.append((DRAW, msgpack.packb([*msgspec.structs.astuple(request), ids.tobytes()])))
         with contextlib.suppress(OSError):
             self._append_late()
 
     def limit(self, limiter: RateLimiter) -> None:
-        """Take down new settings of the limiter; raises OSError."""
+        """Record new settings of the limiter; raises OSError."""
         self._append(LIMITER, msgpack.packb(asdict(limiter)))
 
     def roll(self) -> int:
-        """Begin the next file, whose number is returned; raises OSError, and this file goes on then."""
+        """Begin the next file and return its number; raises OSError, and then continues the present file."""
         self._append_late()
-        self._write(END, b"")  # behind it may be what is left of an older file
+        self._write(END, b"")  # remains of an older file may follow
         before = self._file
         try:
             self._open(self._number + 1)
@@ -100,7 +100,7 @@ class Journal:
         return self._number
 
     def drop(self, before: int) -> None:
-        """Give up the files with lower numbers, unless all are to be kept."""
+        """Release the files with lower numbers, unless all are to be kept."""
         for number in () if self._keep else journal_files(self._folder):
             if number < before:
                 _path(self._folder, number).replace(self._folder / _SPARE)
@@ -142,11 +142,11 @@ class Journal:
 
 
 def _write(file: int, at: int, kind: int, number: int, place: int, payload: bytes) -> int:
-    """Write one record; the offset behind it. Raises OSError, the file ending at `at` then."""
+    """Write one record and return the offset after it. Raises OSError, and then leaves the file's end at `at`."""
     header = _HEADER.pack(_checksum(kind, number, place, payload), kind, place, len(payload))
     try:
         written = os.pwritev(file, [header, payload], at)
-        if written < len(header) + len(payload):  # cut short, most likely by a disk that is full: the rest tells
+        if written < len(header) + len(payload):  # the disk is probably full: writing the rest raises
             written += os.pwrite(file, (header + payload)[written:], at + written)
         if written < len(header) + len(payload):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -163,18 +163,18 @@ def journal_files(folder: Path) -> list[int]:
 
 
 def drop_journal(folder: Path) -> None:
-    """Drop every file of a journal; raises OSError."""
+    """Delete every file of a journal; raises OSError."""
     for number in journal_files(folder):
         _path(folder, number).unlink()
 
 
 def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record]:
-    """The records of one file, but for the one that names it.
+    """Yield the records of one file, except the one that names it.
 
     Raises:
-        UsageError: the file is of another format.
-        TornFile: what follows the records given is no whole one.
-        RunError: it can't be read, or belongs to another run.
+        UsageError: the file has another format.
+        TornFile: an incomplete record follows those yielded.
+        RunError: it cannot be read, or belongs to another run.
     """
     path = _path(folder, number)
     try:
@@ -201,7 +201,7 @@ def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record]:
 
 
 def read_owner(folder: Path, number: int) -> int | None:
-    """The id of the run that a file belongs to; None where the file is torn before it tells."""
+    """The id of the run to which a file belongs; None if the file's first record is incomplete."""
     try:
         with _path(folder, number).open("rb") as file:
             header = file.read(_HEADER.size)
@@ -222,13 +222,13 @@ def _check_begin(path: Path, payload: bytes, run_id: int) -> None:
 
 
 def read_draw(payload: bytes) -> tuple[DrawRequest, NDArray[np.int64]]:
-    """A draw as it was taken down: the request, and the transitions that it gave."""
+    """Read a recorded draw: the request, and the ids of the transitions drawn, int64 [batch]."""
     *request, ids = msgpack.unpackb(payload)
     return DrawRequest(*request), np.frombuffer(ids, np.int64)
 
 
 def read_limiter(payload: bytes) -> RateLimiter:
-    """Settings of the limiter as they were taken down."""
+    """Read recorded settings of the limiter."""
     return RateLimiter.from_table(msgpack.unpackb(payload))
 
 
@@ -237,9 +237,9 @@ def _path(folder: Path, number: int) -> Path:
 
 
 def _checksum(kind: int, number: int, place: int, payload: bytes) -> int:
-    """CRC-32 over sums of the payload's 64-bit columns: a tenth of the time of CRC-32 over all of it.
+    """CRC-32 over sums of the payload's 64-bit columns, in a tenth of the time of CRC-32 over the whole payload.
 
-    number, place: of the file and in it, so that what an older file left behind does not pass for a record.
+    number, place: of the file, and of the record in it, so that remains of an older file do not pass for a record.
     """
     whole = len(payload) // (8 * _LANES) * 8 * _LANES
     lanes = np.frombuffer(payload, np.uint64, whole // 8).reshape(-1, _LANES).sum(axis=0, dtype=np.uint64)

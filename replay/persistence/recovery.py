@@ -1,4 +1,4 @@
-"""Carries out again, on a core, what a journal took down: after a kill -9, and to re-execute a run."""
+"""Replays a journal on a core: after a kill -9, and to re-execute a run."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from replay.table.table import PinnedBatch
 
 
 def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[int, str]:
-    """Bring a core from the beginning of file `first` to the end of its journal; the next free number, and words.
+    """Replay the journal on a core from file `first` to its end; return the next file's number, and a description.
 
-    A file that ends in a torn record, as a kill leaves it, is cut there.
+    A file that ends with a torn record, as a kill leaves it, is cut there.
 
     Raises:
-        RunError: the journal belongs to another run, files are missing or too short, or carrying out gives something
-            else than was taken down.
+        RunError: the journal belongs to another run, files are missing or too short, or the replay deviates from the
+            record.
     """
     before, draws = core.table.inserted, 0
     numbers = following_files(folder, first)
@@ -50,7 +50,7 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
 
 
 def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
-    """Carry out one file; gives every draw, to be read before the next one. Raises as `recover`."""
+    """Replay one file; yields every draw, which must be read before the next one. Raises as `recover`."""
     read = SegmentReader(core.table.spec)
     for kind, payload in read_file(folder, number, run_id):
         if kind == SEGMENT:
@@ -66,7 +66,7 @@ def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Itera
 
 
 def following_files(folder: Path, first: int) -> list[int]:
-    """Numbers of a journal's files from `first` on; raises RunError where one is missing."""
+    """Numbers of a journal's files from `first` on; raises RunError if one is missing."""
     numbers = [number for number in journal_files(folder) if number >= first]
     if numbers != list(range(first, first + len(numbers))):
         raise RunError(f"{folder}: has files {numbers}, should have every one from {first} on")

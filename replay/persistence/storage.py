@@ -1,6 +1,6 @@
 """The replay service's part of an epoch on disk: `replay/` with one `.npy` file per array, and `state.msgpack`.
 
-The folder gets its name when everything in it is on the disk. `state.msgpack` holds the size and checksum of the other
+The folder gets its name once everything in it is on the disk. `state.msgpack` holds the sizes and checksums of the other
 files and begins with its own checksum.
 """
 
@@ -30,23 +30,23 @@ STATE = "state.msgpack"
 
 
 class TornSnapshot(Exception):
-    """A folder that is not a whole snapshot; says what is wrong with it."""
+    """A folder is not an intact snapshot; the message says why."""
 
 
 class Mark(NamedTuple):
-    """What a snapshot belongs to: the id of its run, and the first file of the journal that continues it."""
+    """The id of a snapshot's run, and the first file of the journal that continues the snapshot."""
 
     run_id: int
     journal: int
 
 
 def save_snapshot(snapshot: CoreSnapshot, lock: threading.Condition, path: Path, mark: Mark) -> None:
-    """Write a core's snapshot to the folder `path`, whole or not at all, and release it.
+    """Write a core's snapshot to the folder `path`, completely or not at all, and release it.
 
-    lock: held only in short pieces, to read frames of the table that goes on.
+    lock: held only for short times, to read frames of the table, which stays in use.
 
     Raises:
-        OSError: the folder can't be written.
+        OSError: the folder cannot be written.
     """
     part = path.with_name(path.name + ".part")
     try:
@@ -95,12 +95,12 @@ def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path, mark: 
 
 
 def load_snapshot(core: ReplayCore, path: Path, run_id: int) -> Mark:
-    """Let a new core go on from the snapshot in `path`.
+    """Restore a new core from the snapshot in `path`.
 
     Raises:
-        TornSnapshot: the folder is not a whole snapshot; the core is as before.
-        RunError: it is a snapshot of another run.
-        UsageError: it is one of a table with other settings.
+        TornSnapshot: the folder is not an intact snapshot; the core is unchanged.
+        RunError: the snapshot belongs to another run.
+        UsageError: the snapshot's table has other settings.
     """
     state = _read_state(path / STATE)
     check_owner(path, state["mark"][0], run_id)
@@ -110,14 +110,14 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int) -> Mark:
         replies = [read(wire.decode(payload, wire.ON_DISK)) for payload in state["replies"]]
     except BadMessage as error:
         raise TornSnapshot(f"{path / STATE}: {error}") from error
-    listed = state["episodes"] if "episodes" in state else state["books"]["episodes"]  # where older versions have them
+    listed = state["episodes"] if "episodes" in state else state["books"]["episodes"]  # where older versions saved them
     episodes = [EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in listed]
     core.restore(state["books"], episodes, state["table"], arrays, replies)
     return Mark(*state["mark"])
 
 
 def read_mark(path: Path) -> Mark | None:
-    """What the snapshot in `path` belongs to; None where it is torn."""
+    """Read the mark of the snapshot in `path`; None if it is torn."""
     try:
         return Mark(*_read_state(path / STATE)["mark"])
     except TornSnapshot:
@@ -125,7 +125,7 @@ def read_mark(path: Path) -> Mark | None:
 
 
 def is_whole(path: Path) -> bool:
-    """True where the snapshot in `path` is as it was written; reads all of it."""
+    """Whether the snapshot in `path` is intact; reads all of it."""
     try:
         state = _read_state(path / STATE)
         return all(measure(path / f"{name}.npy") == tuple(written) for name, written in state["files"].items())
@@ -145,7 +145,7 @@ def _read_state(path: Path) -> dict[str, Any]:
 
 
 def _read_array(path: Path, written: tuple[int, int]) -> Array:
-    """The array of a file that is as it was written; a large one stays on disk, for the table copies it."""
+    """Read the array of an intact file; a large one stays on disk, because the table copies it."""
     try:
         found = measure(path)
     except OSError as error:

@@ -1,1 +1,1 @@
-"""The replay table: exact capacity, each frame stored once, eviction and sampling policies."""
+"""The replay table: exact capacity, each frame stored once, policies of eviction and sampling."""

@@ -1,4 +1,4 @@
-"""Frames held once each, however many transitions stack them: reference-counted slots in memory that grows."""
+"""Stores each frame once, however many transitions stack it, in reference-counted slots of growing memory."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ GROWTH = 1.5
 
 
 class FrameStore:
-    """Slots of one frame each; a slot is free again when its last reference is dropped.
+    """Slots of one frame each; a slot becomes free when its last reference is dropped.
 
-    Slots are used from the lowest up and freed ones are used first, in one private mapping that is enlarged in
-    place: memory is committed page by page as frames are written, so it follows the most frames ever held at
-    once. Not safe for threads: one owner makes all calls, those of `PinnedFrames` included.
+    Freed slots are used first, then unused ones in ascending order, in one private mapping that is enlarged in
+    place: memory is committed page by page as frames are written, so it follows the largest number of frames held at
+    once. Not thread-safe: one owner makes all calls, including those of `PinnedFrames`.
     """
 
     def __init__(self, frame_shape: tuple[int, ...], frame_dtype: str) -> None:
@@ -30,7 +30,7 @@ class FrameStore:
         self.dtype = np.dtype(frame_dtype)
         self._elements = int(np.prod(frame_shape))
         self.frame_bytes = self._elements * self.dtype.itemsize
-        self._used = 0  # slots ever used; those from here up were never written
+        self._used = 0  # slots ever used; those above were never written
         self._free_count = 0
         self._references = np.zeros(FIRST_SLOTS, np.int32)
         self._free = np.zeros(FIRST_SLOTS, np.int32)  # a stack of free slots below `_used`
@@ -50,11 +50,11 @@ class FrameStore:
 
     @property
     def bytes_held(self) -> int:
-        """Bytes of the held frames and of the three counters kept for every slot ever used."""
+        """Bytes of the held frames and of the three counters of every slot ever used."""
         return self.held * self.frame_bytes + self._used * 3 * self._references.itemsize
 
     def add(self, frames: Array, references: NDArray[np.intp]) -> Slots:
-        """Store frames [n, *frame_shape], each with so many references (>= 1); give their slots, intp [n]."""
+        """Store frames [n, *frame_shape] with references intp [n] (>= 1) each; return their slots, intp [n]."""
         count = len(frames)
         recycled = min(count, self._free_count)
         fresh = count - recycled
@@ -71,11 +71,11 @@ class FrameStore:
         return slots
 
     def hold(self, slots: Slots, references: NDArray[np.intp] | int = 1) -> None:
-        """Add references to slots that are held already and that do not repeat."""
+        """Add references to distinct slots that are already held."""
         self._references[slots] += np.asarray(references, np.int32)
 
     def drop(self, slots: Slots) -> None:
-        """Take one reference away for every time a slot is named; slots that nobody refers to become free."""
+        """Remove one reference for each occurrence of a slot; slots without references become free."""
         np.subtract.at(self._references, slots, np.int32(1))
         gone = slots[self._references[slots] == 0]
         if len(gone):
@@ -85,10 +85,10 @@ class FrameStore:
             self._free_count += len(gone)
 
     def unique(self, slots: Slots) -> tuple[Slots, NDArray[np.int32]]:
-        """Distinct slots among `slots`, and for each of `slots` its place among them, in the same shape.
+        """The distinct slots among `slots`, and the index of each slot among them, in the shape of `slots`.
 
-        The order depends only on which slots are equal, never on their numbers. Marks in a scratch array take a
-        fifth of the time of sorting.
+        The order depends only on which slots are equal, not on their numbers. Marks in a scratch array take a fifth of
+        the time of sorting.
         """
         flat = slots.reshape(-1)
         distinct = self._distinct(flat)
@@ -96,15 +96,15 @@ class FrameStore:
         return distinct, self._mark[flat].reshape(slots.shape)
 
     def read(self, slots: Slots, out: Array | None = None) -> Array:
-        """Copy of the frames in `slots`: [n, *frame_shape]; in `out`, contiguous memory, if it is given."""
+        """Copy the frames in `slots`, [n, *frame_shape], to `out`, contiguous memory, or to a new array."""
         if out is None:
             return self._rows.take(slots, axis=0).reshape(len(slots), *self.frame_shape)
-        # mode: without it numpy copies to memory of its own first
+        # mode: without it numpy first copies to a buffer
         self._rows.take(slots, axis=0, out=out.reshape(len(slots), self._elements), mode="clip")
         return out
 
     def pin(self, slots: Slots) -> PinnedFrames:
-        """Hold distinct slots as they are now, to be copied out later."""
+        """Keep the frames of distinct slots unchanged, to be copied later."""
         return PinnedFrames(self, slots)
 
     def _distinct(self, slots: Slots) -> Slots:
@@ -122,13 +122,13 @@ class FrameStore:
             larger = np.zeros(slots, np.int32)  # zeros are committed only when written
             larger[: self._used] = getattr(self, name)[: self._used]
             setattr(self, name, larger)
-        del self._rows  # a mapping with a view on it can't be moved
+        del self._rows  # a mapping cannot be moved while a view on it exists
         self._memory.resize(slots * self.frame_bytes)
         self._rows = self._view(slots)
 
 
 class PinnedFrames:
-    """Frames of a store that stay as they are until `release`, whatever is evicted meanwhile; a `wire.Source`."""
+    """Frames of a store that stay unchanged until `release`, whatever is evicted meanwhile; a `wire.Source`."""
 
     def __init__(self, store: FrameStore, slots: Slots) -> None:
         self._store = store
@@ -140,7 +140,7 @@ class PinnedFrames:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of a frame's elements."""
+        """Of the frames' elements."""
         return self._store.dtype
 
     @property
@@ -150,19 +150,19 @@ class PinnedFrames:
 
     @property
     def nbytes(self) -> int:
-        """Of all of them."""
+        """Of all pinned frames."""
         return len(self._slots) * self._store.frame_bytes
 
     def copy_to(self, out: Array) -> None:
-        """Copy them all to `out`, contiguous memory [n, *frame_shape]."""
+        """Copy all pinned frames to `out`, contiguous memory [n, *frame_shape]."""
         self._store.read(self._slots, out)
 
     def read(self, start: int = 0, stop: int | None = None) -> Array:
-        """Copy of the pinned frames start..stop, all if not given: [stop - start, *frame_shape]."""
+        """Copy of the pinned frames start..stop (default: all): [stop - start, *frame_shape]."""
         return self._store.read(self._slots[start:stop])
 
     def release(self) -> None:
-        """Give the frames back; a second call changes nothing."""
+        """Release the frames; a second call does nothing."""
         slots, self._slots = self._slots, self._slots[:0]
         self._store.drop(slots)
 
@@ -176,7 +176,7 @@ class PinnedFrames:
 
 
 def as_slice(indices: Slots) -> slice | Slots:
-    """Ascending indices as a slice where they have no gap, so that frames are copied once and not twice."""
+    """Convert ascending indices without gaps to a slice, so that frames are copied once and not twice."""
     if len(indices) and indices[-1] - indices[0] + 1 == len(indices):
         return slice(int(indices[0]), int(indices[-1]) + 1)
     return indices

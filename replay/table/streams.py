@@ -1,4 +1,4 @@
-"""How segments' frames come into the store: those that a segment shares with the one before it are not stored again."""
+"""Stores segments' frames, without storing again those that a segment shares with its predecessor."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ MAX_STREAMS = 4096
 
 
 class StreamTails:
-    """Of each stream the last segment's number and the slots of its last frames, which the next segment may carry.
+    """The last segment's number and the slots of its last frames of each stream, which the next segment may repeat.
 
-    A tail holds a reference on each of its frames that is stored; -1 stands for one that is not. Beyond `MAX_STREAMS`
-    the stream that has been silent longest is forgotten.
+    A tail holds a reference to each of its stored frames; -1 stands for a frame that is not stored. Beyond
+    `MAX_STREAMS`, the stream that has been silent longest is forgotten.
     """
 
     def __init__(self, frames: FrameStore, stack: int) -> None:
@@ -26,10 +26,10 @@ class StreamTails:
         self._tails: OrderedDict[tuple[int, int], tuple[int, Slots]] = OrderedDict()
 
     def store(self, segment: Segment, index: NDArray[np.int32]) -> tuple[Slots, Slots]:
-        """Store the frames of a segment that `index` names, each once.
+        """Store those frames of a segment that occur in `index`, each once.
 
-        Returns (slots of all its frames, -1 where not stored; slots to drop once the transitions are in place).
-        The stream keeps a reference on its last frames, as many as the next segment is likely to carry.
+        Returns (slots of all its frames, -1 if not stored; slots to drop once the transitions are in place).
+        The stream keeps references to its last frames, as many as the next segment is likely to repeat.
         """
         count = len(segment.frames)
         references = np.bincount(index.reshape(-1), minlength=count)
@@ -53,7 +53,7 @@ class StreamTails:
         return slots, previous[previous >= 0]
 
     def slots(self) -> Slots:
-        """Those of all tails, one stream after the other."""
+        """The slots of all tails, stream by stream."""
         return np.concatenate([*(tail for _, tail in self._tails.values()), np.empty(0, np.intp)])
 
     def streams(self) -> list[list[int]]:
@@ -61,7 +61,7 @@ class StreamTails:
         return [[*key, sequence, len(tail)] for key, (sequence, tail) in self._tails.items()]
 
     def load_state(self, streams: list[list[int]], slots: Slots) -> None:
-        """Continue from what `streams` and `slots` gave; the references are the caller's to take."""
+        """Restore the values of `streams` and `slots`; the caller must add the references."""
         start = 0
         for incarnation, stream, sequence, length in streams:
             self._tails[incarnation, stream] = sequence, slots[start : start + length].copy()

@@ -1,4 +1,4 @@
-"""The table of transitions: exact capacity, each frame once, eviction and sampling by policy, state to the bit."""
+"""The table of transitions: exact capacity, each frame stored once, policies of eviction and sampling, exact state."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS = ("actions", "rewards", "terminated", "span", "param_version", "ids", "
 
 
 class PinnedBatch(NamedTuple):
-    """A batch whose frames lie in the table, held there until they are released.
+    """A batch whose frames stay in the table until they are released.
 
     columns: the other fields of a `Batch`, by name.
     """
@@ -37,8 +37,8 @@ class PinnedBatch(NamedTuple):
 class Table:
     """Transitions of one environment, at most `capacity` of them, over frames stored once each.
 
-    Plain and deterministic: all chance comes from `rng` (a Generator over PCG64, which the table's state includes).
-    Not safe for threads: one owner makes all calls.
+    Deterministic: all random numbers come from `rng` (a Generator over PCG64, which the table's state includes).
+    Not thread-safe: one owner makes all calls.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Table:
         importance_exponent: float = 0.4,
         replacement: bool = True,
     ) -> None:
-        """Raises UsageError for a capacity below 1, exponents below 0 or a policy that does not exist."""
+        """Raise UsageError for a capacity below 1, exponents below 0 or an unknown policy."""
         if capacity < 1:
             raise UsageError(f"capacity: {capacity} transitions, must be at least 1")
         for name, exponent in (("priority", priority_exponent), ("importance", importance_exponent)):
@@ -103,11 +103,11 @@ class Table:
 
     @property
     def evicted_unsampled(self) -> int:
-        """Transitions evicted, or never kept, that no batch had held."""
+        """Transitions evicted, or never kept, that were never drawn."""
         return int(self._reuse_evicted[0])
 
     def insert(self, segment: Segment) -> None:
-        """Add a segment that has been validated and is no duplicate, evicting what the policy chooses."""
+        """Insert a valid segment that is no duplicate; the eviction policy chooses the transitions to evict."""
         size = len(self)
         first = self.inserted
         rows, kept = self._eviction.place(first, segment.steps)
@@ -136,29 +136,29 @@ class Table:
             self._set_priorities(rows, np.full(len(rows), self._max_priority))
 
     def sample(self, batch_size: int) -> Batch:
-        """Draw transitions by the sampling policy. Raises ValueError while the table is empty."""
+        """Draw transitions by the sampling policy. Raises ValueError if the table is empty."""
         slots, columns = self._draw(batch_size)
         return Batch(frames=self._frames.read(slots), **columns)
 
     def sample_pinned(self, batch_size: int) -> PinnedBatch:
-        """`sample`, with the frames left where they lie."""
+        """Draw like `sample`, but leave the frames in the table."""
         slots, columns = self._draw(batch_size)
         return PinnedBatch(self._frames.pin(slots), columns)
 
     def pin(self, batch: Batch) -> PinnedBatch:
-        """Take in the frames of a batch that was drawn before this table came back from its state."""
+        """Store the frames of a batch that was drawn before this table was restored."""
         slots = self._frames.add(batch.frames, np.ones(len(batch.frames), np.intp))
         pinned = self._frames.pin(slots)
         self._frames.drop(slots)
         return PinnedBatch(pinned, batch.columns())
 
     def _draw(self, batch_size: int) -> tuple[Slots, dict[str, Array]]:
-        """Slots of the distinct frames of a batch, and its other fields."""
+        """Draw a batch: the slots of its distinct frames, and its other fields."""
         size = len(self)
         if size == 0:
             raise ValueError("an empty table has nothing to sample")
         rows, weights = self._sampling.draw(batch_size, size)
-        # Transition by transition: neighbouring frames are then read one after the other.
+        # Transition by transition, so that neighbouring frames are read one after another.
         distinct, index = self._frames.unique(self._slots.take(rows, axis=0).astype(np.intp))
         np.add.at(self._reuse, rows, np.int32(1))
         self.batches += 1
@@ -179,11 +179,11 @@ class Table:
         }
 
     def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.floating[Any]]) -> None:
-        """Give transitions new priorities (float [n], usually |TD error|); ids no longer held are ignored.
+        """Set transitions' priorities (float [n], usually |TD error|); ignores ids that are no longer held.
 
-        New transitions get the largest priority seen so far (1 at first). Where an id repeats, its last priority
-        counts. Without a prioritized policy nothing changes. Raises ValueError for a priority that is negative or
-        not finite, or lengths that differ.
+        New transitions get the largest priority so far (1 at first). If an id repeats, its last priority
+        counts. Without a prioritized policy this does nothing. Raises ValueError for a priority that is negative or
+        not finite, and for different lengths.
         """
         given = np.asarray(priorities, np.float64)
         if len(ids) != len(given) or not np.all(np.isfinite(given) & (given >= 0)):
@@ -201,7 +201,7 @@ class Table:
             self._set_priorities(rows[held], given[held])
 
     def stats(self) -> TableStats:
-        """Counts and diagnostics, in time proportional to the transitions held."""
+        """Compute counts and diagnostics, in time proportional to the number of transitions held."""
         size = len(self)
         reuse = self._reuse[:size]
         row_bytes = (self._slots.nbytes + sum(self._column(name).nbytes for name in COLUMNS)) // self.capacity
@@ -220,7 +220,7 @@ class Table:
         )
 
     def snapshot(self) -> TableSnapshot:
-        """Freeze the state as it is now while the table goes on: small arrays are copied, frames only held."""
+        """Freeze the present state while the table stays in use: small arrays are copied, frames only held."""
         size = len(self)
         tail_slots = self._tails.slots()
         stored = tail_slots >= 0
@@ -244,15 +244,15 @@ class Table:
         return TableSnapshot(meta, arrays, self._frames.pin(distinct))
 
     def state(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """Everything that `load_state` needs: msgpack-able scalars, and arrays of what is held (frames included)."""
+        """The state for `load_state`: scalars for msgpack, and arrays of all that is held, including frames."""
         meta, arrays, frames = self.snapshot()
         with frames:
             return meta, {**arrays, "frames": frames.read(0, len(frames))}
 
     def load_state(self, meta: dict[str, Any], arrays: dict[str, Array]) -> None:
-        """Continue, to the bit, where `state` was taken; `arrays["frames"]` may be a memory map.
+        """Restore a state from `state` to the bit; `arrays["frames"]` may be a memory map.
 
-        Raises UsageError where the state is of a table with other settings, ValueError where this one is not new.
+        Raises UsageError if the state's table has other settings, ValueError if this table is not new.
         """
         if self.inserted:
             raise ValueError("only a new table can take over a state")
@@ -269,7 +269,7 @@ class Table:
         size = len(arrays["slots"])
         self._slots[:size] = slots[arrays["slots"]]
         for name in COLUMNS:
-            if name in arrays or name != "span":  # older states lack it: all their transitions span one step
+            if name in arrays or name != "span":  # older states lack it: each transition spans one step
                 self._column(name)[:size] = arrays[name]
         self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
         self.inserted = meta["inserted"]
