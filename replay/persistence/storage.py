@@ -1,7 +1,7 @@
-"""The replay service's part of an epoch on disk: `replay/` with one `.npy` file per array, and `state.msgpack`.
+"""The replay service's part of an epoch: `replay/` with one `.npy` file per array, and `state.msgpack`.
 
-The folder gets its name once everything in it is on the disk. `state.msgpack` holds the sizes and checksums of the other
-files and begins with its own checksum.
+The folder gets its name once everything in it is on the disk. `state.msgpack` holds the sizes and checksums of the
+other files and begins with its own checksum.
 """
 
 from __future__ import annotations
