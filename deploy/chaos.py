@@ -1,4 +1,4 @@
-"""A run under fire: `python -m deploy.chaos` kills roles of a `coop-local` run and counts what is lost."""
+"""`python -m deploy.chaos` kills roles of a `coop-local` run at random moments and counts the losses."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from deploy.status import RunStatus
 
 TICK = 0.05  # seconds
 ROLES = ("coop-learner", "coop-replay", "coop-actor")
-SETTLED = 100  # updates of the run between two kills, at least: each kill meets a run that is at work
+SETTLED = 100  # minimum number of updates between two kills, so that each kill hits a working run
 
 
 @dataclass(frozen=True)
 class ChaosOptions:
-    """Flags of the run under fire."""
+    """Flags of `deploy.chaos`."""
 
     run_dir: Path
     """Folder for the run's files; must be new."""
     kills: int = 20
-    """How many processes to kill with SIGKILL."""
+    """Number of processes to kill with SIGKILL."""
     actors: int = 2
     """Actor processes."""
     total_steps: int = 50_000
@@ -38,17 +38,17 @@ class ChaosOptions:
     checkpoint_every: int = 500
     """Updates between epochs."""
     seed: int = 0
-    """Of the run, and of who is killed when."""
+    """Seed of the run, and of the times and targets of the kills."""
     longest_pause: float = 3.0
-    """Seconds at most between a run that is at work again and the next kill."""
+    """Longest time, in seconds, between the run's recovery and the next kill."""
     give_up: float = 1200.0
-    """Seconds after which the run is taken to hang."""
+    """Seconds after which the run counts as hanging."""
 
 
 class Gunner:
-    """Kills one role after another, each kind as often as the others, once the run is at work again.
+    """Kills one role after another, each kind equally often, once the run works again.
 
-    kills: done so far, by command. longest_stall: seconds without a step or an update.
+    kills: number of kills by command. longest_stall: longest time without a step or an update, in seconds.
     """
 
     def __init__(self, options: ChaosOptions, supervisor: int, status: RunStatus) -> None:
@@ -66,7 +66,7 @@ class Gunner:
         self._next = float("inf")
 
     def turn(self) -> None:
-        """Look at the run, and shoot if it is time."""
+        """Check the run's progress, and kill a role if it is time."""
         now = time.monotonic()
         self._status.refresh()
         told = self._status.learner
@@ -78,7 +78,7 @@ class Gunner:
         if not self._left:
             return
         updates = progress[1]
-        self._at_work_since = min(self._at_work_since, updates)  # the learner may be back at an epoch
+        self._at_work_since = min(self._at_work_since, updates)  # the learner may have returned to an epoch
         if self._next == float("inf") and updates >= self._at_work_since + SETTLED:
             self._next = now + self._chance.uniform(0, self._options.longest_pause)
         if now >= self._next and self._shoot(self._left[-1]):
@@ -160,7 +160,7 @@ def _run() -> None:
         "kills": f"{sum(gunner.kills.values())} ({killed})",
         "transitions accepted": f"{summary['transitions_accepted']:,}",
         "lost": summary["transitions_lost"],
-        "duplicated": 0,  # else coop-reexecute would have failed
+        "duplicated": 0,  # otherwise coop-reexecute would have failed
         "restarts": restarts,
         "longest stall": f"{gunner.longest_stall:.1f} s",
         "wall time": f"{ended - started:.0f} s",

@@ -1,4 +1,4 @@
-"""The console commands. What they need takes seconds to import: until then a signal ends the process at once."""
+"""The console commands. Their imports take seconds, during which a signal ends the process at once."""
 
 from __future__ import annotations
 

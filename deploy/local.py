@@ -1,4 +1,4 @@
-"""`coop-local`: a whole run on this machine, one process a role."""
+"""`coop-local`: a whole run on this machine, one process per role."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from deploy.status import Display, RunStatus
 from deploy.supervisor import RESTARTS, RestartPolicy
 
 TICK = 0.1  # seconds
-GRACE = 30.0  # seconds that a role gets for a clean stop
-JOIN_TIMEOUT = 3600.0  # seconds; that the learner has ended is noticed here, and a busy machine may start it slowly
+GRACE = 30.0  # seconds for a role's clean stop
+JOIN_TIMEOUT = 3600.0  # seconds; this process notices the learner's end itself, and a busy machine may start it slowly
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,16 @@ class LocalOptions(RunOptions):
     actors: int = 1
     """Actor processes."""
     restart: bool = False
-    """With --resume: begin the training anew where learner and replay service hold no epoch in common."""
+    """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
     listen: str | None = None
-    """Endpoint of the learner, so that actors elsewhere can join; a free port on loopback if not given."""
+    """Endpoint of the learner, for actors on other machines (default: a free port on loopback)."""
 
 
 class Topology:
-    """The processes of one run and what to do when one of them ends.
+    """The processes of one run, restarted when they are killed.
 
     Args:
-        directory: run directory; the roles' logs go to its logs/.
+        directory: run directory, with the roles' logs in logs/.
         locks: descriptors of its locks, which learner and replay service hold too.
     """
 
@@ -58,7 +58,7 @@ class Topology:
         common = [f"--zenoh-config={options.zenoh_config}"] if options.zenoh_config else []
         common += ["--shared-memory"] if options.shared_memory else []
         joining = [f"--run={config.run}", "--connect", self.endpoint, f"--join-timeout={JOIN_TIMEOUT}", *common]
-        # --resume, also at the first start: one that is started again goes on from the newest epoch.
+        # --resume also at the first start, so that a restarted role continues from the newest epoch.
         files = [f"--run-dir={directory}", "--resume", *common]
         learning = [f"--config={resolved}", "--listen", self.endpoint, *files]
         learning += ["--restart"] if options.restart else []
@@ -78,11 +78,11 @@ class Topology:
             process.start()
 
     def check(self, display: Display) -> bool:
-        """Start those again that were killed; True once the learner has ended well or by a signal.
+        """Restart killed roles; return True once the learner has ended properly or by a signal.
 
         Raises:
-            RunError: a role gave up by itself, or dies again and again.
-            UsageError: a role found the config wrong.
+            RunError: a role failed by itself, or was killed too often.
+            UsageError: a role rejected the config.
         """
         if self.learner.exit_status() == 0 or self.learner.was_interrupted():
             return True
@@ -94,7 +94,7 @@ class Topology:
         return False
 
     def interrupt(self) -> None:
-        """Ask the learner to stop cleanly; the others follow it, and nobody is started again."""
+        """Ask the learner to stop cleanly; the other roles follow it, and none is restarted."""
         self._interrupted = True
         self.learner.interrupt()
 
@@ -109,12 +109,12 @@ class Topology:
             if status:
                 display.say(stamped(f"{process.why()}; starting it again"))
             else:
-                policy.at = now + GRACE  # it was told to stop, and the learner is likely to follow
+                policy.at = now + GRACE  # it was asked to stop, and the learner will probably follow
         elif policy.due(now):
             process.start()
 
     def finish(self) -> None:
-        """Wait for every role to stop; the others follow the learner."""
+        """Wait for every role to stop; the other roles follow the learner."""
         for process in self._all():
             process.end(GRACE)
 
@@ -139,7 +139,7 @@ def _run() -> None:
         raise UsageError(f"--actors {options.actors}: must be at least 1")
     config = options.run_config()
     check_distributed(config)
-    spec = env_spec(config.env)  # refuses what can't be played, held or sent before anything starts
+    spec = env_spec(config.env)  # refuses invalid environments before anything starts
     check_memory(config, spec)
     check_messages(config, spec)
     directory = options.directory()
@@ -176,7 +176,7 @@ def _supervise(topology: Topology, options: LocalOptions, config: RunConfig, dir
         topology.abort()
         print(f"{topology.learner.last_line()}; --resume goes on")
         stop.leave()
-        raise RunError(topology.learner.why())  # somebody has interrupted the learner alone
+        raise RunError(topology.learner.why())  # the learner alone was interrupted
     topology.finish()
     print(topology.learner.last_line())
     curve = directory / "learning_curve.png"

@@ -1,4 +1,4 @@
-"""What a run tells of itself: follows the status of every role, and shows it."""
+"""Follows the status of a run's roles, and displays it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from common.process.console import Sight, connected, progress_line, returns, sta
 from common.process.display import LiveDisplay
 from common.process.lifecycle import Stop
 
-PLAIN_EVERY = 5.0  # seconds between lines where the output is no terminal
+PLAIN_EVERY = 5.0  # seconds between lines if the output is no terminal
 
 
 class RunStatus:
     """Follows one run through its learner.
 
     Args:
-        endpoint: of the learner, or of any process that is connected to it and forwards.
-        zenoh_config: as for every role of the run.
+        endpoint: of the learner, or of a router connected to it.
+        zenoh_config: like the run's roles.
     """
 
     def __init__(self, run: str, endpoint: str, incarnation: int, zenoh_config: Path | None = None) -> None:
@@ -37,18 +37,18 @@ class RunStatus:
         self.learner: dict[str, Any] = {}
 
     def refresh(self) -> None:
-        """Take in what has been told since."""
+        """Read the statuses published since the last call."""
         message = self._learner.take()
         if message is None:
             return
         try:
             self.learner = msgspec.structs.asdict(LearnerStatus.decode(message))
         except BadMessage:
-            return  # one that can't be shown; the next may be better
+            return  # an invalid status; the next one may be valid
         self._told_at = time.monotonic()
 
     def silent_for(self) -> float:
-        """Seconds since the learner's last status; since the beginning if there was none."""
+        """Seconds since the learner's last status, or since the start if there was none."""
         return time.monotonic() - self._told_at
 
     def follow_stop(self, stop: Stop) -> None:
@@ -60,7 +60,7 @@ class RunStatus:
         return stamped(progress_line(self.learner)) if self.learner else "waiting for the learner"
 
     def events(self) -> list[tuple[int, str]]:
-        """What the learner has told of lately, each line with a number that grows."""
+        """The newest lines of the learner's console, with increasing numbers."""
         return list(self.learner.get("events", []))
 
     def learner_is_there(self) -> bool:
@@ -73,18 +73,18 @@ class RunStatus:
 
 
 class Display(LiveDisplay):
-    """Shows a status."""
+    """Displays a status."""
 
     def __init__(self, status: RunStatus) -> None:
         super().__init__(PLAIN_EVERY, refreshes=4)
         self._status = status
         self._shown = 0
         self._learner = Sight("the learner")
-        self._over = Stop()  # after it they leave
+        self._over = Stop()  # set at the end of the run
         status.follow_stop(self._over)
 
     def update(self) -> None:
-        """Show what the status says now."""
+        """Show the present status."""
         self._status.refresh()
         for number, line in self._status.events():
             if number > self._shown:

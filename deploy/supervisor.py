@@ -1,4 +1,4 @@
-"""When a killed process is started again: after growing pauses, not for ever. Plain: time comes in as an argument."""
+"""When to restart a killed process: after growing pauses, a limited number of times. Time is an argument."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 
 FIRST_PAUSE = 0.25  # seconds
 LONGEST_PAUSE = 4.0  # seconds
-HEALTHY = 60.0  # seconds without an end after which the past is forgotten
-RESTARTS = 20  # without a healthy spell between them
+HEALTHY = 60.0  # seconds without an end after which the count starts again
+RESTARTS = 20  # without a healthy period between them
 
 
 @dataclass(slots=True)
 class RestartPolicy:
-    """When one process may be started again.
+    """Decides when to restart one process.
 
-    ends: how often it ended since its last healthy spell. at: when to start it again, None while it runs.
+    ends: number of ends since its last healthy period. at: when to restart it, in seconds; None while it runs.
     """
 
     ends: int = 0
@@ -22,7 +22,7 @@ class RestartPolicy:
     _last: float = -HEALTHY
 
     def ended(self, now: float) -> bool:
-        """Note an end; False if it has ended too often."""
+        """Note an end; return False if it has ended too often."""
         if now - self._last >= HEALTHY:
             self.ends = 0
         self._last = now
@@ -31,7 +31,7 @@ class RestartPolicy:
         return self.ends <= RESTARTS
 
     def due(self, now: float) -> bool:
-        """True once when the pause is over."""
+        """Return True once, when the pause is over."""
         if self.at is None or now < self.at:
             return False
         self.at = None

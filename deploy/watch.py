@@ -1,4 +1,4 @@
-"""`coop-watch`: the live status of a run, from anywhere that reaches its learner."""
+"""`coop-watch`: the live status of a run, from any machine that reaches its learner."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class WatchOptions:
     connect: str = "tcp/127.0.0.1:7447"
     """Endpoint of the learner, for example tcp/head:7447."""
     join_timeout: float = 30.0
-    """Seconds to look for the learner before giving up."""
+    """Seconds to search for the learner before giving up."""
     patience: float = 60.0
-    """Seconds to wait for a learner that has gone before giving up."""
+    """Seconds to wait for a lost learner before giving up."""
     zenoh_config: Path | None = None
-    """A Zenoh configuration file (TLS, access control); the endpoint given here still holds."""
+    """A Zenoh configuration file (TLS, access control); the endpoint given as a flag still applies."""
 
 
 def main() -> None:
@@ -55,7 +55,7 @@ def _run() -> None:
 
 
 def _check(status: RunStatus, options: WatchOptions) -> None:
-    """Raises JoinError or PeerLost where the learner has been silent for too long."""
+    """Raise JoinError or PeerLost if the learner has been silent for too long."""
     silent = status.silent_for()
     if not status.learner and silent > options.join_timeout:
         where = f"found at {options.connect} within {options.join_timeout:g} s"

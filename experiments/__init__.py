@@ -1,3 +1,3 @@
-"""Wires the roles' own objects together in one process: lockstep runs, sweeps and reports."""
+"""Combines the roles' objects in one process: lockstep runs, evaluation, re-execution, sweeps and reports."""
 
-import common  # noqa: F401 (first: it answers a Ctrl-C while the rest is imported)
+import common  # noqa: F401 (first: it handles a Ctrl-C during the other imports)

@@ -1,4 +1,4 @@
-"""Greedy evaluation: how a saved network plays without exploring."""
+"""Greedy evaluation: plays a saved network without exploration."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Returns of full episodes, unclipped, by `network` (1 or 2) of the checkpoint numbered `epoch`."""
+    """Unclipped returns of full episodes, played by `network` (1 or 2) of the checkpoint `epoch`."""
 
     epoch: int
     network: int
@@ -29,12 +29,12 @@ class Evaluation:
 
 
 def evaluate(run_dir: Path, episodes: int, seed: int) -> Evaluation:
-    """Play the acting network of a run's newest checkpoint, always with its best action.
+    """Play the acting network of a run's newest checkpoint greedily.
 
-    seed: of the emulator; whatever it is, no emulator of the run had the same.
+    seed: of the emulator; the derived seed differs from those of the run's emulators.
 
     Raises:
-        UsageError: there is no run in the folder, or no checkpoint of it.
+        UsageError: the folder holds no run, or no checkpoint.
     """
     if not (run_dir / "config.toml").is_file():
         raise UsageError(f"{run_dir}: holds no run")

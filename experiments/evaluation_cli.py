@@ -1,4 +1,4 @@
-"""`coop-eval`: play a run's newest checkpoint greedily."""
+"""`coop-eval`: plays a run's newest checkpoint greedily."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class EvalOptions:
     """Flags of `coop-eval`."""
 
     run_dir: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN_DIR")]
-    """A run's folder, with its config.toml and checkpoints."""
+    """Folder of a run, with its config.toml and checkpoints."""
     episodes: int = 20
-    """Full episodes to play."""
+    """Number of full episodes to play."""
     seed: int = 0
-    """Of the emulator."""
+    """Seed of the emulator."""
 
 
 def main() -> None:
@@ -38,7 +38,7 @@ def _run() -> None:
         raise UsageError(f"--episodes {options.episodes}: must be at least 1")
     if options.seed < 0:
         raise UsageError(f"--seed {options.seed}: must be at least 0")
-    from experiments.evaluation import evaluate  # noqa: PLC0415 (torch takes seconds, wrong flags should not)
+    from experiments.evaluation import evaluate  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
     done = evaluate(options.run_dir, options.episodes, options.seed)
     mean, sd = statistics.fmean(done.returns), statistics.pstdev(done.returns)

@@ -1,4 +1,4 @@
-"""Algorithm 1 exactly: act, store, sample, update, toggle, in one process with the roles' own objects."""
+"""Algorithm 1 exactly: act, store, sample, update, toggle, in one process with the roles' objects."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from replay.persistence.storage import Mark, load_snapshot, save_snapshot
 class Lockstep:
     """One run of Algorithm 1 with one emulator; deterministic to the bit for a seed.
 
-    step: environment steps done.
+    step: number of environment steps done.
     """
 
     def __init__(self, config: RunConfig) -> None:
@@ -60,7 +60,7 @@ class Lockstep:
         self._segments.begin(self._player.begin())
 
     def play(self) -> Iterator[Effects]:
-        """One pass through Algorithm 1's inner loop."""
+        """Run one iteration of Algorithm 1's inner loop; yields the effects of each update."""
         learner = self.config.learner
         self._policy.acting = self.agent.acting
         self._player.send(self.step, self.agent.updates)
@@ -94,16 +94,16 @@ class Lockstep:
             self._table.insert(segment)
 
     def _updates_due(self) -> int:
-        """Updates that the replay ratio asks for after this step."""
+        """Number of updates that the replay ratio requires after this step."""
         return self._updates_by(self.step) - self._updates_by(self.step - 1)
 
     def _updates_by(self, step: int) -> int:
-        """Updates that follow the first `step` steps."""
+        """Number of updates after the first `step` steps."""
         settings = self.config.replay
         return math.floor(settings.ratio * max(0, step - settings.learning_starts))
 
     def save(self, directory: RunDirectory) -> None:
-        """Save an epoch from which `restore` goes on to the bit."""
+        """Save an epoch that `restore` continues exactly to the bit."""
         state = {
             **self.trainer.state(time.monotonic()),
             "player": {"policy": generator_state(self._policy_rng), "actions": torch.tensor(self._actions)},
@@ -118,12 +118,13 @@ class Lockstep:
         save_epoch(directory.path, self.agent.updates, state, snapshot)
 
     def restore(self, epoch: Path) -> dict[str, int]:
-        """Go on where `save` was called; the sizes that the run's files had.
+        """Restore an epoch from `save`; return the sizes of the run's files at that time, in bytes.
 
-        The emulator comes back by playing the same actions again: exact for every deterministic environment.
+        The emulator's state is restored by playing the same actions again, which is exact for every deterministic
+        environment.
 
         Raises:
-            UsageError: the epoch is not one of a lockstep run.
+            UsageError: the epoch does not belong to a lockstep run.
         """
         state = load_learner(epoch)
         if old_checkpoints.is_old(epoch):
@@ -142,7 +143,7 @@ class Lockstep:
         return sizes
 
     def _replay_actions(self, actions: Iterable[int]) -> None:
-        """Play the actions of a run once more; the table is to come from its snapshot."""
+        """Play the actions of a run again; the table is restored separately, from its snapshot."""
         for step, action in enumerate(actions):
             turn = self._player.replay(np.array([action], np.int32))
             self._segments.add(turn.actions, turn.steps, self._updates_by(step), turn.ended)

@@ -44,12 +44,12 @@ def _run() -> None:
     print(f"{summary}; {path}")
     if run.trainer.diverged:
         raise RunError(run.trainer.diverged)
-    if summary.exit == stop.reason:  # else the run was over before
+    if summary.exit == stop.reason:  # otherwise the run was complete before the signal
         stop.leave()
 
 
 def run_lockstep(run: Lockstep, directory: RunDirectory, stop: Stop) -> Summary:
-    """Play until the run is over or stopped, and leave its files complete; says now and then how far it is."""
+    """Play until the run is over or stopped, and complete its files; prints its progress every few seconds."""
     trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
     while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
         for effects in run.play():

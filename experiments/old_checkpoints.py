@@ -1,4 +1,4 @@
-"""Reads the epochs of lockstep runs as they were before all runs shared one format."""
+"""Reads epochs of lockstep runs in the format used before all runs shared one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def is_old(epoch: Path) -> bool:
 def load(
     epoch: Path, state: dict[str, Any], table: Table, replay_actions: Callable[[Iterable[int]], None]
 ) -> dict[str, Any]:
-    """Fill a new table, and give the state of learner.pt as it is now; it then knew no wall time."""
+    """Fill a new table, and convert the state to today's learner.pt; the old format has no wall time."""
     arrays = {path.stem: np.load(path) for path in (epoch / "replay").glob("*.npy")}
     replay_actions(arrays.pop(Path(ACTIONS).stem).tolist())
     meta = msgpack.unpackb((epoch / "replay" / "state.msgpack").read_bytes(), strict_map_key=False)["table"]

@@ -1,4 +1,4 @@
-"""Trains a distributed run's learner once more from its journal, in one process, and compares the parameters."""
+"""Repeats a distributed run's training from its journal, in one process, and compares the parameters."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from replay.table.table import PinnedBatch
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a re-execution gave.
+    """The result of a re-execution.
 
-    began: update that it began at; 0 where the journal reaches back to the beginning of the run.
-    holes: segments that are not in the journal although later ones of their stream are.
+    began: number of the first update; 0 if the journal reaches back to the beginning of the run.
+    holes: segments missing in the journal although it contains later ones of their stream.
     digest: SHA-256 over both networks' parameters.
     """
 
@@ -44,14 +44,13 @@ class Outcome:
 
 
 def reexecute(run_dir: Path) -> Outcome:
-    """Carry out the journal of `run_dir` from as far back as it goes, with every update of the learner.
+    """Replay the journal of `run_dir` from its beginning, with every update of the learner.
 
-    The batches that count are those of the learner that lived on: where one came back from an epoch and drew a batch
-    again, the last draw of that number.
+    If a learner returned to an epoch and drew a batch again, the last draw of that number counts.
 
     Raises:
-        UsageError: there is no run with a journal and a finished epoch in the folder.
-        RunError: the journal is not whole, holds a segment twice or other transitions than the summary says, or
+        UsageError: the folder holds no run with a journal and a finished epoch.
+        RunError: the journal is incomplete, contains a segment twice or disagrees with the summary's transitions, or
             parameters, optimizers or random state differ in any bit.
     """
     config = resolve(load_tables(None, run_dir / "config.toml"))
@@ -83,7 +82,7 @@ def reexecute(run_dir: Path) -> Outcome:
 
 
 def _beginning(config: RunConfig, run_dir: Path, folder: Path, run_id: int) -> tuple[Agent, ReplayCore, int]:
-    """Agent and core as they were at the first file of the journal, or at the oldest epoch that it continues."""
+    """Agent and core at the start of the journal's first file, or at the oldest epoch that the journal continues."""
     spec = env_spec(config.env)
     agent, core = Agent(config, spec), ReplayCore(config, spec)
     files = journal_files(folder)
@@ -99,7 +98,7 @@ def _beginning(config: RunConfig, run_dir: Path, folder: Path, run_id: int) -> t
 
 
 def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:
-    """For each number of a batch, which draw of the journal was the last one of that number."""
+    """For each batch number, the index of its last draw in the journal."""
     last: dict[int, int] = {}
     place = 0
     for number in files:
@@ -109,7 +108,7 @@ def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:
                     last[read_draw(payload)[0].sequence] = place
                     place += 1
         except TornFile:
-            if number != files[-1]:  # a kill leaves half a record at the end of the journal, and nowhere else
+            if number != files[-1]:  # a kill leaves an incomplete record only at the end of the journal
                 raise
     return last
 
@@ -124,7 +123,7 @@ def _draws(core: ReplayCore, folder: Path, files: list[int], run_id: int) -> Ite
 
 
 def _difference(mine: Any, theirs: Any, name: str) -> str | None:  # noqa: ANN401 (nested state)
-    """The first place in which nested states differ in any bit."""
+    """Describe the first place where nested states differ in any bit; None if they are equal."""
     if isinstance(mine, torch.Tensor):
         return None if torch.equal(mine, theirs) else name
     if isinstance(mine, dict):

@@ -1,4 +1,4 @@
-"""`coop-reexecute RUN_DIR`: does the journal of a run lead to its parameters, bit for bit?"""
+"""`coop-reexecute RUN_DIR`: checks that a run's journal reproduces its parameters, bit for bit."""
 
 from __future__ import annotations
 

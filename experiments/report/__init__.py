@@ -1,1 +1,1 @@
-"""What a folder of runs says: tables, figures and one page."""
+"""Reports on a folder of runs: tables, figures and one page."""

@@ -1,4 +1,4 @@
-"""`coop-report`: the figures, tables and page of a study; packing it into one file, and unpacking."""
+"""`coop-report`: makes the figures, tables and page of a study; packs a study into one file, and unpacks it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class ReportOptions:
     """Flags of `coop-report`."""
 
     runs: Annotated[Positional[Path], tyro.conf.arg(metavar="RUNS")]
-    """A sweep's folder, any folder of run directories, or a file that --pack has made."""
+    """A sweep's folder, any folder of run directories, or a file made with --pack."""
     out: Path | None = None
-    """Folder of the report; RUNS/report if not given, without the ending where RUNS is a file."""
+    """Folder of the report (default: RUNS/report, without the suffix if RUNS is a file)."""
     pack: Path | None = None
-    """Instead of a report: write the folder's runs into this one Parquet file."""
+    """Instead of a report: write the folder's runs into this Parquet file."""
     curves: Path | None = None
-    """Instead of a report: draw every run's learning curve, also of those not finished, into a folder each in here."""
+    """Instead of a report: draw the learning curve of every run, finished or not, into a subfolder of this folder."""
     unpack: Path | None = None
-    """Instead of a report: write the runs of a packed file into this new folder, as they were."""
+    """Instead of a report: restore the runs of a packed file in this new folder."""
 
 
 def main() -> None:
@@ -40,7 +40,7 @@ def _run() -> None:
     runs = options.runs
     if not runs.exists():
         raise UsageError(f"{runs}: no such folder or file")
-    # Imported once the flags are known to be right: the statistics' libraries take seconds.
+    # Imported only after the flags have been checked: the statistics' libraries take seconds.
     if options.pack is not None:
         from experiments.report.packed import pack  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""The lines of episodes.csv and metrics.jsonl as typed columns, and back to the same bytes."""
+"""Converts the lines of episodes.csv and metrics.jsonl to typed columns, and back to the same bytes."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-Columns = dict[str, list[Any]]  # values of each column by line; None where a line does not have it
+Columns = dict[str, list[Any]]  # values of each column by line; None if a line lacks it
 LARGEST = 2**63
 
 
 def csv_columns(text: str) -> Columns:
-    """The cells of a CSV file, as text. Raises ValueError for a line of another length than the first."""
+    """The cells of a CSV file, as text. Raises ValueError for a line whose length differs from the first one's."""
     header, *lines = csv.reader(io.StringIO(text))
     return dict(zip(header, map(list, zip(*lines, strict=True)), strict=True)) if lines else {n: [] for n in header}
 
 
 def csv_text(columns: Mapping[str, Sequence[Any]]) -> str:
-    """The CSV file of typed columns, numbers as `RunDirectory` writes them."""
+    """The CSV file of typed columns, with numbers as `RunDirectory` writes them."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
@@ -32,14 +32,14 @@ def csv_text(columns: Mapping[str, Sequence[Any]]) -> str:
 
 
 def json_columns(text: str) -> Columns:
-    """The values of a file with a JSON object on each line. Raises ValueError where a line is none."""
+    """The values of a file with one JSON object per line. Raises ValueError for an invalid line."""
     rows = [json.loads(line) for line in text.splitlines()]
     names = dict.fromkeys(name for row in rows for name in row)
     return {name: [row.get(name) for row in rows] for name in names}
 
 
 def json_text(columns: Mapping[str, Sequence[Any]], as_json: frozenset[str]) -> str:
-    """The lines of typed columns; `as_json` are those that hold JSON."""
+    """The JSON lines of typed columns; `as_json`: names of the columns that hold JSON."""
     lines = []
     for values in zip(*columns.values(), strict=True):
         row = {name: value for name, value in zip(columns, values, strict=True) if value is not None}
@@ -48,18 +48,18 @@ def json_text(columns: Mapping[str, Sequence[Any]], as_json: frozenset[str]) -> 
 
 
 def csv_type(columns: Sequence[Sequence[str]]) -> tuple[pa.DataType, Callable[[str], Any]]:
-    """The smallest type from which every cell of these columns comes back, and how to read a cell."""
+    """The smallest type that represents every cell of these columns exactly, and the function that reads a cell."""
     cells = [cell for column in columns for cell in column]
     if all(map(_is_integer, cells)):
         return pa.int64(), int
-    # Six digits, as `RunDirectory` writes floats, come back from 32 bits.
+    # 32 bits preserve six digits, which `RunDirectory` writes for floats.
     if all(map(_is_float, cells)) and [*map(_cell, _narrow(cells).tolist())] == cells:
         return pa.float32(), float
     return pa.string(), str
 
 
 def json_type(columns: Sequence[Sequence[Any]]) -> tuple[pa.DataType, Callable[[Any], Any]]:
-    """The smallest type from which every value of these columns comes back, and how to convert one."""
+    """The smallest type that represents every value of these columns exactly, and the function that converts one."""
     values = [value for column in columns for value in column if value is not None]
     kinds = set(map(type, values))
     if kinds <= {int} and all(-LARGEST <= value < LARGEST for value in values):
@@ -71,7 +71,7 @@ def json_type(columns: Sequence[Sequence[Any]]) -> tuple[pa.DataType, Callable[[
 
 
 def decimal(values: Sequence[Any]) -> list[Any]:
-    """The values of a CSV file's column: floats of 32 bits as the six digits that they were read from."""
+    """The values of a CSV column, with 32-bit floats converted back to their six digits."""
     return [float(_cell(value)) if isinstance(value, float) else value for value in values]
 
 

@@ -1,4 +1,4 @@
-"""The tables that tell methods apart: the course of learning, paired differences, and the part of the buffer's size."""
+"""Tables that compare methods: the course of learning, paired differences, and the effect of the buffer's size."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LATER = "These measures were chosen after the data of the studies of CartPole ha
 
 
 def comparison_tables(study: Study) -> list[ResultTable]:
-    """Every table of this module that the runs allow."""
+    """All tables of this module for which there are runs."""
     made = [learning_table(study)]
     if len(study.environments) > 1:
         return made
@@ -41,7 +41,7 @@ def comparison_tables(study: Study) -> list[ResultTable]:
 
 
 def learning_table(study: Study) -> ResultTable:
-    """The course of learning of every method at every setting, diverged runs counted."""
+    """The course of learning of every method at every setting, with the number of diverged runs."""
     diverged: list[tuple[str, Setting]] = [
         (config.method, study.setting_of(config)) for config in study.diverged.values()
     ]
@@ -70,7 +70,7 @@ def learning_table(study: Study) -> ResultTable:
 
 
 def paired_table(study: Study) -> ResultTable:
-    """Differences between methods over the same seeds, at each setting and over all that both have."""
+    """Differences between methods over the same seeds, at each setting and over all shared settings."""
     rows: list[list[Value]] = []
     for name, measure in MEASURES.items():
         values = by_seed(study, measure)
@@ -86,7 +86,7 @@ def paired_table(study: Study) -> ResultTable:
 
 
 def sizes_table(study: Study) -> ResultTable:
-    """The return of every method with the smaller and with the larger half of the capacities."""
+    """The mean return of every method with the smaller and with the larger half of the capacities."""
     rows: list[list[Value]] = []
     values = by_seed(study, score)
     for others in _slices(study):
@@ -100,7 +100,7 @@ def sizes_table(study: Study) -> ResultTable:
 
 
 def interaction_table(study: Study) -> ResultTable:
-    """How much more one method gains over another in small buffers than in large ones."""
+    """The difference between two methods in small buffers minus that in large ones."""
     rows: list[list[Value]] = []
     for name, measure in MEASURES.items():
         values = by_seed(study, measure)
@@ -116,7 +116,7 @@ def interaction_table(study: Study) -> ResultTable:
 
 
 def common_breaking_table(study: Study) -> ResultTable:
-    """Breaking points of all methods against one threshold."""
+    """Breaking points of all methods against a common threshold."""
     rows: list[list[Value]] = []
     for others in other_settings(study, CAPACITY):
         found = {method: along(study, CAPACITY, method, others) for method in study.methods}
@@ -136,7 +136,7 @@ def common_breaking_table(study: Study) -> ResultTable:
 
 
 def _course(runs: Sequence[Run]) -> list[Value]:
-    """Give the columns of `learning_table` from area to seeds."""
+    """Compute the columns of `learning_table` from area to seeds."""
     if not runs:
         return [*[None] * 10, 0, "none"]
     areas = np.array([area(run) for run in runs])
@@ -172,7 +172,7 @@ def _threshold(environment: str) -> str:
 
 
 def _halves(study: Study, others: Setting | None) -> tuple[list[int], list[int]]:
-    """The places of the settings with the smaller and with the larger half of the capacities; all others if None."""
+    """Indices of the settings with the smaller and the larger half of the capacities; of all other axes if None."""
     place = study.axes.index(CAPACITY)
     sizes = sorted({setting[place] for setting in study.settings})
     split = sizes[math.ceil(len(sizes) / 2) - 1]
@@ -185,7 +185,7 @@ def _halves(study: Study, others: Setting | None) -> tuple[list[int], list[int]]
 
 
 def _slices(study: Study) -> list[Setting | None]:
-    """The settings of the axes other than capacity, and None for all of them where they are several."""
+    """The settings of the axes other than capacity, and None for all of them together if there are several."""
     others = other_settings(study, CAPACITY)
     return [*others, None] if len(others) > 1 else [*others]
 

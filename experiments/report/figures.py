@@ -32,7 +32,7 @@ Curve = Callable[[Sequence[Run]], tuple[Floats, Floats]]
 
 
 def figures(study: Study) -> tuple[list[Figure], list[str]]:
-    """Every figure that the runs allow, and what can't be shown, with the reason."""
+    """All figures for which there are runs, and a line for each figure that cannot be shown, with the reason."""
     made = [returns_by_episodes(study), returns_by_steps(study), exploration(study), q_gap(study)]
     lacking = []
     if study.index(CAPACITY) is None:
@@ -64,13 +64,13 @@ def returns_by_steps(study: Study) -> Figure:
 
 
 def q_gap(study: Study) -> Figure:
-    """The norm of Q1 - Q2 against episodes, for the methods with two networks that learn."""
+    """The norm of Q1 - Q2 against episodes, for the methods with two trained networks."""
     title, y = "Norm of Q1 - Q2 against episodes", "mean norm on a fixed batch"
     return _curves(study, "q_gap", title, "episodes", y, q_gaps, _has_gaps, log_y=True)
 
 
 def exploration(study: Study) -> Figure:
-    """The exploration rate s against steps, and the returns that each rate leads to."""
+    """The exploration rate s against steps, and the returns at each rate."""
     place = study.index(RATE)
     settings = [study.reference]
     if place is not None:
@@ -91,7 +91,7 @@ def exploration(study: Study) -> Figure:
 
 
 def buffers(study: Study) -> Figure:
-    """Mean return against buffer size, the error bars from run to run."""
+    """Mean return against buffer size, with error bars over runs."""
     panels = []
     for others in other_settings(study, CAPACITY):
         lines = []
@@ -200,7 +200,7 @@ def _line(text: str, at: Floats, curves: Floats) -> Line:
 
 
 def _panel_settings(study: Study) -> list[Setting]:
-    """All settings, or where they are too many, those that differ from the reference by capacity alone."""
+    """All settings, or if there are too many, those that differ from the reference only in capacity."""
     place = study.index(CAPACITY)
     if len(study.settings) <= MOST_PANELS:
         return study.settings

@@ -1,4 +1,4 @@
-"""How a run learned over its whole course, and how methods differ over the same seeds."""
+"""The course of learning over a whole run, and differences between methods over the same seeds."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from common.returns import RETURN_WINDOW, running_mean
 from experiments.report.measures import REPS
 from experiments.report.study import Floats, Run, Study
 
-SHORT = 20  # episodes of the running mean by which a run is healthy or collapses
-FALL = 3 / 13  # of the threshold: below that a healthy run has collapsed; for CartPole 195 and 150
+SHORT = 20  # episodes in the running mean that decides whether a run is healthy or has collapsed
+FALL = 3 / 13  # share of the threshold by which a healthy run must fall to collapse; for CartPole from 195 to 150
 
 
 class Course(NamedTuple):
-    """A run against a threshold of return, by the running mean of 20 episodes.
+    """A run compared with a threshold of return, by the running mean of 20 episodes.
 
     steps_to: environment steps until it first reached the threshold; inf if it never did. share_above: of the steps
     after that, those at which it was at the threshold or above; nan if it never was. collapses: how often it fell from
@@ -33,7 +33,7 @@ class Course(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A mean over seeds with its 95 % bootstrap interval; nan where there are too few seeds."""
+    """A mean over seeds with its 95 % bootstrap interval; nan if there are too few seeds."""
 
     value: float
     low: float
@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
 
 
 def reward_threshold(environment: str) -> float | None:
-    """The return at which gymnasium calls an environment solved; None where it names none."""
+    """The return at which gymnasium considers an environment solved; None if it names none."""
     try:
         return gymnasium.spec(environment).reward_threshold
     except gymnasium.error.Error:
@@ -51,7 +51,7 @@ def reward_threshold(environment: str) -> float | None:
 def area(run: Run) -> float:
     """Area under the curve by steps, divided by the steps: the mean over steps of the running mean of 100 episodes.
 
-    Until the first episode has ended its return counts.
+    Before the first episode's end, its return counts.
     """
     lengths = np.diff(run.end_steps, prepend=0.0)
     latest = np.concatenate((run.returns[:1], running_mean(run.returns)[:-1]))
@@ -59,7 +59,7 @@ def area(run: Run) -> float:
 
 
 def course(run: Run, threshold: float) -> Course:
-    """Follow a run; see `Course`."""
+    """Compute a run's `Course`."""
     means = running_mean(run.returns, SHORT)[SHORT - 1 :]
     steps = run.end_steps[SHORT - 1 :]
     fallen = threshold - FALL * abs(threshold)
@@ -101,11 +101,11 @@ def over_seeds(values: Sequence[float] | Floats) -> Estimate:
 
 
 def by_seed(study: Study, measure: Callable[[Run], float]) -> pd.DataFrame:
-    """A measure of every run: a row for each seed, columns (method, setting's place); nan where there is no run."""
+    """A measure of every run: a row per seed, columns (method, index of the setting); nan if there is no run."""
     measured = study.frame.assign(value=study.frame["run"].map(measure))
     return measured.pivot_table("value", "seed", ["method", "setting"], aggfunc="last")
 
 
 def differences(values: pd.DataFrame, x: str, y: str) -> pd.DataFrame:
-    """What x has above y: a row for each seed, a column for each setting, those that both methods have."""
+    """The difference x - y: a row per seed and a column per setting, of those that both methods have."""
     return (values[x] - values[y]).dropna(axis="columns", how="all").dropna()

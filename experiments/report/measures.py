@@ -1,4 +1,4 @@
-"""The numbers that a report takes from runs, and their statistics over runs (rliable's, by seeds)."""
+"""The measures that a report computes from runs, and their statistics over runs (rliable's, by seeds)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rliable import library, metrics
 from common.returns import RETURN_WINDOW
 from experiments.report.study import Floats, Run
 
-ENOUGH = 0.95  # of the return at the largest capacity: learning has not broken
+ENOUGH = 0.95  # share of the return at the largest capacity that counts as unbroken learning
 POINTS = 120  # of a curve
 REPS = 1000  # bootstrap samples
 DIAGNOSTICS = ("sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
 
 
 class Interval(NamedTuple):
-    """Estimates with their 95 % bootstrap intervals; float64, all of one shape."""
+    """Estimates with their 95 % bootstrap intervals; float64 arrays of one shape."""
 
     value: Floats
     low: Floats
@@ -27,10 +27,10 @@ class Interval(NamedTuple):
 
 
 class Breaking(NamedTuple):
-    """Where learning breaks: the smallest capacity with at least 95 % of the return at the largest.
+    """The breaking point: the smallest capacity with at least 95 % of the return at the largest.
 
-    low, high: 95 % bootstrap interval of `capacity` over runs; equal to it where there is one run only.
-    gaps: a larger capacity is below 95 % again, so the order is not plain.
+    low, high: 95 % bootstrap interval of `capacity` over runs; equal to it if there is only one run.
+    gaps: a larger capacity is below 95 % again, so the returns are not monotonic.
     """
 
     capacity: int
@@ -50,9 +50,9 @@ def spread(run: Run) -> float:
 
 
 def diagnostic(run: Run, name: str) -> float:
-    """Mean of a diagnostic over the second half of a run; of the share evicted unsampled, a running total, the last.
+    """Mean of a diagnostic over the second half of a run; the last value of the share evicted unsampled.
 
-    nan for a run too short for a row of metrics.
+    nan for a run that is too short to have a row of metrics.
     """
     values, steps = run.metrics[name], run.metrics["env_step"]
     if not len(values):
@@ -83,12 +83,12 @@ def q_gaps(runs: Sequence[Run]) -> tuple[Floats, Floats]:
 
 
 def _latest(steps: Floats, values: Floats, at: Floats) -> Floats:
-    """The value that was the latest at each moment of `at`; the first one before there is any."""
+    """The latest value at each step of `at`; the first value for earlier steps."""
     return values[np.maximum(0, np.searchsorted(steps, at, side="right") - 1)]
 
 
 def iqm(scores: Floats) -> Floats:
-    """Interquartile mean over runs: float64 [runs, tasks] -> [tasks], as rliable's but for each task alone."""
+    """Interquartile mean over runs: float64 [runs, tasks] -> [tasks], like rliable's but for each task separately."""
     cut = len(scores) // 4
     return np.asarray(np.sort(scores, axis=0)[cut : len(scores) - cut].mean(axis=0))
 
@@ -116,11 +116,11 @@ def profiles(scores: Mapping[str, Floats], levels: Floats) -> dict[str, Interval
 
 
 def breaking_point(capacities: NDArray[np.int64], scores: Sequence[Floats]) -> Breaking:
-    """Where learning breaks, by the mean score over runs.
+    """The breaking point by the mean score over runs.
 
     Args:
         capacities: int64 [n], ascending.
-        scores: of each capacity, float64 [runs]; the numbers of runs may differ.
+        scores: for each capacity, float64 [runs]; the numbers of runs may differ.
     """
     enough = _is_enough(np.array([each.mean() for each in scores]))
     first = int(enough.argmax())
@@ -136,7 +136,7 @@ def first_enough(
 ) -> tuple[int | None, int | None, int | None]:
     """The smallest capacity whose mean over runs is at least 95 % of `best`, and its 95 % bootstrap interval over runs.
 
-    None where no capacity is enough, and for a bound where that is so in the bootstrap.
+    The capacity is None if none is enough; a bound is None if that holds in the bootstrap.
     """
     generator = np.random.default_rng(0)
     samples = [each[generator.integers(0, len(each), (REPS, len(each)))].mean(axis=1) for each in scores]
@@ -149,13 +149,13 @@ def first_enough(
 
 
 def _is_enough(means: Floats) -> NDArray[np.bool_]:
-    """True <bool>[..., capacities] at 95 % of the last entry and above (a negative one: less 5 % of its size)."""
+    """Whether each mean [..., capacities] is at least 95 % of the last one (if negative: within 5 % of its size)."""
     largest = means[..., -1:]
     return np.asarray(means >= largest - (1 - ENOUGH) * np.abs(largest))
 
 
 def _share_better(x: Floats, y: Floats) -> Floats:
-    """Do what rliable's `metrics.probability_of_improvement` does, as one array operation."""
+    """Compute rliable's `metrics.probability_of_improvement` in one array operation."""
     difference = x[:, None] - y[None, :]
     return np.array([((difference > 0) + 0.5 * (difference == 0)).mean()])
 
@@ -167,5 +167,5 @@ def _interval(scores: Floats | tuple[Floats, Floats], function: object) -> Inter
 
 
 def _seed() -> None:
-    """Start over: rliable draws from numpy's global generator; the same runs must give the same report."""
+    """Seed numpy's global generator, which rliable uses: the same runs must give the same report."""
     np.random.seed(0)

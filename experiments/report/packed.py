@@ -1,4 +1,4 @@
-"""A study in one Parquet file: a row for each run, from which every file of the run comes back byte for byte.
+"""Packs a study into one Parquet file with a row per run, and restores every file of the runs byte for byte.
 
 Columns: `run`, the folder's name; `config.toml` and `summary.json`, their text; and a list for each column of
 `episodes.csv` and `metrics.jsonl`, named like `episodes.csv/return`. The schema's metadata hold `sweep.toml`.
@@ -39,7 +39,7 @@ SMALLEST = 22  # zstd's level
 
 
 class PackedStudy:
-    """Reads a packed study. Raises UsageError where the file is none."""
+    """Reads a packed study. Raises UsageError if the file is none."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -52,7 +52,7 @@ class PackedStudy:
         self.sweep = None if sweep is None else sweep.decode()
 
     def text(self, run: str, file: str) -> str | None:
-        """The content of a run's file; None where it has none."""
+        """The content of a run's file; None if there is none."""
         if run not in self._rows:
             return None
         if file in TEXTS:
@@ -68,9 +68,9 @@ class PackedStudy:
         return json_text(columns, frozenset(as_json))
 
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> Columns:
-        """Some columns of a run's episodes or metrics, None where an optional one is not there.
+        """Some columns of a run's episodes or metrics, None if an optional one is missing.
 
-        Raises KeyError where the run lacks a wanted one.
+        Raises KeyError if the run lacks a wanted one.
         """
         columns = self._columns(run, file)
         if not columns:
@@ -90,11 +90,13 @@ class PackedStudy:
 
 
 def pack(folder: Path, path: Path) -> str:
-    """Write the runs of a folder, and its sweep.toml, into one file; what was done, in words.
+    """Write the runs of a folder, and its sweep.toml, into one file; return a description of the result.
 
-    An empty file comes back as an empty one, and so does a run's missing table. Raises:
-        RunError: a file is torn, or would not come back byte for byte.
-        UsageError: the folder holds no run, or the file can't be written.
+    An empty file is restored as an empty file, and so is a run's missing table.
+
+    Raises:
+        RunError: a file is torn, or cannot be restored byte for byte.
+        UsageError: the folder holds no run, or the file cannot be written.
     """
     runs = sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
     if not runs:
@@ -121,9 +123,9 @@ def pack(folder: Path, path: Path) -> str:
 
 
 def unpack(path: Path, folder: Path) -> str:
-    """Write the files of a packed study as they were; what was done, in words.
+    """Restore the files of a packed study; return a description of the result.
 
-    Raises UsageError where the file is none, or the folder is there already or can't be written.
+    Raises UsageError if the file is no packed study, or the folder exists already or cannot be written.
     """
     packed = PackedStudy(path)
     try:
@@ -165,7 +167,7 @@ def _read(path: Path, text: str | None) -> Columns:
 
 
 def _lists(file: str, runs: Sequence[Columns]) -> list[tuple[pa.Field, pa.Array]]:
-    """Each column of a file, as one list a run; null where the run does not have it."""
+    """Each column of a file, as one list per run; null if the run lacks it."""
     made = []
     for name in dict.fromkeys(name for run in runs for name in run):
         kind, convert = TYPE[file]([run[name] for run in runs if name in run])

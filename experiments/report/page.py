@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs no other file."""
+"""Renders the report as one HTML page that needs no other file."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def page(
     figures: Sequence[tuple[Figure, Path]],
     lacking: Sequence[str],
 ) -> str:
-    """The page.
+    """Render the page.
 
     Args:
-        folder: where the runs are.
-        figures: each with its PNG, which goes into the page.
-        lacking: what can't be shown, with the reason.
+        folder: of the runs.
+        figures: each with the path of its PNG, which is embedded in the page.
+        lacking: lines about what cannot be shown, with the reason.
     """
     title = html.escape(study.title or f"Runs in {folder.name}")
     total = len(study.runs) + len(study.missing)

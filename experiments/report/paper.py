@@ -1,4 +1,4 @@
-"""What the paper reports: Table 1 (arXiv 2110.15305), mean and standard deviation over the last 100 episodes."""
+"""The paper's Table 1 (arXiv 2110.15305): mean and standard deviation over the last 100 episodes."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ TABLE_1: dict[str, dict[str, tuple[float, float]]] = {
 
 
 def table_1(env_id: str) -> dict[str, tuple[float, float]]:
-    """The column of an environment, (mean, sd) by method; empty where the paper has none."""
+    """The column of an environment, (mean, sd) by method; empty if the paper has none."""
     name = re.sub(r"^.*/|-v\d+$|[^A-Za-z]", "", env_id).lower()
     return TABLE_1.get(name, {})

@@ -1,4 +1,4 @@
-"""Figures as data, and their drawing: panels of lines, with the seeds and run counts below."""
+"""Figures as data, and how they are drawn: panels of lines, with seeds and run counts below."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from experiments.report.measures import Interval
 from experiments.report.study import Floats
 from experiments.report.table import ResultTable, Value
 
-# Okabe and Ito's colours, which readers who see few colours tell apart.
+# The palette of Okabe and Ito, which colour-blind readers can distinguish.
 COLOURS = {"dqn": "#E69F00", "edql": "#009E73", "g-coop": "#56B4E9", "coop": "#D55E00"}
 OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
 COLUMNS = 3  # of panels
 DECADE = 10
-LETTERS = 14  # of small print on an inch
+LETTERS = 14  # of small print per inch
 
 
 @dataclass(frozen=True)
 class Line:
-    """Points with their intervals; x float64 [n], y float64 [n] each. An interval that is all nan isn't drawn."""
+    """Points with their intervals; x and each y are float64 [n]. An interval of nan only is not drawn."""
 
     label: str
     x: Floats
@@ -37,8 +37,8 @@ class Line:
 class Panel:
     """One pair of axes.
 
-    marks: with markers and error bars instead of bands. share: y runs from 0 to 1. wide_x: on a logarithmic scale
-    where the numbers span more than a decade. ticks: names of the places 0, 1, ... on x.
+    marks: draw markers and error bars instead of bands. share: y ranges from 0 to 1. wide_x: use a logarithmic x axis
+    if the numbers span more than a decade. ticks: labels of the positions 0, 1, ... on x.
     """
 
     title: str
@@ -54,7 +54,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Panels; `name` is its files', `text` says how to read it, `counts` how many runs and seeds are in it.
+    """Panels; `name`: of its files. `text`: how to read it. `counts`: the numbers of its runs and seeds.
 
     same_y: the panels share their y axis.
     """
@@ -67,7 +67,7 @@ class Figure:
     same_y: bool = False
 
     def points(self) -> ResultTable:
-        """Everything that is drawn, as one table."""
+        """All points drawn, as one table."""
         rows: list[list[Value]] = [
             [panel.title, line.label, *(float(value) for value in point)]
             for panel in self.panels
@@ -78,7 +78,7 @@ class Figure:
 
 
 def draw(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG, the same bytes for the same data."""
+    """Write a figure as a PNG; the same data give the same bytes."""
     mpl.use("Agg")
     columns = min(COLUMNS, len(figure.panels))
     rows = math.ceil(len(figure.panels) / columns)

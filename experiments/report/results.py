@@ -1,4 +1,4 @@
-"""The report's tables, from a study's runs."""
+"""The report's tables of a study's results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from experiments.report.table import ResultTable, Value, plain
 
 
 def tables(study: Study) -> list[ResultTable]:
-    """Every table that the runs allow."""
+    """All tables for which there are runs."""
     made = [paper_table(study), settings_table(study)]
     if study.index(CAPACITY) is not None:
         made.append(breaking_table(study))
@@ -140,7 +140,7 @@ def runs_table(study: Study) -> ResultTable:
 
 
 def _over_runs(runs: Sequence[Run]) -> list[Value]:
-    """Give mean, sd over runs, sd within a run, IQM, low, high, runs, seeds."""
+    """Compute mean, sd over runs, sd within a run, IQM, low, high, runs, seeds."""
     if not runs:
         return [None, None, None, None, None, None, 0, "none"]
     scores = np.array([[score(run)] for run in runs])
@@ -152,7 +152,7 @@ def _over_runs(runs: Sequence[Run]) -> list[Value]:
 
 
 def _breaking(capacities: list[int], scores: list[Floats], largest: int) -> list[Value]:
-    """Give breaking point, low, high, gaps, largest, return there, runs each."""
+    """Compute breaking point, low, high, gaps, largest, return there, runs each."""
     if not capacities or capacities[-1] != largest:
         return [None, None, None, None, largest, None, None]
     point = breaking_point(np.array(capacities), scores)

@@ -1,4 +1,4 @@
-"""Parts of a study: the runs along one axis, the scores that methods share, and their names in words."""
+"""Parts of a study: runs along one axis, scores of settings and seeds that methods share, and their labels."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def other_settings(study: Study, axis: str) -> list[Setting]:
 def along(
     study: Study, axis: str, method: str, others: Setting, measure: Callable[[Run], float] = score
 ) -> tuple[list[int], list[Floats]]:
-    """The values of one axis at which a method has runs, the other axes fixed, and a measure of the runs at each."""
+    """The values of one axis, others fixed, at which a method has runs, and a measure of the runs at each value."""
     place = study.axes.index(axis)
     settings = [s for s in study.settings if s[:place] + s[place + 1 :] == others and study.of(method, s)]
     measured = [np.array([measure(run) for run in study.of(method, setting)]) for setting in settings]
@@ -35,7 +35,7 @@ def along(
 
 
 def matrices(study: Study) -> dict[str, Floats]:
-    """Scores float64 [seeds, settings] of each method: settings that all methods have, seeds that all of those have."""
+    """Scores float64 [seeds, settings] of each method, over the settings and seeds that all methods have."""
     scores = study.frame.assign(score=study.frame["run"].map(score))
     tables = {
         method: scores[scores["method"] == method].pivot_table("score", "seed", "setting", aggfunc="last")
@@ -47,18 +47,18 @@ def matrices(study: Study) -> dict[str, Floats]:
 
 
 def pairs(methods: Sequence[str]) -> list[tuple[str, str]]:
-    """Every two methods, the later one of the paper's table first."""
+    """All pairs of methods, with the later one in the paper's table first."""
     return [(x, y) for i, x in enumerate(methods) for y in methods[:i]]
 
 
 def counts(runs: Sequence[Run]) -> str:
-    """How many runs of which seeds: "dqn: 12 runs, seeds 0,1; coop: 6 runs, seeds 0-2"."""
+    """The numbers of runs and the seeds by method: "dqn: 12 runs, seeds 0,1; coop: 6 runs, seeds 0-2"."""
     by_method = pd.Series(runs, dtype=object).groupby([run.config.method for run in runs], sort=False)
     return "; ".join(f"{method}: {len(group)} runs, seeds {seeds_of(list(group))}" for method, group in by_method)
 
 
 def seeds_of(runs: Sequence[Run]) -> str:
-    """Seeds in few characters: "0-9", "0,2,5"."""
+    """Seeds in compact form: "0-9", "0,2,5"."""
     seeds = sorted({run.config.seed for run in runs})
     if len(seeds) > 2 and seeds == list(range(seeds[0], seeds[-1] + 1)):
         return f"{seeds[0]}-{seeds[-1]}"

@@ -1,4 +1,4 @@
-"""Where a report's runs come from: a folder with a directory for each run, or a packed study."""
+"""Sources of a report's runs: a folder of run directories, or a packed study."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Source(Protocol):
     sweep: str | None
 
     def text(self, run: str, file: str) -> str | None:
-        """The content of a run's file; None where it has none."""
+        """The content of a run's file; None if there is none."""
         ...
 
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
-        """Some columns of a run's episodes or metrics; an optional one has None where a line lacks it.
+        """Some columns of a run's episodes or metrics; an optional one has None if a line lacks it.
 
-        Raises KeyError or ValueError where a wanted one is not there.
+        Raises KeyError or ValueError if a wanted one is missing.
         """
         ...
 
@@ -56,5 +56,5 @@ class FolderSource:
 
 
 def open_source(path: Path) -> Source:
-    """Open a folder of runs or a packed study; raises UsageError where the file is none."""
+    """Open a folder of runs or a packed study; raises UsageError if the file is none."""
     return FolderSource(path) if path.is_dir() else PackedStudy(path)

@@ -1,4 +1,4 @@
-"""The finished runs of a folder, and by which fields of their configs they differ."""
+"""The finished runs of a folder, and the fields in which their configs differ."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ class Study:
     """The runs of one folder.
 
     axes: dotted names of the fields that differ between runs of one method.
-    missing: names of runs that are expected or begun but not finished, each with what there is of it.
-    diverged: names and configs of runs that ended because they diverged; they are counted and averaged nowhere.
-    reference: the value of each axis that is nearest to the preset's.
+    missing: names of runs that are expected or begun but not finished, each with its state.
+    diverged: names and configs of runs that diverged; they are counted, but included in no mean.
+    reference: for each axis, the value nearest to the preset's.
     """
 
     title: str
@@ -69,12 +69,12 @@ class Study:
 
     @property
     def methods(self) -> list[str]:
-        """Those with a finished run, in the order of the paper's table."""
+        """The methods with a finished run, in the order of the paper's table."""
         return [method for method in METHODS if any(run.config.method == method for run in self.runs)]
 
     @property
     def environments(self) -> list[str]:
-        """The environments played."""
+        """The environments of the runs."""
         return sorted({run.config.env.id for run in self.runs})
 
     @property
@@ -97,18 +97,18 @@ class Study:
 
     @cached_property
     def settings(self) -> list[Setting]:
-        """Every setting that a run has, in order."""
+        """All settings of runs, in order."""
         return sorted(set(map(self.setting, self.runs)), key=lambda setting: [_order(value) for value in setting])
 
     @cached_property
     def frame(self) -> pd.DataFrame:
-        """A row for each run, by seed: `run`, `method`, `seed` and `setting`, its place in `settings`."""
+        """A row per run, ordered by seed: `run`, `method`, `seed` and `setting`, the index in `settings`."""
         places = {setting: place for place, setting in enumerate(self.settings)}
         rows = [(run, run.config.method, run.config.seed, places[self.setting(run)]) for run in self.runs]
         return pd.DataFrame(rows, columns=["run", "method", "seed", "setting"]).sort_values("seed", kind="stable")
 
     def of(self, method: str, setting: Setting) -> list[Run]:
-        """The runs of one method at one setting, by seed."""
+        """The runs of one method at one setting, ordered by seed."""
         return self._groups.get((method, self.settings.index(setting)), []) if setting in self.settings else []
 
     @cached_property
@@ -116,7 +116,7 @@ class Study:
         return {key: list(runs) for key, runs in self.frame.groupby(["method", "setting"])["run"]}
 
     def index(self, axis: str) -> int | None:
-        """The place of an axis in a setting; None if the runs do not differ by it."""
+        """The index of an axis in a setting; None if the runs do not differ in it."""
         return self.axes.index(axis) if axis in self.axes else None
 
 
@@ -163,7 +163,7 @@ def field_of(config: RunConfig, axis: str) -> Any:  # noqa: ANN401 (a value of a
 
 
 def _state(source: Source, run: str) -> str:
-    """What is missing of a run; empty if it is finished."""
+    """Which part of a run is missing; empty if it is finished."""
     summary = source.text(run, SUMMARY)
     if summary is None:
         begun = any(source.text(run, file) is not None for file in (CONFIG, EPISODES))
@@ -197,7 +197,7 @@ def read_config(source: Source, run: str, path: Path) -> RunConfig:
 
 
 def _axes(configs: list[RunConfig]) -> tuple[str, ...]:
-    """Fields that differ within a method; what differs between methods alone is part of the method."""
+    """Fields that differ within a method; those that differ only between methods belong to the method."""
     values: dict[tuple[str, str], set[Any]] = {}
     for config in configs:
         for name, value in _flat(identity(config)):
@@ -215,7 +215,7 @@ def _flat(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _order(value: Any) -> tuple[int, float, str]:  # noqa: ANN401
-    """Numbers by size, the rest by its text."""
+    """Sort key: numbers by size, other values by their text."""
     return (0, float(value), "") if isinstance(value, int | float) else (1, 0.0, str(value))
 
 

@@ -1,4 +1,4 @@
-"""A table of results, and its writing as CSV, Markdown and HTML."""
+"""A table of results, and its formats CSV, Markdown and HTML."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-Value = str | int | float | None  # None: there is no such number
+Value = str | int | float | None  # None: the number does not exist
 
 
 @dataclass(frozen=True)
 class ResultTable:
-    """A table; `name` is its files', `note` what a reader must know of it."""
+    """A table; `name`: of its files. `note`: what a reader must know about it."""
 
     name: str
     title: str
@@ -23,7 +23,7 @@ class ResultTable:
     note: str = ""
 
     def csv(self) -> str:
-        """All digits that matter; nothing where there is no number."""
+        """The table as CSV, with all significant digits; a missing number is empty."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(self.columns)
@@ -31,14 +31,14 @@ class ResultTable:
         return out.getvalue()
 
     def markdown(self) -> str:
-        """Rounded, with title and note."""
+        """The table as Markdown, rounded, with title and note."""
         lines = [f"## {self.title}", ""]
         lines += [f"| {' | '.join(self.columns)} |", f"|{' --- |' * len(self.columns)}"]
         lines += [f"| {' | '.join(map(rounded, row))} |" for row in self.rows]
         return "\n".join([*lines, "", *([self.note, ""] if self.note else [])])
 
     def html(self) -> str:
-        """Rounded, without title."""
+        """The table as HTML, rounded, without title."""
         head = "".join(f"<th>{html.escape(name)}</th>" for name in self.columns)
         body = "".join(
             "<tr>" + "".join(f"<td>{html.escape(rounded(value))}</td>" for value in row) + "</tr>\n"
@@ -49,12 +49,12 @@ class ResultTable:
 
 
 def plain(setting: Sequence[object]) -> list[Value]:
-    """The values of a setting as a table's."""
+    """Convert the values of a setting to a table's values."""
     return [value if isinstance(value, int | float | str) else str(value) for value in setting]
 
 
 def rounded(value: Value) -> str:
-    """A value for people: four digits, more where the number is an integer."""
+    """Format a value for readers: four digits, or all digits of an integer."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"
     if isinstance(value, float) and not value.is_integer():

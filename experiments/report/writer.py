@@ -23,7 +23,7 @@ def draw_curves(runs: Path, out: Path) -> list[Path]:
     """Draw the learning curve of every run that has an episode, finished or not, to OUT/RUN/learning_curve.png.
 
     Raises:
-        UsageError: there is no run, or the folder can't be written.
+        UsageError: there is no run, or the folder cannot be written.
         RunError: a run's file is torn.
     """
     source = open_source(runs)
@@ -48,10 +48,10 @@ def draw_curves(runs: Path, out: Path) -> list[Path]:
 
 
 def write_report(runs: Path, out: Path) -> tuple[Path, list[ResultTable]]:
-    """Write the report of a folder of runs, and warn of runs not to be trusted; the page's path and the tables.
+    """Write the report of a folder of runs, and warn of untrustworthy runs; return its path and tables.
 
     Raises:
-        UsageError: the folder holds no run, or the report's can't be written.
+        UsageError: the folder holds no run, or the report's folder cannot be written.
         RunError: no run is finished, or a finished one has a torn file.
     """
     study = load_study(runs)

@@ -1,1 +1,1 @@
-"""Grids of runs: what they hold, and running them, here or as a job array."""
+"""Grids of runs: their definition, and their execution on this machine or as Slurm job arrays."""

@@ -1,4 +1,4 @@
-"""`coop-sweep`: a grid of runs, here or as a job array; started again, it goes on where it was."""
+"""`coop-sweep`: runs a grid on this machine or as job arrays; the same command continues an interrupted sweep."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class SweepOptions:
     grid: Annotated[Positional[str], tyro.conf.arg(metavar="GRID")]
     """A grid that comes with the package, or a TOML file."""
     quick: bool = False
-    """The grid's small size, for two cores."""
+    """Use the grid's small version, for two cores."""
     jobs: int | None = None
-    """Cells at once; as many as there are cores if not given."""
+    """Number of cells to run concurrently (default: the number of cores)."""
     dir: Path | None = None
-    """Folder of the sweep; runs/sweeps/GRID if not given."""
+    """Folder of the sweep (default: runs/sweeps/GRID)."""
     cell: str | None = None
-    """Run this cell only."""
+    """Run only this cell."""
     slurm: bool = False
-    """Submit the cells as a Slurm job array instead of running them here."""
+    """Submit the cells as Slurm job arrays instead of running them on this machine."""
 
     def folder(self) -> Path:
         """The sweep's folder."""
@@ -63,7 +63,7 @@ def _run() -> None:
         left = [cell.cell.name for cell in cells if not (cell.finished() or cell.diverged())]
         print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
         return
-    # The libraries below a run start a thread for each core unless told otherwise, and runs side by side starve.
+    # By default, the libraries that a run uses start a thread per core, and concurrent runs would starve each other.
     os.environ.update(dict.fromkeys(THREADS, "1"))
     _work(Runner(grid.file, cells, options.jobs or len(os.sched_getaffinity(0))), folder)
 
@@ -76,12 +76,12 @@ def _chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]
 
 
 def _settle(grid: Grid, cells: list[CellFolder], folder: Path) -> None:
-    """Make the folder this sweep's, or refuse it before anything runs."""
+    """Assign the folder to this sweep, or refuse it before anything runs."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for cell in cells:
             cell.check()
-        part = folder / f"sweep.toml.{os.getpid()}"  # the tasks of a job array write it side by side
+        part = folder / f"sweep.toml.{os.getpid()}"  # the tasks of a job array write it concurrently
         part.write_text(grid.to_toml(), encoding="utf-8")
         part.replace(folder / "sweep.toml")
     except OSError as error:
@@ -89,10 +89,10 @@ def _settle(grid: Grid, cells: list[CellFolder], folder: Path) -> None:
 
 
 def _work(runner: Runner, folder: Path) -> None:
-    """Run until no cell is left or somebody asks to stop.
+    """Run until no cell is left or a stop is requested.
 
     Raises:
-        Interrupted: a signal has come before the end.
+        Interrupted: a signal came before the end.
         RunError: cells have failed.
     """
     stop = Stop()

@@ -1,4 +1,4 @@
-"""Shows a sweep: a live table on a terminal, a line for each cell that ends elsewhere."""
+"""Displays a sweep: a live table on a terminal, otherwise a line for each cell that ends."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.table import Table
 from common.process.display import LiveDisplay
 from experiments.sweep.runner import Runner
 
-PLAIN_EVERY = 30.0  # seconds between lines where the output is no terminal
+PLAIN_EVERY = 30.0  # seconds between lines if the output is no terminal
 
 
 class SweepDisplay(LiveDisplay):
@@ -37,7 +37,7 @@ class SweepDisplay(LiveDisplay):
         return f"{text}; {self._time_left()}"
 
     def _time_left(self) -> str:
-        """From the steps per second of this sweep so far; methods and replay ratios differ, so it is a guess."""
+        """Estimate the time left from this sweep's mean speed, although methods and replay ratios differ in speed."""
         done, left = self._runner.steps_done(), self._runner.steps_left()
         if not left:
             return "no time left"

@@ -1,4 +1,4 @@
-"""A cell's folder: what it tells of its run, the config it must hold, and the lock that lets one process run it."""
+"""A cell's folder: the state of its run, the config that it must hold, and the lock of the process that runs it."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is: environment steps at its last episode's end, mean return of the last 100 episodes."""
+    """A run's progress: environment steps at its last episode's end, mean return of the last 100 episodes."""
 
     step: int
     mean_return: float
 
 
 class CellFolder:
-    """One cell's folder under the sweep's."""
+    """One cell's folder within the sweep's."""
 
     def __init__(self, sweep: Path, cell: Cell) -> None:
         self.cell = cell
         self.path = sweep / cell.name
 
     def check(self) -> None:
-        """Raises UsageError where the folder holds a run of another config."""
+        """Raise UsageError if the folder holds a run of another config."""
         held = self.path / "config.toml"
         text = held.read_text(encoding="utf-8") if held.exists() else ""
         try:
-            # An empty file is what a kill left while the run wrote it.
+            # A kill during writing leaves an empty file.
             same = not text or identity(resolve(tomllib.loads(text))) == identity(self.cell.config)
         except (tomllib.TOMLDecodeError, UsageError):
             same = False
@@ -49,15 +49,15 @@ class CellFolder:
             raise UsageError(f"{held}: not the config of this grid's cell; give another --dir")
 
     def finished(self) -> bool:
-        """True once its run has gone through to the end."""
+        """True once its run is complete."""
         return self.outcome().startswith("complete")
 
     def diverged(self) -> bool:
-        """True once its run has diverged, which it would do again."""
+        """True once its run has diverged; repeating it would diverge again."""
         return self.outcome().startswith("diverged")
 
     def outcome(self) -> str:
-        """How its run ended, in the words of summary.json; empty while there is none."""
+        """How its run ended, from summary.json; empty if that does not exist."""
         try:
             return str(json.loads((self.path / "summary.json").read_text(encoding="utf-8"))["exit"])
         except FileNotFoundError:
@@ -65,7 +65,7 @@ class CellFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[int | None]:
-        """Hold the cell's lock; None if another process has it. A child that inherits the descriptor keeps the lock."""
+        """Hold the cell's lock; None if another process has it. A child that inherits the descriptor keeps it."""
         self.path.mkdir(exist_ok=True)
         try:
             lock = FileLock(self.path / "lock")
@@ -76,16 +76,16 @@ class CellFolder:
             yield lock.descriptor
 
     def prepare(self) -> None:
-        """Write the config that the run starts from, or goes on with."""
+        """Write the config from which the run starts or continues."""
         (self.path / "config.toml").write_text(to_toml(self.cell.config), encoding="utf-8")
 
     def progress(self) -> Progress:
-        """Read from the end of episodes.csv; zeros before the first episode has ended."""
+        """Read the progress from the end of episodes.csv; zeros before the first episode's end."""
         try:
             with (self.path / "episodes.csv").open("rb") as file:
                 header = file.readline().decode()
                 file.seek(max(len(header), os.fstat(file.fileno()).st_size - TAIL))
-                # The first line of the tail may be half a one, and the last one too.
+                # The first and the last line of the tail may be incomplete.
                 lines = file.read().decode().rpartition("\n")[0].splitlines()[-RETURN_WINDOW:]
         except FileNotFoundError:
             return Progress(0, 0.0)

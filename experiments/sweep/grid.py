@@ -1,4 +1,4 @@
-"""A grid of runs: the TOML file that describes it, checked and expanded into cells before anything runs."""
+"""A grid of runs: reads its TOML file, checks it, and expands it into cells before anything runs."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 
 @dataclass(frozen=True)
 class GridFile:
-    """What a grid's file may hold."""
+    """The contents of a grid's file."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
     methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("coop",)
     seeds: Annotated[tuple[Count, ...], Field(min_length=1)] = (0,)
     title: str = ""
-    """The question, in one line."""
+    """The grid's question, in one line."""
     preset: str = "cartpole"
-    """Settings that every cell starts from."""
+    """Preset from which every cell starts."""
     mode: Literal["lockstep", "distributed"] = "lockstep"
-    """A cell is one coop-lockstep, or one coop-local."""
+    """Whether a cell is a run of coop-lockstep or of coop-local."""
     actors: Positive = 1
-    """Actor processes of a distributed cell."""
+    """Number of actor processes in a distributed cell."""
     fixed: dict[str, Any] = field(default_factory=dict)
     """Config fields that all cells share."""
     vary: dict[str, Any] = field(default_factory=dict)
-    """Config fields with the list of values that each one takes."""
+    """Config fields that vary, each with a list of values."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One run of a grid; `name` is its folder's."""
+    """One run of a grid; `name`: of its folder."""
 
     name: str
     config: RunConfig
@@ -58,13 +58,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Grid:
-    """A checked grid: its file's content and its cells, those of the first seed first."""
+    """A checked grid: its file's contents, and its cells, ordered by seed first."""
 
     file: GridFile
     cells: tuple[Cell, ...]
 
     def to_toml(self) -> str:
-        """The grid as a file that `load_grid` takes."""
+        """The grid as a file for `load_grid`."""
         return tomli_w.dumps(asdict(self.file))
 
 
@@ -77,11 +77,11 @@ def load_grid(name: str, quick: bool = False) -> Grid:
     """Read, check and expand a grid.
 
     Args:
-        name: of a grid that comes with the package, or a TOML file.
-        quick: take the small size that the file's table `quick` describes.
+        name: of a grid that comes with the package, or the path of a TOML file.
+        quick: use the small version from the file's table `quick`.
 
     Raises:
-        UsageError: the grid can't be right; names the file, the field and what is allowed.
+        UsageError: the grid is invalid; names the file, the field and what is allowed.
     """
     try:
         text = _text(name)
@@ -91,7 +91,7 @@ def load_grid(name: str, quick: bool = False) -> Grid:
 
 
 def parse_grid(text: str, name: str, quick: bool = False) -> Grid:
-    """Check and expand a grid's TOML; `name` is for errors. Raises UsageError as `load_grid`."""
+    """Check and expand a grid's TOML; name: for error messages. Raises UsageError as `load_grid`."""
     try:
         tables = tomllib.loads(text)
         small = tables.pop("quick", None)
@@ -128,7 +128,7 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
     cells = []
     for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
         total_steps = dict(zip(axes, values, strict=True)).get(("total_steps",), file.fixed.get("total_steps"))
-        fits = type(total_steps) is int and total_steps > 0  # what is not a number of steps is refused below
+        fits = type(total_steps) is int and total_steps > 0  # other values are refused below
         start = base(method, total_steps if fits else None)
         tables = merged(start, current(file.fixed, start["learner"]["optimizer"]))
         for path, value in zip(axes, values, strict=True):
@@ -144,7 +144,7 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
 
 
 def _axes(file: GridFile) -> dict[FieldPath, list[Any]]:
-    """The fields that vary, each with its values."""
+    """The varying fields with their values."""
     axes, fixed = dict(leaves(file.vary)), dict(leaves(file.fixed))
     for path, values in axes.items():
         if not isinstance(values, list) or not values:
@@ -158,13 +158,13 @@ def _axes(file: GridFile) -> dict[FieldPath, list[Any]]:
 
 
 def _short_names(paths: tuple[FieldPath, ...]) -> list[str]:
-    """The last word of each path, or all of it where two share that word."""
+    """The last word of each path, or the whole path if two share that word."""
     last = [path[-1] for path in paths]
     return [path[-1] if last.count(path[-1]) == 1 else ".".join(path) for path in paths]
 
 
 def _word(value: Any) -> str:  # noqa: ANN401 (a value of any field)
-    """A value as it stands in a folder's name."""
+    """Format a value for a folder's name."""
     text = ".".join(map(str, value)) if isinstance(value, list) else str(value)
     return re.sub(r"[^A-Za-z0-9.]+", "_", text)
 
@@ -173,7 +173,7 @@ def _check_environments(cells: list[Cell]) -> None:
     known: list[EnvSettings] = []
     for cell in cells:
         if cell.config.env not in known:
-            env_spec(cell.config.env)  # refuses what can't be played
+            env_spec(cell.config.env)  # refuses invalid environments
             known.append(cell.config.env)
 
 

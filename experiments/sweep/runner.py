@@ -1,4 +1,4 @@
-"""Runs a grid's cells as child processes, as many at once as asked; what is finished is never run again."""
+"""Runs a grid's cells as child processes, a given number concurrently; never repeats finished cells."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from common.process.processes import ChildProcess, command
 from experiments.sweep.folder import CellFolder, Progress
 from experiments.sweep.grid import GridFile
 
-GRACE = 60.0  # seconds that a run gets to save itself
-RETRY = 1.0  # seconds until a cell that another process holds is tried again
+GRACE = 60.0  # seconds for a run to save its state
+RETRY = 1.0  # seconds before retrying a cell that another process holds
 
 
 @dataclass
 class Running:
-    """A cell's child process; `began` is the step that it went on from."""
+    """A cell's child process; began: the environment step from which it continued."""
 
     folder: CellFolder
     process: ChildProcess
@@ -26,11 +26,11 @@ class Running:
 
 @dataclass
 class Tally:
-    """What has become of the cells, for displays.
+    """The results of the cells, for displays.
 
-    skipped: finished before. elsewhere: finished by another process meanwhile. failed: name and reason. diverged: name
-    and how the run ended, now or before; a cell that diverged is not run again.
-    steps: environment steps done by the finished runs of this process.
+    skipped: finished earlier. elsewhere: finished by another process meanwhile. failed: name and reason. diverged: name
+    and how the run ended, now or earlier; such a cell is not repeated.
+    steps: environment steps of the runs that this process has finished.
     """
 
     skipped: int = 0
@@ -44,8 +44,8 @@ class Tally:
 class Runner:
     """Starts, watches and ends the cells' processes.
 
-    A process holds its cell's lock for as long as it lives, also when the sweep that started it has been killed. So a
-    cell is never run by two at once: a second sweep, and the tasks of a job array, share the work.
+    A process holds its cell's lock as long as it lives, even if the sweep that started it has been killed. So two
+    processes never run the same cell: a second sweep, and the tasks of a job array, share the work.
     """
 
     def __init__(self, grid: GridFile, folders: list[CellFolder], jobs: int) -> None:
@@ -65,7 +65,7 @@ class Runner:
                 self.waiting.append(folder)
 
     def tick(self) -> list[str]:
-        """Collect what has ended and start what may start; what happened, in words."""
+        """Collect ended processes and start new ones; return lines that describe what happened."""
         return [*self._collect(), *self._fill()]
 
     @property
@@ -74,16 +74,16 @@ class Runner:
         return not self.running and not self.waiting
 
     def steps_left(self) -> int:
-        """Environment steps that the running and the waiting cells still have to do."""
+        """Remaining environment steps of the running and the waiting cells."""
         waiting = sum(folder.cell.config.total_steps for folder in self.waiting)
         return waiting + sum(run.folder.cell.config.total_steps - run.progress.step for run in self.running)
 
     def steps_done(self) -> int:
-        """Environment steps that this process has seen done."""
+        """Environment steps done since this process started."""
         return self.tally.steps + sum(max(0, run.progress.step - run.began) for run in self.running)
 
     def abort(self, seconds: float = GRACE) -> None:
-        """Ask every run to stop, and wait; a run that does not stop in `seconds` is killed."""
+        """Ask every run to stop, and wait; kill runs that do not stop within `seconds`."""
         for run in self.running:
             run.process.interrupt()
         deadline = time.monotonic() + seconds
@@ -131,7 +131,7 @@ class Runner:
         return happened
 
     def _start(self, folder: CellFolder) -> str | None:
-        """Start a cell, or put it back where another process holds it; what is wrong if it can't be started."""
+        """Start a cell, or put it back if another process holds it; return the reason if it cannot be started."""
         name, now = folder.cell.name, time.monotonic()
         if now < self._retry_at.get(name, 0.0):
             self.waiting.append(folder)
@@ -156,7 +156,7 @@ class Runner:
         return None
 
     def _command(self, folder: CellFolder) -> list[str]:
-        # With --resume also at the first start: one that is started again goes on from its newest checkpoint.
+        # --resume also at the first start, so that a restarted run continues from its newest checkpoint.
         flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}", "--resume"]
         if self._grid.mode == "distributed":
             return command("coop-local", *flags, f"--actors={self._grid.actors}")

@@ -1,4 +1,4 @@
-"""A sweep as Slurm job arrays: one task a cell, each one a sweep of that cell alone."""
+"""Runs a sweep as Slurm job arrays: one task per cell, each of which is a sweep of that cell alone."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from experiments.sweep.grid import GridFile
 
 
 def submit(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> list[str]:
-    """Submit those cells that no job has yet, as many arrays as Slurm's limit asks for; what was done, in words.
+    """Submit the cells that no job holds yet, in as many arrays as Slurm's limit requires; return lines that say so.
 
-    Each array's script and the names of its cells stay in the sweep's folder: by them a later call knows what every
-    task that Slurm still lists will run.
+    Each array's script and the names of its cells stay in the sweep's folder: from them a later call knows the cell of
+    every task that Slurm still lists.
 
     Args:
         folder: of the sweep, with its sweep.toml.
         cells: names of the cells to run.
-        jobs: tasks at once; arrays then follow one another. None leaves that to the cluster.
+        jobs: number of concurrent tasks; arrays then run one after another. None: no limit.
 
     Raises:
-        RunError: there is no Slurm here, or it refused.
+        RunError: Slurm is not installed, or refused.
     """
     folder = folder.resolve()
     held = _held(folder)
@@ -50,7 +50,7 @@ def _cells(number: int) -> str:
 
 
 def _held(folder: Path) -> dict[str, str]:
-    """The cells that tasks of this folder's arrays will run or are running, each with its array's job id."""
+    """The cells of this folder's pending or running tasks, with the job ids of their arrays."""
     held = {}
     for line in _ask("squeue", "--array", "--noheader", "--format=%F %K %o").splitlines():
         job, task, script = line.split(maxsplit=2)
@@ -61,7 +61,7 @@ def _held(folder: Path) -> dict[str, str]:
 
 
 def _array_size() -> int:
-    """How many tasks an array may have."""
+    """The largest number of tasks in an array."""
     found = re.search(r"^MaxArraySize\s*=\s*(\d+)", _ask("scontrol", "show", "config"), re.MULTILINE)
     if found is None:
         raise RunError("scontrol show config: names no MaxArraySize")
@@ -72,7 +72,7 @@ def _array_size() -> int:
 
 
 def _write(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> Path:
-    """Write an array's script and the names of its cells, one a line, under a number of their own."""
+    """Write an array's script and the names of its cells, one per line, under a new number."""
     script = next(path for n in count(1) if not (path := folder / f"array-{n}.sh").exists())
     script.with_suffix(".cells").write_text("".join(f"{cell}\n" for cell in cells), encoding="utf-8")
     script.write_text(_script(grid, folder, script.with_suffix(".cells"), len(cells), jobs), encoding="utf-8")
@@ -80,7 +80,7 @@ def _write(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> 
 
 
 def _submit(script: Path, after: str | None) -> str:
-    """Hand an array to Slurm, to begin once job `after` has ended; its job id."""
+    """Submit an array to Slurm, to begin once job `after` has ended; return its job id."""
     wait = [] if after is None else [f"--dependency=afterany:{after}"]
     try:
         return _ask("sbatch", "--parsable", *wait, str(script)).strip().partition(";")[0]
@@ -91,13 +91,13 @@ def _submit(script: Path, after: str | None) -> str:
 
 
 def _ask(program: str, *arguments: str) -> str:
-    """What a program of Slurm's prints; RunError where there is none, or it refuses."""
+    """The output of one of Slurm's programs; raises RunError if it is missing or fails."""
     try:
         done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
     except FileNotFoundError as error:
         raise RunError(f"{program}: not found here; give the same command where Slurm is") from error
     if done.returncode:
-        # It begins with the program's name.
+        # The text begins with the program's name.
         raise RunError(" ".join(done.stderr.split()) or f"{program}: exit status {done.returncode}")
     return done.stdout
 
