@@ -23,7 +23,7 @@ from learner.records.epochs import complete_epochs, load_learner, newest_epoch
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
 from replay.persistence.journal import DRAW, TornFile, journal_files, read_draw, read_file
-from replay.persistence.recovery import carry_out, following_files
+from replay.persistence.recovery import following_files, replay_file
 from replay.table.table import PinnedBatch
 
 
@@ -32,14 +32,14 @@ class Outcome:
     """The result of a re-execution.
 
     began: number of the first update; 0 if the journal reaches back to the beginning of the run.
-    holes: segments missing in the journal although it contains later ones of their stream.
+    missing_segments: segments missing in the journal although it contains later ones of their stream.
     digest: SHA-256 over both networks' parameters.
     """
 
     began: int
     updates: int
     transitions: int
-    holes: int
+    missing_segments: int
     digest: str
 
 
@@ -78,7 +78,7 @@ def reexecute(run_dir: Path) -> Outcome:
         accepted = summary["transitions_accepted"]
         raise RunError(f"{folder}: {core.table.inserted:,} transitions, but the run accepted {accepted:,}")
     digest = hashlib.sha256(b"".join(network.snapshot().tobytes() for network in agent.networks)).hexdigest()
-    return Outcome(began, agent.updates, core.table.inserted, core.holes, digest)
+    return Outcome(began, agent.updates, core.table.inserted, core.missing_segments, digest)
 
 
 def _beginning(config: RunConfig, run_dir: Path, folder: Path, run_id: int) -> tuple[Agent, ReplayCore, int]:
@@ -116,7 +116,7 @@ def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:
 def _draws(core: ReplayCore, folder: Path, files: list[int], run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
     for number in files:
         try:
-            yield from carry_out(core, folder, number, run_id)
+            yield from replay_file(core, folder, number, run_id)
         except TornFile:
             if number != files[-1]:
                 raise

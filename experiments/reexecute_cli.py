@@ -30,6 +30,6 @@ def _run() -> None:
     outcome = reexecute(options.run_dir)
     print(
         f"updates {outcome.began:,} to {outcome.updates:,} on {outcome.transitions:,} transitions, none twice, "
-        f"{outcome.holes} segments missing: parameters, optimizers and random state equal the run's, bit for bit "
-        f"(sha256 {outcome.digest})"
+        f"{outcome.missing_segments} segments missing: parameters, optimizers and random state equal "
+        f"the run's, bit for bit (sha256 {outcome.digest})"
     )

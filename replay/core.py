@@ -1,4 +1,4 @@
-"""What the replay service decides, without I/O: de-duplication, the limiter's verdicts, draws and the books."""
+"""The replay service's logic, without I/O: de-duplication, limiter, inserts, draws and counters."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest, E
 from common.settings.capacity import check_memory
 from common.settings.config import RunConfig
 from common.types import Array, Batch, EnvSpec, Segment
-from replay.dedup import SeenWindow
+from replay.dedup import DuplicateFilter
 from replay.episodes import EpisodeLog
 from replay.limiter import RateLimiter
 from replay.table.table import PinnedBatch, Table, TableSnapshot
 
-LEARNERS_KEPT = 64  # learners that others have taken over from, and that are refused
+LEARNERS_KEPT = 64  # superseded learners, which are refused
 
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Not now, and why."""
+    """The request is not admitted now; `reason` says why."""
 
     reason: str
 
 
 class Recorder(Protocol):
-    """Takes down what changes a core, in order, before anybody hears of it."""
+    """Records the changes of a core, in order, before the requests are answered."""
 
     def insert(self, payload: bytes) -> None:
-        """An insert request that is about to be carried out.
+        """Record an insert request that is about to be applied.
 
         Raises:
-            OSError: it could not be taken down, and must not be carried out.
+            OSError: it could not be recorded, and must not be applied.
         """
 
     def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
-        """A draw and the transitions that it gave; never fails, for the draw has happened."""
+        """Record a draw and the ids of its transitions, int64 [batch]; never fails, because the draw has happened."""
 
     def limit(self, limiter: RateLimiter) -> None:
-        """New settings of the limiter; raises OSError as `insert`."""
+        """Record new settings of the limiter; raises OSError as `insert`."""
 
 
-class Unrecorded:
+class NullRecorder:
     """The recorder of a core without a journal."""
 
     def insert(self, payload: bytes) -> None:
@@ -62,18 +62,18 @@ class Unrecorded:
 class CoreSnapshot(NamedTuple):
     """A core's state at one moment; `table` must be released.
 
-    books: everything but table and episodes, msgpack-able. episodes: those that may be asked for again; plain, for
-    packing them takes longer than the others may wait. replies: the draws that may be asked for again.
+    state: everything except table and episodes, for msgpack. episodes: those that the learner may ask for again; not
+    packed yet, because packing would block the core for too long. replies: the draws that it may ask for again.
     """
 
-    books: dict[str, Any]
+    state: dict[str, Any]
     episodes: tuple[EpisodeRecord, ...]
     table: TableSnapshot
     replies: list[tuple[Batch, Drawn]]
 
 
 class Reply(NamedTuple):
-    """The answer to a draw; the frames of its batch are held until the learner can't ask for it again."""
+    """The answer to a draw; its frames are held until the learner cannot ask for it again."""
 
     batch: PinnedBatch
     drawn: Drawn
@@ -81,17 +81,17 @@ class Reply(NamedTuple):
 
 @dataclass(slots=True)
 class _Account:
-    """Transitions of one actor process: accepted here, and acknowledged according to the actor."""
+    """Transitions of one actor process: accepted by this core, and acknowledged according to the actor."""
 
     accepted: int = 0
     acked: int = 0
 
 
 class ReplayCore:
-    """A table with its limiter and its books. One owner makes all calls.
+    """A table with its limiter and counters. One owner makes all calls.
 
-    drawn: batches drawn, as the learner counts them: one that comes back from an epoch takes the count back with it.
-    problem: why no segment can be taken although the limiter admits it, in words; empty where there is none.
+    drawn: batches drawn, as the learner counts them: a learner restored from an epoch also resets this count.
+    problem: why no segment can be inserted although the limiter admits it, in words; empty if there is no problem.
     """
 
     def __init__(self, config: RunConfig, spec: EnvSpec, recorder: Recorder | None = None) -> None:
@@ -100,7 +100,7 @@ class ReplayCore:
         self.limiter = RateLimiter(
             settings.ratio, settings.learning_starts, settings.tolerance, config.total_steps, settings.capacity
         )
-        self.recorder: Recorder = recorder or Unrecorded()
+        self.recorder: Recorder = recorder or NullRecorder()
         self.batch_size = config.learner.batch_size
         self._total_steps = config.total_steps
         self.drawn = 0
@@ -108,36 +108,36 @@ class ReplayCore:
         self.problem = ""
         self.inserts_wait_for = ""
         self.samples_wait_for = ""
-        self._seen = SeenWindow()
+        self._seen = DuplicateFilter()
         self._episodes = EpisodeLog()
-        self._asked_from = 0  # the episode from which on the last draw asked
+        self._next_episode = 0  # number of the first episode for which the last draw asked
         self._accounts: dict[int, _Account] = {}
-        self._learners: list[int] = []  # the last one is served
+        self._learners: list[int] = []  # the last one is the present learner
         self._replies: dict[int, Reply] = {}
 
     @property
     def lost(self) -> int:
-        """Transitions that actors hold a receipt for and that never came here; 0 unless something is broken.
+        """Transitions acknowledged to actors but missing here; 0 unless something is broken.
 
-        At most those of the whole run: an actor that says more is not to be believed.
+        At most those of the whole run, whatever the actors claim.
         """
         lost = sum(max(0, account.acked - account.accepted) for account in self._accounts.values())
         return min(lost, self._total_steps)
 
     @property
-    def holes(self) -> int:
-        """Segments that have not come although later ones of their stream have."""
+    def missing_segments(self) -> int:
+        """Segments that have not arrived although later ones of their stream have."""
         return self._seen.missing()
 
     @property
-    def episodes_booked(self) -> int:
-        """Episodes that ended so far."""
+    def episodes_total(self) -> int:
+        """Number of episodes that have ended."""
         return self._episodes.total
 
     def insert(self, segment: Segment, payload: bytes = b"") -> int | Wait:
-        """Take a segment, unless an earlier delivery was taken; the count of transitions accepted, or the reason.
+        """Insert a segment unless it is a duplicate; return the number of transitions accepted, or the reason to wait.
 
-        payload: the request that brought it, for the recorder.
+        payload: the segment's request, for the recorder.
         """
         if self._seen.seen(segment.incarnation, segment.stream, segment.sequence):
             self.duplicates += 1
@@ -152,11 +152,11 @@ class ReplayCore:
         self.inserts_wait_for = reason or ""
         if reason:
             return Wait(reason)
-        self.take(segment)
+        self.apply_insert(segment)
         return self.table.inserted
 
-    def take(self, segment: Segment) -> None:
-        """Carry out an insert that was admitted, now or, according to a journal, before."""
+    def apply_insert(self, segment: Segment) -> None:
+        """Apply an admitted insert, a new one or one from a journal; raises RunError for a duplicate."""
         if not self._seen.accept(segment.incarnation, segment.stream, segment.sequence):
             raise RunError(f"segment {segment.sequence} of actor {segment.incarnation:x} would be taken twice")
         account = self._accounts.setdefault(segment.incarnation, _Account())
@@ -169,10 +169,10 @@ class ReplayCore:
         self.table.insert(segment)
 
     def draw(self, request: DrawRequest) -> Reply | Wait:
-        """Draw a batch, or give the one that this request drew before, or the limiter's reason.
+        """Draw a batch, or repeat the one of an equal earlier request; return the reason to wait if none is admitted.
 
         Raises:
-            RunError: another learner has taken over from the one that asks.
+            RunError: another learner has superseded the one that asks.
         """
         self._follow(request)
         known = self._replies.get(request.sequence)
@@ -186,12 +186,12 @@ class ReplayCore:
         self.samples_wait_for = reason or ""
         if reason:
             return Wait(reason)
-        reply = self.give(request)
+        reply = self.apply_draw(request)
         self.recorder.draw(request, reply.batch.columns["ids"])
         return reply
 
-    def give(self, request: DrawRequest) -> Reply:
-        """Carry out a draw that was admitted, now or, according to a journal, before; raises as `draw`."""
+    def apply_draw(self, request: DrawRequest) -> Reply:
+        """Apply an admitted draw, a new one or one from a journal; raises as `draw`."""
         self._follow(request)
         table = self.table
         if request.priorities:
@@ -199,7 +199,7 @@ class ReplayCore:
             table.update_priorities(np.array(numbers, np.int64), np.array(priorities))
         batch = table.sample_pinned(request.batch_size)
         self.drawn = max(self.drawn, request.sequence + 1)
-        self._asked_from = request.episodes_from
+        self._next_episode = request.episodes_from
         first, episodes = self._episodes.since(request.episodes_from, MAX_EPISODES)
         drawn = Drawn(
             sequence=request.sequence,
@@ -216,22 +216,22 @@ class ReplayCore:
         return reply
 
     def limit(self, limiter: RateLimiter) -> None:
-        """Go on under other settings; raises OSError where they can't be recorded."""
+        """Change the limiter's settings; raises OSError if they cannot be recorded."""
         self.recorder.limit(limiter)
         self.limiter = limiter
 
-    def adopt(self, limiter: RateLimiter) -> None:
-        """Take over the settings that the run had before; it may be longer now than it was then."""
+    def restore_limiter(self, limiter: RateLimiter) -> None:
+        """Restore earlier settings, with the run's present length, which may have grown."""
         self.limiter = replace(limiter, total=self._total_steps)
 
     def snapshot(self, base: int, keep: Sequence[int] = ()) -> CoreSnapshot:
-        """Everything as it is now; a learner that is back at `base` updates can be served from it.
+        """Take a snapshot that can serve a learner restored at `base` updates.
 
-        keep: the older epochs that a learner may go back to. Episodes that none of them asks for again are dropped.
+        keep: the older epochs to which a learner may return. Episodes that none of them needs are dropped.
         """
         again = (drawn.first_episode for _, drawn in self._replies.values() if drawn.sequence >= base)
-        self._episodes.mark(base, min(again, default=self._asked_from), keep)
-        books = {
+        self._episodes.mark(base, min(again, default=self._next_episode), keep)
+        state = {
             "drawn": self.drawn,
             "duplicates": self.duplicates,
             "seen": self._seen.state(),
@@ -241,33 +241,33 @@ class ReplayCore:
             "learners": list(self._learners),
             "limiter": asdict(self.limiter),
         }
-        return CoreSnapshot(books, self._episodes.copy(), self.table.snapshot(), self.repeatable(base))
+        return CoreSnapshot(state, self._episodes.copy(), self.table.snapshot(), self.repeatable(base))
 
     def repeatable(self, base: int = 0) -> list[tuple[Batch, Drawn]]:
-        """The draws from number `base` on that the learner may ask for again."""
+        """The draws from number `base` on for which the learner may ask again."""
         return [(batch.read(), drawn) for batch, drawn in self._replies.values() if drawn.sequence >= base]
 
     def restore(
         self,
-        books: Mapping[str, Any],
+        state: Mapping[str, Any],
         episodes: Iterable[EpisodeRecord],
         meta: dict[str, Any],
         arrays: dict[str, Array],
         replies: Iterable[tuple[Batch, Drawn]],
     ) -> None:
-        """Go on where `snapshot` was called; the core must be new. Raises UsageError for a table of other settings."""
+        """Restore a new core from a `snapshot`. Raises UsageError if its table has other settings."""
         self.table.load_state(meta, arrays)
-        self.drawn = books["drawn"]
-        self.duplicates = books["duplicates"]
-        self._seen.load_state(books["seen"])
-        self._episodes.load(books["first_episode"], episodes, dict(books.get("floors", [])))
-        self._accounts = {actor: _Account(accepted, acked) for actor, accepted, acked in books["accounts"]}
-        self._learners = list(books["learners"])
-        self.adopt(RateLimiter.from_table(books["limiter"]))
+        self.drawn = state["drawn"]
+        self.duplicates = state["duplicates"]
+        self._seen.load_state(state["seen"])
+        self._episodes.load(state["first_episode"], episodes, dict(state.get("floors", [])))
+        self._accounts = {actor: _Account(accepted, acked) for actor, accepted, acked in state["accounts"]}
+        self._learners = list(state["learners"])
+        self.restore_limiter(RateLimiter.from_table(state["limiter"]))
         self._replies = {drawn.sequence: Reply(self.table.pin(batch), drawn) for batch, drawn in replies}
 
     def _follow(self, request: DrawRequest) -> None:
-        """Let the learner's count of updates be the count of draws where one of us has come back from an epoch."""
+        """Set the count of draws to the learner's count of updates if either side has returned to an epoch."""
         known = self._learners[-1:] == [request.incarnation]
         if not known:
             if request.incarnation in self._learners:
@@ -277,11 +277,11 @@ class ReplayCore:
         if not known or request.base > self.drawn:
             self.drawn = request.base
             self._episodes.known_to_end_at(request.episodes_from)
-        # Keeping more than can be asked for again costs memory and the processor's caches.
+        # Older replies cannot be asked for again; they would only occupy memory and the processor's caches.
         self._forget([sequence for sequence in self._replies if sequence < request.base])
 
     def _forget(self, sequences: Iterable[int]) -> None:
-        """Drop replies, those of them that are there."""
+        """Drop those of these replies that exist."""
         for sequence in sequences:
             reply = self._replies.pop(sequence, None)
             if reply is not None:
@@ -289,7 +289,7 @@ class ReplayCore:
 
 
 def make_table(config: RunConfig, spec: EnvSpec) -> Table:
-    """The table of a run as it starts; raises UsageError where this machine can't hold it."""
+    """Make the empty table of a run; raises UsageError if it does not fit into this machine's memory."""
     check_memory(config, spec)
     settings = config.replay
     return Table(

@@ -1,4 +1,4 @@
-"""Which segments have been seen: retries are recognised, reordered ones are not taken for retries."""
+"""Filters duplicate segments: recognises retries, and does not mistake reordered segments for retries."""
 
 from __future__ import annotations
 
@@ -25,36 +25,36 @@ class _Stream:
     gaps: list[range] = field(default_factory=list)
 
     def gap_of(self, sequence: int) -> int | None:
-        """The index of the gap that a number is missing from; None where it was seen, or comes after all others."""
+        """The index of the gap that contains a number; None if it was seen, or is above all others."""
         index = bisect_right(self.gaps, sequence, key=_start) - 1
         return index if index >= 0 and sequence in self.gaps[index] else None
 
 
-class SeenWindow:
+class DuplicateFilter:
     """Sequence numbers seen of every (incarnation, stream), counted from 0.
 
-    A stream remembers its newest `max_gaps` gaps, and the `max_streams` streams that were used last do so;
-    of the others their names alone are left. What is forgotten counts as lost, and whatever comes after it was
-    forgotten is refused, all of a stream whose name is left: never twice goes before at least once. A number that is
-    accepted adds one gap or one name at most, so memory is bounded by the number of segments.
+    The filter remembers the newest `max_gaps` gaps of the `max_streams` streams used last, and only the names of the
+    other streams. Numbers in forgotten gaps count as lost, and are refused if they arrive later, as is everything
+    of a stream of which only the name is left: at-most-once takes precedence over at-least-once. An accepted number
+    adds at most one gap or one name, so memory is bounded by the number of segments.
     """
 
     def __init__(self, max_streams: int = MAX_STREAMS, max_gaps: int = MAX_GAPS) -> None:
         self._max_streams = max_streams
         self._max_gaps = max_gaps
         self._streams: OrderedDict[tuple[int, int], _Stream] = OrderedDict()
-        self._closed: set[tuple[int, int]] = set()  # streams of which the name is left
+        self._closed: set[tuple[int, int]] = set()  # streams of which only the name is left
         self._missing = 0
 
     def seen(self, incarnation: int, stream: int, sequence: int) -> bool:
-        """True where `accept` would refuse; records nothing."""
+        """Whether `accept` would refuse; records nothing."""
         if (incarnation, stream) in self._closed:
             return True
         seen = self._streams.get((incarnation, stream))
         return seen is not None and sequence <= seen.highest and seen.gap_of(sequence) is None
 
     def accept(self, incarnation: int, stream: int, sequence: int) -> bool:
-        """Record a sequence number (>= 0); False where it was seen before."""
+        """Record a sequence number (>= 0); return False if it was seen before."""
         if (incarnation, stream) in self._closed:
             return False
         seen = self._streams.setdefault((incarnation, stream), _Stream())
@@ -79,11 +79,11 @@ class SeenWindow:
         return True
 
     def missing(self) -> int:
-        """Numbers skipped below the highest seen of their stream: lost, unless they still come."""
+        """Count of numbers skipped below the highest of their stream: lost, unless they still arrive."""
         return self._missing
 
     def state(self) -> dict[str, Any]:
-        """Everything seen, msgpack-able, streams in order of last use."""
+        """The state for `load_state` and msgpack, with streams in order of last use."""
         forgotten = self._missing - sum(_lengths(self._streams.values()))
         return {
             "forgotten": min(forgotten, MAX_INTEGER),
@@ -95,7 +95,7 @@ class SeenWindow:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Continue where `state` was taken, by an earlier version too."""
+        """Restore a state from `state`, also one of an earlier version."""
         self._closed = {(incarnation, stream) for incarnation, stream in state.get("closed", [])}
         self._streams = OrderedDict(
             ((incarnation, stream), _Stream(highest, _ranges(gaps)))
@@ -109,7 +109,7 @@ def _lengths(streams: Iterable[_Stream]) -> Iterable[int]:
 
 
 def _ranges(gaps: Iterable[int | Sequence[int]]) -> list[range]:
-    """Saved gaps, each [start, stop]; earlier versions saved every missing number by itself."""
+    """Convert saved gaps, each [start, stop]; earlier versions saved every missing number separately."""
     ranges: list[range] = []
     for gap in gaps:
         start, stop = (gap, gap + 1) if isinstance(gap, int) else gap

@@ -132,7 +132,7 @@ class ReplayService:
                 evicted_unsampled=table.evicted_unsampled,
                 duplicates=core.duplicates,
                 lost=core.lost,
-                episodes=core.episodes_booked,
+                episodes=core.episodes_total,
                 bad_messages=self._node.bad_messages,
                 inserts_wait_for=core.inserts_wait_for,
                 samples_wait_for=core.samples_wait_for,

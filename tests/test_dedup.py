@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.bounds import MAX_COUNT, MAX_GAPS
-from replay.dedup import SeenWindow
+from replay.dedup import DuplicateFilter
 
 arrivals = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(0, 30)), max_size=200)
 
@@ -16,7 +16,7 @@ arrivals = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(
 @settings(max_examples=200)
 @given(arrivals=arrivals)
 def test_equals_a_set(arrivals: list[tuple[int, int, int]]) -> None:
-    window, seen = SeenWindow(), set()
+    window, seen = DuplicateFilter(), set()
     for arrival in arrivals:
         assert window.seen(*arrival) == (arrival in seen)
         assert window.accept(*arrival) == (arrival not in seen)
@@ -29,10 +29,10 @@ def test_equals_a_set(arrivals: list[tuple[int, int, int]]) -> None:
 @settings(max_examples=100)
 @given(before=arrivals, after=arrivals)
 def test_restored_window_goes_on_alike(before: list[tuple[int, int, int]], after: list[tuple[int, int, int]]) -> None:
-    window = SeenWindow(max_streams=3, max_gaps=5)
+    window = DuplicateFilter(max_streams=3, max_gaps=5)
     for arrival in before:
         window.accept(*arrival)
-    twin = SeenWindow(max_streams=3, max_gaps=5)
+    twin = DuplicateFilter(max_streams=3, max_gaps=5)
     twin.load_state(msgpack.unpackb(msgpack.packb(window.state())))
     for arrival in after:
         known = window.seen(*arrival)
@@ -43,7 +43,7 @@ def test_restored_window_goes_on_alike(before: list[tuple[int, int, int]], after
 @settings(max_examples=100)
 @given(arrivals=arrivals)
 def test_what_is_forgotten_is_never_accepted_twice(arrivals: list[tuple[int, int, int]]) -> None:
-    window, accepted = SeenWindow(max_streams=2, max_gaps=2), []
+    window, accepted = DuplicateFilter(max_streams=2, max_gaps=2), []
     for arrival in arrivals:
         if window.accept(*arrival):
             accepted.append(arrival)
@@ -53,7 +53,7 @@ def test_what_is_forgotten_is_never_accepted_twice(arrivals: list[tuple[int, int
 
 def test_large_jumps_take_one_gap_each() -> None:
     """An actor's certificate is enough to skip numbers: what it makes the service hold depends on inserts alone."""
-    window, streams, each = SeenWindow(), 10, 200
+    window, streams, each = DuplicateFilter(), 10, 200
     for sequence in range(MAX_COUNT // each, MAX_COUNT, MAX_COUNT // each)[:each]:
         for stream in range(streams):
             assert window.accept(1, stream, sequence)
@@ -66,7 +66,7 @@ def test_large_jumps_take_one_gap_each() -> None:
 
 def test_windows_of_earlier_versions_load() -> None:
     """They list every missing number by itself."""
-    window = SeenWindow()
+    window = DuplicateFilter()
     window.load_state({"forgotten": 7, "streams": [[1, 0, 9, [2, 3, 4, 8]], [2, 0, 0, []]]})
     assert window.missing() == 11
     assert window.state()["streams"] == [[1, 0, 9, [[2, 5], [8, 9]]], [2, 0, 0, []]]
@@ -87,13 +87,13 @@ def test_windows_of_earlier_versions_load() -> None:
     ],
 )
 def test_gaps(sequences: list[int], accepted: list[bool], missing: int) -> None:
-    window = SeenWindow(max_gaps=4)
+    window = DuplicateFilter(max_gaps=4)
     assert [window.accept(1 << 63, 0, sequence) for sequence in sequences] == accepted
     assert window.missing() == missing
 
 
 def test_streams_used_least_recently_are_forgotten() -> None:
-    window = SeenWindow(max_streams=2)
+    window = DuplicateFilter(max_streams=2)
     assert window.accept(1, 0, 1)  # 0 is missing
     assert window.accept(2, 0, 0)
     assert not window.accept(1, 0, 1)
@@ -103,7 +103,7 @@ def test_streams_used_least_recently_are_forgotten() -> None:
     assert window.accept(5, 0, 0)  # drops stream 1, and its missing 0 is lost
     assert window.missing() == 1
     assert len(window.state()["streams"]) == 2
-    twin = SeenWindow(max_streams=2)
+    twin = DuplicateFilter(max_streams=2)
     twin.load_state(msgpack.unpackb(msgpack.packb(window.state())))
     for one in (window, twin):
         for incarnation, sequence in ((1, 1), (2, 0), (3, 0), (1, 0), (1, 2)):

@@ -39,7 +39,7 @@ def _restored(folder: Path, spec: EnvSpec) -> ReplayCore:
 
 def test_segments_and_batches_of_protocol_1_are_read(tmp_path: Path, spec: EnvSpec) -> None:
     core = _restored(tmp_path, spec)
-    assert (core.table.inserted, core.drawn, core.episodes_booked, core.lost) == (28, 3, 7, 0)
+    assert (core.table.inserted, core.drawn, core.episodes_total, core.lost) == (28, 3, 7, 0)
     batch = core.table.sample(16)
     assert batch.span.tolist() == [1] * 16
     assert batch.rewards.tolist() == batch.ids.tolist(), "rewards count the steps"

@@ -51,7 +51,7 @@ def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
     for one in (core, twin):
         assert one.insert(make_segment(spec, 14)) == 60, "a repeated delivery is still known"
         assert one.insert(make_segment(spec, 15)) == 64
-    assert (twin.duplicates, twin.lost, twin.episodes_booked) == (2, 0, 16)
+    assert (twin.duplicates, twin.lost, twin.episodes_total) == (2, 0, 16)
     for sequence in (base, base + 1, core.drawn, core.drawn + 1):
         request = DrawRequest(1, sequence, base, 4, 0)
         first, second = core.draw(request), twin.draw(request)
@@ -60,7 +60,7 @@ def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
         for name in ("ids", "frames", "obs_index"):
             np.testing.assert_array_equal(getattr(first.batch.read(), name), getattr(second.batch.read(), name))
         assert first.drawn == second.drawn
-    assert twin.snapshot(base).books == core.snapshot(base).books
+    assert twin.snapshot(base).state == core.snapshot(base).state
 
 
 def test_a_run_that_was_complete_may_go_on_for_longer(spec: EnvSpec, tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_episodes_are_kept_as_long_as_they_may_be_asked_for(spec: EnvSpec, tmp_p
         told[core.drawn] = last.drawn.first_episode
         save(core, epochs, core.drawn, *list(told)[-3:-1])
         kept = core.snapshot(core.drawn, list(told)[-3:-1])
-        assert kept.books["first_episode"] <= told[list(told)[max(0, turn - 3)]]
+        assert kept.state["first_episode"] <= told[list(told)[max(0, turn - 3)]]
         assert len(kept.episodes) <= 31
         kept.table.frames.release()
     twin = ReplayCore(CONFIG, spec)
@@ -149,7 +149,7 @@ def test_episodes_are_kept_as_long_as_they_may_be_asked_for(spec: EnvSpec, tmp_p
         assert not isinstance(reply, Wait)
         assert reply.drawn.first_episode == told[back]
         steps = [record.env_step for record in reply.drawn.episodes]
-        assert steps == [4 * (number + 1) for number in range(told[back], one.episodes_booked)]
+        assert steps == [4 * (number + 1) for number in range(told[back], one.episodes_total)]
 
 
 def test_a_run_without_epochs_keeps_a_bounded_number_of_episodes(spec: EnvSpec) -> None:
@@ -174,7 +174,7 @@ def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
     older = ReplayCore(CONFIG, spec)
     older.insert(make_segment(spec))
     assert isinstance(older.draw(DrawRequest(2, 20, 20, 4, 9)), Wait)
-    assert (older.drawn, older.episodes_booked) == (20, 9), "episodes that the learner knows keep their numbers"
+    assert (older.drawn, older.episodes_total) == (20, 9), "episodes that the learner knows keep their numbers"
 
 
 def test_learner_epochs(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def _use(core: ReplayCore, spec: EnvSpec, sequences: range) -> None:
 
 def _assert_alike(core: ReplayCore, twin: ReplayCore) -> None:
     first, second = core.snapshot(0), twin.snapshot(0)
-    assert first.books == second.books
+    assert first.state == second.state
     assert first.episodes == second.episodes
     assert first.table.meta == second.table.meta
     for name, array in first.table.arrays.items():

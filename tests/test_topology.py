@@ -113,7 +113,7 @@ def test_coop_local_end_to_end(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     check_files(path, 1500)
     again = reexecute(path)
-    assert (again.began, again.updates, again.holes) == (1000, 1372, 0)
+    assert (again.began, again.updates, again.missing_segments) == (1000, 1372, 0)
     again = run("coop-local", *flags)
     assert again.returncode == 2
     assert again.stderr.count("\n") == 1

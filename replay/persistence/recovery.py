@@ -39,7 +39,7 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
     numbers = following_files(folder, first)
     for number in numbers:
         try:
-            for _ in carry_out(core, folder, number, run_id):
+            for _ in replay_file(core, folder, number, run_id):
                 draws += 1
         except TornFile as torn:
             if number != numbers[-1]:
@@ -49,20 +49,20 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
     return first + len(numbers), f"{taken:,} transitions and {draws:,} batches from the journal"
 
 
-def carry_out(core: ReplayCore, folder: Path, number: int, run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
+def replay_file(core: ReplayCore, folder: Path, number: int, run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
     """Replay one file; yields every draw, which must be read before the next one. Raises as `recover`."""
     read = SegmentReader(core.table.spec)
     for kind, payload in read_file(folder, number, run_id):
         if kind == SEGMENT:
-            core.take(read(wire.decode(payload, wire.ON_DISK)))
+            core.apply_insert(read(wire.decode(payload, wire.ON_DISK)))
         elif kind == DRAW:
             request, ids = read_draw(payload)
-            batch, _ = core.give(request)
+            batch, _ = core.apply_draw(request)
             if not np.array_equal(batch.columns["ids"], ids):
                 raise RunError(f"{folder}: file {number}, batch {request.sequence}: not the transitions taken down")
             yield request, batch
         elif kind == LIMITER:
-            core.adopt(read_limiter(payload))
+            core.restore_limiter(read_limiter(payload))
 
 
 def following_files(folder: Path, first: int) -> list[int]:

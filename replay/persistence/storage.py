@@ -83,7 +83,7 @@ def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path, mark: 
     files["frames"] = file.size, file.checksum
     replies = [bytes(encode_batch("", batch.frames, batch.columns(), drawn)) for batch, drawn in snapshot.replies]
     state = {
-        "books": snapshot.books,
+        "books": snapshot.state,  # a name of the file format
         "episodes": msgspec.to_builtins(snapshot.episodes),
         "table": meta,
         "replies": replies,
