@@ -36,7 +36,7 @@ from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
 from learner.broadcast import Broadcaster
-from learner.reception import Reception
+from learner.join_service import JoinService
 from learner.roster import Roster
 from learner.shared_epochs import SharedEpochs
 
@@ -124,7 +124,7 @@ class Topology:
         self._node = stack.enter_context(Node(session, RUN, "learner", new_incarnation()))
         agent = Agent(config, spec)
         digest, epochs = agent.networks[0].layout_digest(), SharedEpochs([], "benchmark")
-        Reception(self._node, config, spec, digest, 0, epochs, Roster(), print)
+        JoinService(self._node, config, spec, digest, 0, epochs, Roster(), print)
         Broadcaster(self._node, agent)
         joining = ["--run", RUN, "--connect", head]
         service = command("coop-replay", *joining, "--listen", replay, "--run-dir", str(folder))

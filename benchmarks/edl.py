@@ -25,7 +25,7 @@ from common.settings.config import RunConfig
 from common.settings.tables import validated
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
-from learner.edl.arrays import Array, like
+from learner.edl.arrays import Array, convert_like
 from learner.edl.backprop import Tape
 from learner.edl.feedback import FeedbackRule
 
@@ -81,7 +81,7 @@ class SvdRule(FeedbackRule):
         for gradient in out.values():
             if gradient.ndim > 1:
                 u, values, vh = torch.linalg.svd(torch.as_tensor(gradient).flatten(1), full_matrices=False)
-                gradient[:] = like(((u * (values + RATE)) @ vh).view(gradient.shape), gradient)
+                gradient[:] = convert_like(((u * (values + RATE)) @ vh).view(gradient.shape), gradient)
 
 
 def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:

@@ -27,7 +27,7 @@ from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.tables import validated
-from learner.reception import Reception
+from learner.join_service import JoinService
 from learner.roster import Roster
 from learner.shared_epochs import SharedEpochs
 
@@ -50,7 +50,7 @@ class Service:
         )
         head, at = free_endpoint(), free_endpoint()
         learner = stack.enter_context(Node(open_session((head,)), run, "learner", new_incarnation()))
-        Reception(
+        JoinService(
             learner, config, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster(), event=print
         )
         flags = ("--run", run, "--connect", head, "--listen", at, "--run-dir", str(folder))

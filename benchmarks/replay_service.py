@@ -33,7 +33,7 @@ from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.tables import validated
-from learner.reception import Reception
+from learner.join_service import JoinService
 from learner.roster import Roster
 from learner.shared_epochs import SharedEpochs
 
@@ -168,7 +168,9 @@ class Bench:
         incarnation = new_incarnation()
         session = open_session((head,), (bare,), shared_memory=shared_memory)
         node = stack.enter_context(Node(session, RUN, "learner", incarnation))
-        Reception(node, CONFIG, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster(), event=print)
+        JoinService(
+            node, CONFIG, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster(), event=print
+        )
         flags = ["--run", RUN, "--connect", head, "--listen", replay, "--run-dir", str(folder)]
         service = ChildProcess(
             "replay", command("coop-replay", *flags, *["--shared-memory"] * shared_memory), folder / "log"

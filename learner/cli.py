@@ -20,7 +20,7 @@ from common.settings.options import RunOptions, beginning, parse_run
 from common.types import EnvSpec
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
-from learner.reception import Reception
+from learner.join_service import JoinService
 from learner.records.epochs import go_back, whole_epochs
 from learner.records.run_directory import RunDirectory, settle
 from learner.roster import Roster
@@ -78,7 +78,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         run_id = settle(path, config)
         roster = Roster(path, time.monotonic())
         layout = agent.networks[0].layout_digest()
-        reception = Reception(node, config, spec, layout, run_id, epochs, roster, console.event)
+        join_service = JoinService(node, config, spec, layout, run_id, epochs, roster, console.event)
         console.event(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}")
         if held:
             console.event("waiting for the replay service to tell which epochs it holds")
@@ -98,7 +98,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         )
         checkpoints = Checkpoints(node, path, samples, epochs, console.event)
         with RunDirectory(path, config, None if state is None else state["sizes"]) as directory:
-            summary = LearnerService(node, stop, trainer, directory, samples, checkpoints, reception, console).run()
+            summary = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console).run()
     print(summary, flush=True)
     if trainer.diverged:
         raise RunError(trainer.diverged)

@@ -18,7 +18,7 @@ from common.process.console import Console, progress_line
 from common.process.lifecycle import Stop
 from learner.broadcast import Broadcaster
 from learner.checkpoints import Checkpoints
-from learner.reception import Reception
+from learner.join_service import JoinService
 from learner.records.curve import draw_learning_curve
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
@@ -44,7 +44,7 @@ class LearnerService:
         directory: RunDirectory,
         samples: SampleClient,
         checkpoints: Checkpoints,
-        reception: Reception,
+        join_service: JoinService,
         console: Console,
     ) -> None:
         self._node = node
@@ -57,7 +57,7 @@ class LearnerService:
         self._broadcaster = Broadcaster(node, trainer.agent)
         self._status_due = 0.0
         self._status: dict[str, Any] = {}
-        self._reception = reception
+        self._join_service = join_service
         self._console = console
         self._speed = (time.monotonic(), trainer.agent.updates, 0.0)
         node.presence.on_change(self._look_round)
@@ -96,7 +96,7 @@ class LearnerService:
                 trainer.epoch_begun()
         elif trainer.trained_out() and (stats := self._replay_stats()) is not None:
             self._carry_out(trainer.note(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
-        if got is None and self._reception.departure.is_due:
+        if got is None and self._join_service.departure.is_due:
             self._save_for_departure()
         if time.monotonic() >= self._status_due:
             self._tell()
@@ -138,13 +138,13 @@ class LearnerService:
     def _members(self) -> dict[str, Any]:
         return {
             "connected": self._node.presence.counts(),
-            "missing": self._reception.attendance.missing(time.monotonic()),
+            "missing": self._join_service.members.missing(time.monotonic()),
             "events": self._console.recent(),
         }
 
     def _look_round(self, incarnation: int, there: bool) -> None:
         """Report at once that a member has come or gone: the loop may be waiting for it."""
-        self._reception.attendance.token(incarnation, there, time.monotonic())
+        self._join_service.members.token(incarnation, there, time.monotonic())
         if self._status:
             self._node.publish_status({**self._status, **self._members()})
 
@@ -156,7 +156,7 @@ class LearnerService:
         except RunError as error:
             self._console.event(f"{error}; the run goes on without it")
         finally:
-            self._reception.departure.grant()
+            self._join_service.departure.grant()
 
     def _save(self) -> None:
         """Save the closing epoch, unless there was no update, the agent diverged or the replay service is gone."""
@@ -171,7 +171,7 @@ class LearnerService:
 
     def _finish(self, outcome: str) -> Summary:
         """Collect the final counters, write the summary, and stop the other roles."""
-        self._reception.departure.end()
+        self._join_service.departure.end()
         try:
             stats = self._replay_stats()
             steps, lost, duplicates = (

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join
 from common.process.console import STANDSTILL, Console, Sight, Standstill, counted, progress_line
-from learner.attendance import FORGOTTEN, Attendance
+from learner.members import FORGOTTEN, MemberTracker
 
 STATUS = {
     "env_steps": 9964,
@@ -58,40 +58,40 @@ def test_numbers_with_nouns() -> None:
 
 def test_members_come_and_go() -> None:
     events: list[str] = []
-    attendance = Attendance(events.append)
+    members = MemberTracker(events.append)
 
     def told() -> list[str]:
         new = list(events)
         events.clear()
         return new
 
-    attendance.token(1, True, 0.0)
+    members.token(1, True, 0.0)
     service = Join("replay", 1, ["tcp/rep:1"], origin=Origin("rep", 7))
     actor = Join("actor", 2, [], origin=Origin("act", 8))
-    attendance.joined(service, "replay service")
-    attendance.joined(replace(service, index=0), "replay service")  # asks each moment
-    attendance.joined(actor, "actor 0")
+    members.joined(service, "replay service")
+    members.joined(replace(service, index=0), "replay service")  # asks each moment
+    members.joined(actor, "actor 0")
     assert told() == ["replay service on rep (pid 7) joined; it listens on tcp/rep:1", "actor 0 on act (pid 8) joined"]
-    attendance.token(2, False, 1.0)
-    attendance.token(99, False, 1.0)  # one that never joined
+    members.token(2, False, 1.0)
+    members.token(99, False, 1.0)  # one that never joined
     assert told() == ["actor 0 on act (pid 8) does not answer"]
-    assert attendance.missing(1.0) == ["actor 0 on act (pid 8)"]
-    attendance.token(2, True, 2.0)
+    assert members.missing(1.0) == ["actor 0 on act (pid 8)"]
+    members.token(2, True, 2.0)
     assert told() == ["actor 0 on act (pid 8) is back"]
-    assert attendance.missing(2.0) == []
-    attendance.token(2, False, 3.0)
-    attendance.token(1, False, 3.0)
+    assert members.missing(2.0) == []
+    members.token(2, False, 3.0)
+    members.token(1, False, 3.0)
     told()
-    attendance.joined(replace(actor, incarnation=3, origin=Origin("act", 9)), "actor 1")
-    assert attendance.missing(3.0) == ["replay service on rep (pid 7)"], "another one has taken the actor's place"
-    assert attendance.missing(3.0 + FORGOTTEN) == []
+    members.joined(replace(actor, incarnation=3, origin=Origin("act", 9)), "actor 1")
+    assert members.missing(3.0) == ["replay service on rep (pid 7)"], "another one has taken the actor's place"
+    assert members.missing(3.0 + FORGOTTEN) == []
     told()
-    attendance.token(2, True, 4.0)
+    members.token(2, True, 4.0)
     assert told() == ["actor 0 on act (pid 8) is back"], "although another one had taken its place"
-    attendance.leaving(2)
-    attendance.token(2, False, 4.0)
+    members.leaving(2)
+    members.token(2, False, 4.0)
     assert told() == ["actor 0 on act (pid 8) left"]
-    attendance.joined(replace(actor, index=0), "actor 0")
+    members.joined(replace(actor, index=0), "actor 0")
     assert told() == ["actor 0 on act (pid 8) is back"]
 
 

@@ -22,7 +22,7 @@ from common.process.lifecycle import Stop
 from common.settings.config import RunConfig
 from common.types import EnvSpec
 from deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
-from learner.reception import Reception
+from learner.join_service import JoinService
 from learner.roster import Roster
 from learner.shared_epochs import SharedEpochs
 from replay.core import ReplayCore
@@ -33,7 +33,7 @@ REQUEST = Join("actor", 3, [])
 
 
 def _receive(node: Node, spec: EnvSpec) -> None:
-    Reception(node, RunConfig(run="test"), spec, "layout", 9, SharedEpochs([], "run"), Roster(), print)
+    JoinService(node, RunConfig(run="test"), spec, "layout", 9, SharedEpochs([], "run"), Roster(), print)
 
 
 def test_another_protocol_is_refused_with_both_versions(
@@ -44,7 +44,7 @@ def test_another_protocol_is_refused_with_both_versions(
         patch.setattr(wire, "PROTOCOL", 7)
         payload = REQUEST.encode("test")
         newer = EndOfRun.because("an answer of another protocol").encode("test")
-    # Before the reception, so that who has joined knows of it too.
+    # Before the join service, so that who has joined knows of it too.
     learner.serve(learner.key("newer"), lambda message: newer)
     _receive(learner, spec)
     assert join(actor, Stop(), REQUEST, (), 5) is not None
@@ -106,7 +106,7 @@ def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, m
     monkeypatch.setattr(joining, "OCCUPIED", 0.0)
     learner, actor = nodes
     events: list[str] = []
-    reception = Reception(
+    join_service = JoinService(
         learner, RunConfig(run="test"), spec, "layout", 9, SharedEpochs([], "run"), Roster(), events.append
     )
     service = Join("replay", 5, ["tcp/rep:1"], origin=Origin("rep", 7))
@@ -120,17 +120,17 @@ def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, m
     payload = Leave(5).encode("test")
     with pytest.raises(Refused, match="not an actor's"):
         actor.ask(join_key(actor, "actor"), payload)
-    assert not reception.departure.is_due
+    assert not join_service.departure.is_due
     assert actor.ask(join_key(actor, "replay"), payload).kind == "retry", "an epoch comes first"
-    assert reception.departure.is_due
-    reception.departure.grant()
-    assert not reception.departure.is_due
+    assert join_service.departure.is_due
+    join_service.departure.grant()
+    assert not join_service.departure.is_due
     assert actor.ask(join_key(actor, "replay"), payload).kind == "farewell"
     assert join(actor, Stop(), other, (), 5) is not None
     take_leave(actor, Join("actor", 3, []))
     with pytest.raises(JoinError, match=r"the replay service on rep \(pid 8\) has taken over from this one"):
         join(actor, Stop(), replace(service, index=0), (), 5)
-    reception.departure.end()
+    join_service.departure.end()
     take_leave(actor, other)
     assert events == [
         "replay service on rep (pid 7) joined; it listens on tcp/rep:1",

@@ -25,7 +25,7 @@ from common.process.locks import INHERITED, RunLock
 from common.process.run_ids import RUN_ID, claim, draw_run_id, read_run_id
 from common.settings.options import RunOptions
 from common.types import EnvSpec
-from learner.reception import Reception
+from learner.join_service import JoinService
 from learner.records.epochs import go_back, save_epoch, whole_epochs
 from learner.records.run_directory import RunDirectory
 from learner.roster import Roster
@@ -255,11 +255,11 @@ def serve_replay(endpoint: str, folder: Path, *flags: str) -> subprocess.Complet
 
 @pytest.fixture
 def learner(endpoint: str, spec: EnvSpec) -> Callable[..., SharedEpochs]:
-    """Makes the reception of a learner that holds the given epochs."""
+    """Makes the join service of a learner that holds the given epochs."""
 
     def receive(node: Node, *held: int, restart: bool = False) -> SharedEpochs:
         epochs = SharedEpochs(held, "runs/a", restart=restart)
-        Reception(node, CONFIG, spec, "layout", 5, epochs, Roster(), lambda _: None)
+        JoinService(node, CONFIG, spec, "layout", 5, epochs, Roster(), lambda _: None)
         return epochs
 
     return receive

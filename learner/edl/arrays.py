@@ -19,7 +19,7 @@ def namespace(array: Array) -> Namespace:
     return torch if isinstance(array, torch.Tensor) else np
 
 
-def like(values: Array, array: Array) -> Array:
+def convert_like(values: Array, array: Array) -> Array:
     """Convert `values`, of either library, to the library, dtype and device of `array`, without a needless copy."""
     if isinstance(values, torch.Tensor) and values.dtype == torch.bfloat16:  # numpy lacks bfloat16
         values = values.float()
@@ -28,4 +28,4 @@ def like(values: Array, array: Array) -> Array:
 
 def assign(array: Array, values: Array) -> None:
     """Overwrite `array` with `values`, of either library and any dtype, in one pass."""
-    array[:] = values if namespace(values) is namespace(array) else like(values, array)
+    array[:] = values if namespace(values) is namespace(array) else convert_like(values, array)

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from common.process.memory import keep_freed_memory
-from learner.edl.arrays import Array, like
+from learner.edl.arrays import Array, convert_like
 from learner.edl.backprop import Chain, Tape
 from learner.edl.dense import DenseChain
 from learner.edl.polar import polar, polar_of_product
@@ -87,10 +87,10 @@ class FeedbackRule:
         """Compute sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e and the gradients of every layer."""
         transforms = Transforms(self.chain, tape, self._polar_dtype)
         if self._polar_dtype is None:
-            for index, sigma in transforms.pull(error, s):
+            for index, sigma in transforms.apply_feedback(error, s):
                 self.chain.write(tape, index, sigma, out)
         else:
-            polar_parts = dict(transforms.pull(error, s, polar_only=True))
+            polar_parts = dict(transforms.apply_feedback(error, s, polar_only=True))
             for index, delta in self.chain.walk(tape, error[:, None]):
                 self.chain.write(tape, index, delta[:, 0] + polar_parts[index], out)
 
@@ -104,7 +104,7 @@ class FeedbackRule:
             layer = self.chain.parametrised.index(index)
             generator = torch.Generator().manual_seed(self._seed * 1000 + layer)
             draw = torch.randn(error.shape[1], size, generator=generator, dtype=torch.float64) / math.sqrt(size)
-            self._fixed[index] = like(draw, error)
+            self._fixed[index] = convert_like(draw, error)
         return (error @ self._fixed[index]).reshape(shape)
 
 
@@ -115,7 +115,7 @@ def _polar_of_gradient(gradient: Array, delta: Array, h: Array, rng: np.random.G
         factor = polar_of_product(torch.as_tensor(delta), torch.as_tensor(h), rng)
     else:
         factor = polar(matrix, rng)
-    return like(factor.view(gradient.shape), gradient)
+    return convert_like(factor.view(gradient.shape), gradient)
 
 
 def edl_gradients(

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import Array, like, namespace
+from learner.edl.arrays import Array, convert_like, namespace
 
 _SMALL = 8  # the shorter side up to which an SVD is faster than the algebra with a Gram matrix
 
@@ -43,7 +43,7 @@ def whitened(gram: Array, e: Array) -> tuple[Array, Array | None]:
         white, doubtful = _whitened_pairs(gram, e, limits)
     else:
         wide, unsafe = _whitened_by_eigh(torch.as_tensor(gram).double(), torch.as_tensor(e).double(), limits)
-        white, doubtful = like(wide, gram), None if unsafe is None else namespace(gram).asarray(unsafe)
+        white, doubtful = convert_like(wide, gram), None if unsafe is None else namespace(gram).asarray(unsafe)
     if doubtful is not None:
         white[namespace(gram).broadcast_to(doubtful, white.shape[:-1])] = 0
     return white, doubtful

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from common.networks.network import FlatNetwork
-from learner.edl.arrays import Array, like, namespace
+from learner.edl.arrays import Array, convert_like, namespace
 from learner.edl.backprop import Chain
 from learner.edl.dense import DenseChain
 
@@ -27,4 +27,4 @@ class Trainable:
 
     def cast(self, array: Array) -> Array:
         """Convert an array of either library for this network's passes."""
-        return like(array, self.theta)
+        return convert_like(array, self.theta)

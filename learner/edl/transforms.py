@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import Array, like, namespace
+from learner.edl.arrays import Array, convert_like, namespace
 from learner.edl.backprop import Chain, Tape
 from learner.edl.dense import DenseChain
 from learner.edl.polar import polar_by_svd, whitened
@@ -39,7 +39,7 @@ class Transforms:
             self._layers.append((index, t.shape[2:]))
             self._ts.append(_flat(t) if dtype is None else _flat(t).to(tape.output.dtype))
 
-    def pull(self, error: Array, s: float, polar_only: bool = False) -> Iterator[tuple[int, Array]]:
+    def apply_feedback(self, error: Array, s: float, polar_only: bool = False) -> Iterator[tuple[int, Array]]:
         """Yield (step, B(i)^T e) for each layer, last first: error [batch, A] -> [batch, *shape].
 
         polar_only: compute s (U V^T)^T e instead of (T(i) + s U V^T)^T e.
@@ -61,7 +61,7 @@ class Transforms:
     def matrices(self, s: float) -> list[tuple[int, Array]]:
         """(step, B(i) = T(i) + s U V^T), last first: [batch, A, n_i], images with channels first."""
         found = []
-        units = like(torch.eye(self._actions), self._basis)
+        units = convert_like(torch.eye(self._actions), self._basis)
         if self._linear_end is not None:
             whole = (self._batch, self._actions, self._actions)
             found.append((self._linear_end, namespace(units).broadcast_to(units * (1 + s), whole)))
@@ -87,19 +87,19 @@ class Transforms:
     def _by_svd(self, t: Array, where: Array) -> Array:
         """Polar factors of those samples of T [batch or 1, A, n] for which `where` is true: [k, A, n]."""
         chosen = namespace(t).broadcast_to(t, (self._batch, *t.shape[1:]))[where]
-        return like(polar_by_svd(torch.as_tensor(chosen)), t)
+        return convert_like(polar_by_svd(torch.as_tensor(chosen)), t)
 
 
 def _basis(output_weight: Array | None, output: Array) -> Array:
     """An orthogonal Q [A, A] that makes the rows of Q W nearly orthogonal, for the output weight W [A, n]."""
     actions = output.shape[1]
     if actions == 2:
-        return like(_SUM_AND_DIFFERENCE, output)
+        return convert_like(_SUM_AND_DIFFERENCE, output)
     if output_weight is None:
-        return like(torch.eye(actions), output)
+        return convert_like(torch.eye(actions), output)
     w = torch.as_tensor(output_weight).double()
     vectors: Tensor = torch.linalg.eigh((w @ w.mT).nan_to_num_()).eigenvectors
-    return like(vectors.mT, output)
+    return convert_like(vectors.mT, output)
 
 
 def _flat(t: Array) -> Array:

@@ -16,8 +16,8 @@ from common.process.files import LineFile, cut_back, write_whole
 from common.process.run_ids import draw_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.tables import to_toml
-from learner.records.board import Board
 from learner.records.summary import Summary
+from learner.records.tensorboard import TensorBoardWriter
 from learner.trainer import EpisodeRow
 
 EPISODE_FIELDS = (
@@ -38,7 +38,7 @@ class RunDirectory:
                 cut_back(path / name, size)
             self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
             self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
-            self._board = Board(path / "tb")
+            self._tensorboard = TensorBoardWriter(path / "tb")
         except OSError as error:
             raise RunError(f"run directory {path}: {error.strerror or error}") from error
         self._csv = csv.writer(self._episodes, lineterminator="\n")
@@ -63,14 +63,14 @@ class RunDirectory:
         place = (row.number, record.env_step, row.update, f"{record.actor:x}", record.stream)
         values = (f"{value:.6g}" for value in (end.epsilon, row.s, end.q1_mean, end.q2_mean))
         self._csv.writerow((*place, f"{end.episode_return:g}", end.length, *values, end.param_version))
-        self._board.add("episode/return", end.episode_return, record.env_step)
+        self._tensorboard.add("episode/return", end.episode_return, record.env_step)
 
     def _metrics_row(self, row: dict[str, Any]) -> None:
         """Add a line to metrics.jsonl, and its numbers to TensorBoard."""
         self._metrics.write(json.dumps({"time": time.time(), **row}) + "\n")
         for name, value in row.items():
             if name != "env_step" and isinstance(value, int | float):
-                self._board.add(f"train/{name}", value, row["env_step"])
+                self._tensorboard.add(f"train/{name}", value, row["env_step"])
 
     def summary(self, summary: Summary) -> None:
         """Write summary.json atomically."""
@@ -84,7 +84,7 @@ class RunDirectory:
         """Close all files."""
         self._episodes.close()
         self._metrics.close()
-        self._board.close()
+        self._tensorboard.close()
 
     def _look(self) -> None:
         """Report once that the disk is full, and once that it has space again; no line is lost in between."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from torch.utils.tensorboard import SummaryWriter
 
 
-class Board:
+class TensorBoardWriter:
     """Writes scalars for TensorBoard in a separate thread; a failure ends the file, not the run."""
 
     def __init__(self, path: Path) -> None:

@@ -16,7 +16,7 @@ from common.messaging.transport import Node
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.types import EnvSpec
-from learner.attendance import Attendance
+from learner.members import MemberTracker
 from learner.roster import Occupied, Roster
 from learner.shared_epochs import SharedEpochs
 
@@ -53,7 +53,7 @@ class Departure:
             self._over = True
 
 
-class Reception:
+class JoinService:
     """Answers requests to join or leave, and remembers where the replay service listens.
 
     Args:
@@ -61,7 +61,7 @@ class Reception:
         event: called with a line when a member comes or goes.
 
     Attributes:
-        attendance: the members by name.
+        members: the members by name.
         departure: of the replay service, if it wants to leave.
     """
 
@@ -76,7 +76,7 @@ class Reception:
         roster: Roster,
         event: Callable[[str], None],
     ) -> None:
-        self.attendance = Attendance(event)
+        self.members = MemberTracker(event)
         self.departure = Departure()
         self._node = node
         self._config = config
@@ -107,7 +107,7 @@ class Reception:
             return Retry(str(other)).encode(self._node.run)
         if request.role == "actor" or request.endpoints:
             name = f"actor {index}" if request.role == "actor" else "replay service"
-            self.attendance.joined(request, name)
+            self.members.joined(request, name)
         joined = Joined(
             self._config,
             self._spec,
@@ -135,5 +135,5 @@ class Reception:
             if not self.departure.ask(incarnation):
                 return Retry("an epoch is to be saved first").encode(self._node.run)
             self._roster.dismiss(incarnation)
-        self.attendance.leaving(incarnation)
+        self.members.leaving(incarnation)
         return Farewell().encode(self._node.run)

@@ -10,7 +10,7 @@ from common.messaging.messages.join import Join
 FORGOTTEN = 60.0  # seconds after which a lost member is no longer listed as missing
 
 
-class Attendance:
+class MemberTracker:
     """Names the members of a run and reports their coming and going; thread-safe.
 
     Args:
