@@ -41,7 +41,7 @@ class ActorService:
         settings = config.actor
         self._player = Player(env, policy, partial(schedules.epsilon, settings))
         self._weights = WeightsFollower(node, policy)
-        self._inserts = InsertClient(route, stop, settings.window * env.num_envs, self._tell)
+        self._inserts = InsertClient(route, stop, settings.window * env.num_envs, self._publish_status)
         self._segments = SegmentAssembler(
             env.spec,
             env.num_envs,
@@ -57,13 +57,13 @@ class ActorService:
         """Play until the stop; steps that have not filled a segment by then are dropped."""
         while not self._weights.ready:
             self._weights.refresh()
-            self._tell()
+            self._publish_status()
             if self._stop.wait(0.05):
                 return
         self._segments.begin(self._player.begin())
         while not self._stop.is_set():
             self._play()
-            self._tell()
+            self._publish_status()
 
     def _play(self) -> None:
         """Play one step of all emulators; they work while the previous step is sent."""
@@ -79,7 +79,7 @@ class ActorService:
             if not self._inserts.submit(segment):
                 break
 
-    def _tell(self) -> None:
+    def _publish_status(self) -> None:
         """Publish the status if it is due; also called while an insert waits."""
         now = time.monotonic()
         if now < self._status_due:

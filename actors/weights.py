@@ -44,9 +44,9 @@ class WeightsFollower:
     def refresh(self) -> None:
         """Load new broadcasts; ask the learner for weights whose broadcast did not arrive."""
         for follower in self._weights:
-            if (message := follower.take()) is not None:
+            if (message := follower.poll()) is not None:
                 self._load(message)
-        if (message := self._role.take()) is not None:
+        if (message := self._role.poll()) is not None:
             self._follow(message)
         if not self.ready:
             self.fetch()

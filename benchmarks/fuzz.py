@@ -141,7 +141,7 @@ class Watch:
 
     def learner(self, field: str) -> int:
         """A field of the learner's status."""
-        message = self._status.take()
+        message = self._status.poll()
         if message is not None:
             self._told = dict(message.fields)
         return int(self._told.get(field, 0))

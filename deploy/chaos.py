@@ -45,7 +45,7 @@ class ChaosOptions:
     """Seconds after which the run counts as hanging."""
 
 
-class Gunner:
+class ChaosMonkey:
     """Kills one role after another, each kind equally often, once the run works again.
 
     kills: number of kills by command. longest_stall: longest time without a step or an update, in seconds.
@@ -69,8 +69,8 @@ class Gunner:
         """Check the run's progress, and kill a role if it is time."""
         now = time.monotonic()
         self._status.refresh()
-        told = self._status.learner
-        progress = (told.get("env_steps", 0), told.get("updates", 0))
+        learner = self._status.learner
+        progress = (learner.get("env_steps", 0), learner.get("updates", 0))
         if progress != self._progress:
             if self._progress[1]:
                 self.longest_stall = max(self.longest_stall, now - self._moved)
@@ -81,11 +81,11 @@ class Gunner:
         self._at_work_since = min(self._at_work_since, updates)  # the learner may have returned to an epoch
         if self._next == float("inf") and updates >= self._at_work_since + SETTLED:
             self._next = now + self._chance.uniform(0, self._options.longest_pause)
-        if now >= self._next and self._shoot(self._left[-1]):
+        if now >= self._next and self._kill(self._left[-1]):
             self._left.pop()
             self._next, self._at_work_since = float("inf"), updates
 
-    def _shoot(self, name: str) -> bool:
+    def _kill(self, name: str) -> bool:
         alive = [pid for pid, found in _children(self._supervisor) if found == name]
         if not alive:
             return False
@@ -137,9 +137,9 @@ def _run() -> None:
     started = time.monotonic()
     status = RunStatus("chaos", endpoint, new_incarnation())
     try:
-        gunner = Gunner(options, process.pid, status)
+        monkey = ChaosMonkey(options, process.pid, status)
         while process.exit_status() is None:
-            gunner.turn()
+            monkey.turn()
             time.sleep(TICK)
             if time.monotonic() > started + options.give_up:
                 raise RunError(f"the run still goes on after {options.give_up:g} s: {status.line()}")
@@ -154,15 +154,15 @@ def _run() -> None:
     if proof.returncode:
         raise RunError(proof.stderr.strip())
     summary = json.loads((options.run_dir / "summary.json").read_text(encoding="utf-8"))
-    killed = ", ".join(f"{count} {name.removeprefix('coop-')}" for name, count in gunner.kills.items())
+    killed = ", ".join(f"{count} {name.removeprefix('coop-')}" for name, count in monkey.kills.items())
     restarts = log.read_text(encoding="utf-8").count("starting it again")
     for name, value in {
-        "kills": f"{sum(gunner.kills.values())} ({killed})",
+        "kills": f"{sum(monkey.kills.values())} ({killed})",
         "transitions accepted": f"{summary['transitions_accepted']:,}",
         "lost": summary["transitions_lost"],
         "duplicated": 0,  # otherwise coop-reexecute would have failed
         "restarts": restarts,
-        "longest stall": f"{gunner.longest_stall:.1f} s",
+        "longest stall": f"{monkey.longest_stall:.1f} s",
         "wall time": f"{ended - started:.0f} s",
         "re-executed": proof.stdout.strip(),
     }.items():

@@ -10,7 +10,7 @@ from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
 from common.process.console import stamped
-from common.process.files import write_whole
+from common.process.files import write_atomic
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
 from common.process.processes import ChildProcess, command, free_endpoint
@@ -51,7 +51,7 @@ class Topology:
         try:
             logs.mkdir(parents=True, exist_ok=True)
             resolved = directory / "config.toml"
-            write_whole(resolved, to_toml(config).encode())
+            write_atomic(resolved, to_toml(config).encode())
         except OSError as error:
             raise RunError(f"run directory {directory}: {error.strerror or error}") from error
         self.endpoint = options.listen or free_endpoint()
@@ -88,7 +88,7 @@ class Topology:
             return True
         for process in self._all():
             if process.exit_status() is not None and not self._interrupted:
-                self._revive(process, display)
+                self._restart(process, display)
         if self._interrupted and self.learner.exit_status() is not None:
             raise RunError(f"{self.learner.why()}; interrupted before it was back, --resume goes on")
         return False
@@ -98,7 +98,7 @@ class Topology:
         self._interrupted = True
         self.learner.interrupt()
 
-    def _revive(self, process: ChildProcess, display: Display) -> None:
+    def _restart(self, process: ChildProcess, display: Display) -> None:
         policy, now = self._policies[process.name], time.monotonic()
         if policy.at is None:
             status = process.exit_status() or 0

@@ -15,7 +15,7 @@ from common.errors import BadMessage
 from common.messaging.keys import status_key
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.transport import Node, open_session
-from common.process.console import Sight, connected, progress_line, returns, stamped
+from common.process.console import PeerMonitor, connected, progress_line, returns, stamped
 from common.process.display import LiveDisplay
 from common.process.lifecycle import Stop
 
@@ -33,23 +33,23 @@ class RunStatus:
     def __init__(self, run: str, endpoint: str, incarnation: int, zenoh_config: Path | None = None) -> None:
         self._node = Node(open_session((), (endpoint,), zenoh_config), run, "watch", incarnation)
         self._learner = self._node.latest(status_key(self._node, "learner"))
-        self._told_at = time.monotonic()
+        self._updated_at = time.monotonic()
         self.learner: dict[str, Any] = {}
 
     def refresh(self) -> None:
         """Read the statuses published since the last call."""
-        message = self._learner.take()
+        message = self._learner.poll()
         if message is None:
             return
         try:
             self.learner = msgspec.structs.asdict(LearnerStatus.decode(message))
         except BadMessage:
             return  # an invalid status; the next one may be valid
-        self._told_at = time.monotonic()
+        self._updated_at = time.monotonic()
 
     def silent_for(self) -> float:
         """Seconds since the learner's last status, or since the start if there was none."""
-        return time.monotonic() - self._told_at
+        return time.monotonic() - self._updated_at
 
     def follow_stop(self, stop: Stop) -> None:
         """Set `stop` when the learner ends the run."""
@@ -79,7 +79,7 @@ class Display(LiveDisplay):
         super().__init__(PLAIN_EVERY, refreshes=4)
         self._status = status
         self._shown = 0
-        self._learner = Sight("the learner")
+        self._learner = PeerMonitor("the learner")
         self._over = Stop()  # set at the end of the run
         status.follow_stop(self._over)
 
@@ -90,9 +90,9 @@ class Display(LiveDisplay):
             if number > self._shown:
                 self._shown = number
                 self.say(line)
-        told = self._status.learner
-        if told and not self._over.is_set():
-            text = self._learner.look(self._status.learner_is_there(), told["origin"])
+        learner = self._status.learner
+        if learner and not self._over.is_set():
+            text = self._learner.check(self._status.learner_is_there(), learner["origin"])
             if text:
                 self.say(stamped(text))
         super().update()
@@ -103,26 +103,26 @@ class Display(LiveDisplay):
 
     def picture(self) -> RenderableType:
         """The status as a panel."""
-        told = self._status.learner
+        learner = self._status.learner
         table = Table(show_header=False, box=None)
         table.add_column(style="dim")
         table.add_column()
-        if not told:
+        if not learner:
             table.add_row("status", "waiting for the learner")
             return table
         rows = {
-            "step": f"{told['env_steps']:,} of {told['total_steps']:,}",
-            "episodes": returns(told["return_mean_100"], told["episodes"]),
-            "updates": f"{told['updates']:,}, {told['updates_per_s']:.0f}/s",
-            "acting": f"network {told['acting']}, epsilon {told['epsilon']:.3f}, s {told['s']:.3f}",
-            "connected": connected(told["connected"]),
+            "step": f"{learner['env_steps']:,} of {learner['total_steps']:,}",
+            "episodes": returns(learner["return_mean_100"], learner["episodes"]),
+            "updates": f"{learner['updates']:,}, {learner['updates_per_s']:.0f}/s",
+            "acting": f"network {learner['acting']}, epsilon {learner['epsilon']:.3f}, s {learner['s']:.3f}",
+            "connected": connected(learner["connected"]),
         }
-        if told["warning"]:
-            rows["warning"] = str(told["warning"])
-        if told["missing"]:
-            rows["lost"] = ", ".join(told["missing"])
-        if told["waiting"]:
-            rows["waiting"] = str(told["waiting"])
+        if learner["warning"]:
+            rows["warning"] = str(learner["warning"])
+        if learner["missing"]:
+            rows["lost"] = ", ".join(learner["missing"])
+        if learner["waiting"]:
+            rows["waiting"] = str(learner["waiting"])
         for name, value in rows.items():
             table.add_row(name, value)
-        return Group(table, ProgressBar(total=told["total_steps"], completed=told["env_steps"], width=60))
+        return Group(table, ProgressBar(total=learner["total_steps"], completed=learner["env_steps"], width=60))

@@ -69,7 +69,7 @@ class Lockstep:
         self._store(turn)
         self.step += 1
         table = self._table
-        told = msgspec.structs.replace(
+        drawn = msgspec.structs.replace(
             self.trainer.drawn,
             inserted=self.step,
             size=len(table),
@@ -78,12 +78,12 @@ class Lockstep:
         )
         for _ in range(self._updates_due()):
             batch = table.sample(learner.batch_size)
-            effects = self.trainer.train(batch, told, time.monotonic())
+            effects = self.trainer.train(batch, drawn, time.monotonic())
             if effects.priorities is not None:
                 table.update_priorities(batch.ids, effects.priorities)
             yield effects
         ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in turn.ended.items())
-        yield self.trainer.note(msgspec.structs.replace(told, episodes=ended))
+        yield self.trainer.note(msgspec.structs.replace(drawn, episodes=ended))
         if learner.swap_unit == "steps" and self.step % self.config.swap_period == 0:
             self.agent.swap()
         if learner.reset_role_at_episode and turn.ended and self.agent.acting:

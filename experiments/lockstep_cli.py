@@ -60,7 +60,7 @@ def run_lockstep(run: Lockstep, directory: RunDirectory, stop: Stop) -> Summary:
         if time.monotonic() >= due:
             due = time.monotonic() + PROGRESS_EVERY
             print(_progress(run), end="\r" if sys.stdout.isatty() else "\n", flush=True)
-    if trainer.sound():
+    if trainer.saveable():
         run.save(directory)
     summary = summarise(trainer, trainer.diverged or outcome, time.monotonic(), run.step)
     directory.summary(summary)

@@ -21,8 +21,8 @@ from common.types import EnvSpec
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
 from learner.join_service import JoinService
-from learner.records.epochs import go_back, whole_epochs
-from learner.records.run_directory import RunDirectory, settle
+from learner.records.epochs import intact_epochs, rewind
+from learner.records.run_directory import RunDirectory, claim_run_directory
 from learner.roster import Roster
 from learner.service import LearnerService
 from learner.shared_epochs import SharedEpochs
@@ -66,7 +66,7 @@ def _run() -> None:
 def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path, stop: Stop) -> None:
     """Train a run from its beginning, or from an epoch, to its end."""
     console = Console()
-    held = whole_epochs(path) if options.resume else []
+    held = intact_epochs(path) if options.resume else []
     if options.resume and not held:
         console.event(beginning(path))
     trainer = Trainer(Agent(config, spec), time.monotonic())
@@ -75,7 +75,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory)
     with Node(session, config.run, "learner", incarnation) as node:
-        run_id = settle(path, config)
+        run_id = claim_run_directory(path, config)
         roster = Roster(path, time.monotonic())
         layout = agent.networks[0].layout_digest()
         join_service = JoinService(node, config, spec, layout, run_id, epochs, roster, console.event)
@@ -86,15 +86,15 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         if number is None:
             stop.leave()
             return
-        state = go_back(path, number)
+        state = rewind(path, number)
         if state is not None:
             trainer.load_state(state, time.monotonic())
             console.event(f"goes on from epoch {number}")
         elif held:
             console.event("begins anew: no epoch is held by both")
-        settings, told = config.learner, 0 if state is None else state["told"]
+        settings, episodes_received = config.learner, 0 if state is None else state["told"]
         samples = SampleClient(
-            node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, told
+            node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, episodes_received
         )
         checkpoints = Checkpoints(node, path, samples, epochs, console.event)
         with RunDirectory(path, config, None if state is None else state["sizes"]) as directory:

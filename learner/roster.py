@@ -16,7 +16,7 @@ from common.errors import BadMessage, RunError
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join
 from common.messaging.presence import LEASE
-from common.process.files import write_whole
+from common.process.files import write_atomic
 
 ROSTER = "roster.json"
 
@@ -120,7 +120,7 @@ class Roster:
         """Save the entries and then use them; raises RunError."""
         if self._path is not None:
             try:
-                write_whole(self._path, json.dumps(asdict(entries)).encode())
+                write_atomic(self._path, json.dumps(asdict(entries)).encode())
             except OSError as error:
                 raise RunError(f"{self._path}: {error.strerror or error}") from error
         self._entries = entries

@@ -60,7 +60,7 @@ class LearnerService:
         self._join_service = join_service
         self._console = console
         self._speed = (time.monotonic(), trainer.agent.updates, 0.0)
-        node.presence.on_change(self._look_round)
+        node.presence.on_change(self._on_presence_change)
 
     def run(self) -> Summary:
         """Train to the end; return the summary that was saved.
@@ -91,22 +91,22 @@ class LearnerService:
             effects = trainer.train(batch, drawn, time.monotonic())
             if effects.priorities is not None:
                 self._samples.prioritise(batch, effects.priorities)
-            self._carry_out(effects)
+            self._apply(effects)
             if trainer.epoch_due() and self._checkpoints.begin(self._state):
                 trainer.epoch_begun()
-        elif trainer.trained_out() and (stats := self._replay_stats()) is not None:
-            self._carry_out(trainer.note(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
+        elif trainer.all_updates_done() and (stats := self._replay_stats()) is not None:
+            self._apply(trainer.note(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
         if got is None and self._join_service.departure.is_due:
             self._save_for_departure()
         if time.monotonic() >= self._status_due:
-            self._tell()
+            self._publish_status()
 
-    def _carry_out(self, effects: Effects) -> None:
+    def _apply(self, effects: Effects) -> None:
         if effects.broadcast:
             self._broadcaster.publish()
         self._directory.record(effects.episodes, effects.metrics)
 
-    def _tell(self) -> None:
+    def _publish_status(self) -> None:
         """Publish the status for displays, and repeat the role for actors that missed it."""
         now, telemetry = time.monotonic(), self._trainer.telemetry
         then, updates, speed = self._speed
@@ -142,7 +142,7 @@ class LearnerService:
             "events": self._console.recent(),
         }
 
-    def _look_round(self, incarnation: int, there: bool) -> None:
+    def _on_presence_change(self, incarnation: int, there: bool) -> None:
         """Report at once that a member has come or gone: the loop may be waiting for it."""
         self._join_service.members.token(incarnation, there, time.monotonic())
         if self._status:
@@ -151,7 +151,7 @@ class LearnerService:
     def _save_for_departure(self) -> None:
         """Save an epoch for a replay service that waits for it before leaving."""
         try:
-            if self._agent.updates and self._trainer.sound():
+            if self._agent.updates and self._trainer.saveable():
                 self._checkpoints.save(self._state())
         except RunError as error:
             self._console.event(f"{error}; the run goes on without it")
@@ -160,7 +160,7 @@ class LearnerService:
 
     def _save(self) -> None:
         """Save the closing epoch, unless there was no update, the agent diverged or the replay service is gone."""
-        if not self._agent.updates or not self._trainer.sound():
+        if not self._agent.updates or not self._trainer.saveable():
             return
         deadline = time.monotonic() + (0 if self._stop.is_set() else REPLAY_BACK)
         while self._replay_stats() is None:
@@ -196,7 +196,7 @@ class LearnerService:
     def _state(self) -> dict[str, Any]:
         return {
             **self._trainer.state(time.monotonic()),
-            "told": self._samples.episodes,
+            "told": self._samples.episodes,  # a name of the file format
             "sizes": self._directory.sizes(),
         }
 

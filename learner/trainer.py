@@ -82,13 +82,13 @@ class Trainer:
         return Effects(
             broadcast=broadcast and not self.diverged,
             priorities=np.abs(update.td_errors) if self.config.replay.prioritized and not self.diverged else None,
-            episodes=self._book(drawn),
+            episodes=self._number_episodes(drawn),
             metrics=self._metrics(now) if agent.updates % METRICS_EVERY == 0 else None,
         )
 
     def note(self, drawn: Drawn) -> Effects:
         """Process counters and episodes that arrived without a batch."""
-        return Effects(episodes=self._book(drawn))
+        return Effects(episodes=self._number_episodes(drawn))
 
     def outcome(self) -> str:
         """Why the run is over; empty while it continues."""
@@ -106,19 +106,19 @@ class Trainer:
             return "complete: target_return reached"
         return ""
 
-    def trained_out(self) -> bool:
+    def all_updates_done(self) -> bool:
         """True once every planned update is done, so that no further batch brings the counters of the last steps."""
         return 0 < self.drawn.planned <= self.agent.updates
 
     def epoch_due(self) -> bool:
         """True if an epoch should begin now; it stays due until `epoch_begun`."""
-        return self.agent.updates >= self._next_epoch and self.sound()
+        return self.agent.updates >= self._next_epoch and self.saveable()
 
     def epoch_begun(self) -> None:
         """Count updates to the next epoch from here."""
         self._next_epoch = self.agent.updates + self._epoch_every
 
-    def sound(self) -> bool:
+    def saveable(self) -> bool:
         """True while the agent may be saved; a diverged state must not be resumed."""
         if not self.diverged and not self.agent.finite():
             self.diverged = f"diverged: parameters are not finite at update {self.agent.updates}"
@@ -153,7 +153,7 @@ class Trainer:
     def _epoch_every(self) -> float:
         return self.config.checkpoint_every or math.inf
 
-    def _book(self, drawn: Drawn) -> list[EpisodeRow]:
+    def _number_episodes(self, drawn: Drawn) -> list[EpisodeRow]:
         """Store the counters, and number the episodes."""
         self.drawn = msgspec.structs.replace(drawn, episodes=()) if drawn.episodes else drawn
         number, updates, s = self.telemetry.episode, self.agent.updates, self.agent.exploration_rate()

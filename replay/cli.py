@@ -63,7 +63,7 @@ def _run() -> None:
             folder = ReplayFolder(options.run_dir or _named(options.run, known.run_id), known.run_id)
             console.event(folder.check(resume=options.resume))
             with folder.lock():
-                held = ReplayEpochs(folder.path, known.run_id).whole()
+                held = ReplayEpochs(folder.path, known.run_id).intact()
                 request = Join("replay", incarnation, locators(session), epochs=held[-MOST_EPOCHS:])
                 joined = joining(request)
                 if joined is not None:

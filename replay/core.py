@@ -276,7 +276,7 @@ class ReplayCore:
             self._forget(list(self._replies))
         if not known or request.base > self.drawn:
             self.drawn = request.base
-            self._episodes.known_to_end_at(request.episodes_from)
+            self._episodes.extend_to(request.episodes_from)
         # Older replies cannot be asked for again; they would only occupy memory and the processor's caches.
         self._forget([sequence for sequence in self._replies if sequence < request.base])
 

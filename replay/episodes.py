@@ -38,7 +38,7 @@ class EpisodeLog:
         start = first - self.first
         return first, tuple(self._records[start : start + most])
 
-    def known_to_end_at(self, total: int) -> None:
+    def extend_to(self, total: int) -> None:
         """Make the log end at `total` at least: a learner has received that many, and their numbers must not change."""
         self.first = max(self.first, total - len(self._records))
 

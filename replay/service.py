@@ -169,7 +169,7 @@ class ReplayService:
             if self._broken:  # senders repeat their requests to the next replay service
                 return Wait(self._broken)
         with self._changing():
-            while isinstance(outcome := self._why_not() or attempt(), Wait):
+            while isinstance(outcome := self._not_serving() or attempt(), Wait):
                 now = time.monotonic()
                 gate.closed_at = gate.closed_at or now
                 left = gate.closed_at + HOLD - now
@@ -198,7 +198,7 @@ class ReplayService:
                 self._broken = f"an error of this program may have left the table half changed: {error!r}"
                 raise
 
-    def _why_not(self) -> Wait | None:
+    def _not_serving(self) -> Wait | None:
         """Why this service must neither acknowledge nor draw now; None if it may."""
         if self._leaving:
             return Wait(LEAVING)

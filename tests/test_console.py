@@ -1,4 +1,4 @@
-"""What consoles and displays say of the members of a run, of its progress and of a standstill."""
+"""What consoles and displays say of the members of a run, of its progress and of a stall."""
 
 import re
 
@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join
-from common.process.console import STANDSTILL, Console, Sight, Standstill, counted, progress_line
+from common.process.console import STALL_AFTER, Console, PeerMonitor, StallDetector, counted, progress_line
 from learner.members import FORGOTTEN, MemberTracker
 
 STATUS = {
@@ -96,19 +96,19 @@ def test_members_come_and_go() -> None:
 
 
 def test_a_standstill_is_told_once() -> None:
-    look = Standstill().look
+    look = StallDetector().check
     assert look(0.0, 5, "r") == ""
-    assert look(STANDSTILL - 0.1, 5, "r") == ""
-    assert look(STANDSTILL, 5, "") == "", "nothing is known to be waited for"
-    assert look(STANDSTILL, 5, "because") == "waiting: because"
-    assert look(STANDSTILL + 9, 5, "because of another reason") == ""
-    assert look(STANDSTILL + 10, 6, "") == "goes on"
-    assert look(STANDSTILL + 10, 7, "") == ""
-    assert look(2 * STANDSTILL + 10, 7, "again") == "waiting: again"
+    assert look(STALL_AFTER - 0.1, 5, "r") == ""
+    assert look(STALL_AFTER, 5, "") == "", "nothing is known to be waited for"
+    assert look(STALL_AFTER, 5, "because") == "waiting: because"
+    assert look(STALL_AFTER + 9, 5, "because of another reason") == ""
+    assert look(STALL_AFTER + 10, 6, "") == "goes on"
+    assert look(STALL_AFTER + 10, 7, "") == ""
+    assert look(2 * STALL_AFTER + 10, 7, "again") == "waiting: again"
 
 
 def test_others_go_out_of_sight_and_come_back() -> None:
-    look = Sight("the learner").look
+    look = PeerMonitor("the learner").check
     assert look(False, "") == "", "not there yet"
     assert look(True, "head (pid 1)") == ""
     assert look(True, "head (pid 1)") == ""

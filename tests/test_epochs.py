@@ -14,7 +14,7 @@ from common.errors import RunError
 from common.messaging.messages.sample import DrawRequest, EpisodeRecord
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec
-from learner.records.epochs import complete_epochs, go_back, load_learner, newest_epoch, save_epoch, whole_epochs
+from learner.records.epochs import complete_epochs, intact_epochs, load_learner, newest_epoch, rewind, save_epoch
 from replay.core import ReplayCore, Wait
 from replay.episodes import MOST, EpisodeLog
 from replay.persistence.epochs import ReplayEpochs
@@ -188,7 +188,7 @@ def test_learner_epochs(tmp_path: Path) -> None:
     assert newest is not None
     assert load_learner(newest)["flat"].tolist() == [300.0] * 3
     (newest / "learner.pt").write_bytes((newest / "learner.pt").read_bytes()[:-9])
-    state = go_back(tmp_path, whole_epochs(tmp_path)[-1])
+    state = rewind(tmp_path, intact_epochs(tmp_path)[-1])
     assert state is not None
     assert state["flat"].tolist() == [200.0] * 3
     assert complete_epochs(tmp_path) == [200], "the torn one is gone, and does not count as one of two to keep"

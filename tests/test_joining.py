@@ -103,7 +103,7 @@ def test_presence(nodes: tuple[Node, Node], endpoint: str) -> None:
 
 
 def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joining, "OCCUPIED", 0.0)
+    monkeypatch.setattr(joining, "HANDOVER_TIMEOUT", 0.0)
     learner, actor = nodes
     events: list[str] = []
     join_service = JoinService(

@@ -19,14 +19,14 @@ from common.errors import RunError, UsageError
 from common.messaging.joining import join
 from common.messaging.messages.join import Join
 from common.messaging.transport import Node, new_incarnation, open_session
-from common.process.files import cut_back
+from common.process.files import truncate
 from common.process.lifecycle import Stop
 from common.process.locks import INHERITED, RunLock
 from common.process.run_ids import RUN_ID, claim, draw_run_id, read_run_id
 from common.settings.options import RunOptions
 from common.types import EnvSpec
 from learner.join_service import JoinService
-from learner.records.epochs import go_back, save_epoch, whole_epochs
+from learner.records.epochs import intact_epochs, rewind, save_epoch
 from learner.records.run_directory import RunDirectory
 from learner.roster import Roster
 from learner.shared_epochs import SharedEpochs
@@ -227,10 +227,10 @@ def test_the_learner_goes_back_to_the_epoch_that_is_chosen(tmp_path: Path) -> No
     for number in (500, 1000):
         save_epoch(tmp_path, number, {"updates": number}, lambda _: None)
     (tmp_path / "checkpoints" / "1000" / "learner.pt").write_bytes(b"torn")
-    assert whole_epochs(tmp_path) == [500]
-    assert go_back(tmp_path, 500) == {"updates": 500}
+    assert intact_epochs(tmp_path) == [500]
+    assert rewind(tmp_path, 500) == {"updates": 500}
     assert not (tmp_path / "checkpoints" / "1000").exists()
-    assert go_back(tmp_path, 0) is None
+    assert rewind(tmp_path, 0) is None
     assert not list((tmp_path / "checkpoints").iterdir())
 
 
@@ -316,9 +316,9 @@ def test_a_file_is_never_lengthened(tmp_path: Path) -> None:
     path = tmp_path / "episodes.csv"
     path.write_bytes(b"twelve bytes")
     with pytest.raises(RunError, match="has 12 bytes, and should have at least 13"):
-        cut_back(path, 13)
+        truncate(path, 13)
     assert path.read_bytes() == b"twelve bytes"
-    cut_back(path, 6)
+    truncate(path, 6)
     assert path.read_bytes() == b"twelve"
     config = RunOptions().run_config()
     with pytest.raises(RunError, match="has 6 bytes, and should have at least 99"):

@@ -131,7 +131,7 @@ def test_when_a_run_is_over(config: dict[str, float], told: Drawn, updates: int,
     assert trainer.outcome() == ""
     trainer.train(next(source), told, 0.0)
     assert trainer.outcome() == outcome
-    assert trainer.trained_out() == (updates == told.planned)
+    assert trainer.all_updates_done() == (updates == told.planned)
 
 
 def test_an_epoch_is_due_until_it_is_begun() -> None:
@@ -159,14 +159,14 @@ def test_a_run_whose_values_are_no_longer_finite_has_diverged(method: str) -> No
     assert not effects.broadcast
     assert effects.priorities is None
     assert not trainer.epoch_due()
-    assert not trainer.sound()
+    assert not trainer.saveable()
 
 
 def test_parameters_that_are_not_finite_are_neither_broadcast_nor_saved() -> None:
     trainer, source = Trainer(Agent(replace(CONFIG, checkpoint_every=6), SPEC), 0.0), batches()
     for _ in range(6):
         trainer.train(next(source), drawn(), 0.0)
-    assert trainer.sound()
+    assert trainer.saveable()
     trainer.agent.networks[1].flat[3] = np.inf  # of which the TD errors of this batch know nothing
     assert not trainer.epoch_due()
     assert trainer.outcome() == "diverged: parameters are not finite at update 6"

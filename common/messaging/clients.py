@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from common.bounds import MAX_AHEAD
 from common.errors import BadMessage
-from common.messaging.keys import Place, replay_key
+from common.messaging.keys import KeySpace, replay_key
 from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import BatchReader, Drawn, DrawRequest
@@ -32,7 +32,7 @@ NO_ANSWER = "the replay service does not answer"
 BAD_ANSWER = "the replay service's answer is bad"
 
 
-class Line(Place, Protocol):
+class QuerySender(KeySpace, Protocol):
     """The connection that carries queries to the replay service: a `Node`, or an actor's `ReplayRoute`."""
 
     run: str
@@ -77,7 +77,7 @@ class InsertClient:
         waiting: why inserts wait, in words; empty while they do not.
     """
 
-    def __init__(self, node: Line, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, node: QuerySender, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
         self.acked = 0
         self.inserted = 0
         self.waiting = ""
@@ -95,9 +95,9 @@ class InsertClient:
         Raises:
             Refused: the replay service rejected a segment as invalid.
         """
-        self._settle_ready()
+        self._collect_acks()
         while len(self._outstanding) >= self._window:
-            if not self._settle(self._outstanding[0]):
+            if not self._await_ack(self._outstanding[0]):
                 return False
             self._outstanding.popleft()
         payload = encode_segment(self._node.run, msgspec.structs.replace(segment, acked=self.acked))
@@ -107,12 +107,12 @@ class InsertClient:
     def drain(self) -> bool:
         """Wait until all segments are acknowledged; return False if a stop was requested first."""
         while self._outstanding:
-            if not self._settle(self._outstanding[0]):
+            if not self._await_ack(self._outstanding[0]):
                 return False
             self._outstanding.popleft()
         return True
 
-    def _settle_ready(self) -> None:
+    def _collect_acks(self) -> None:
         """Process the acknowledgements that have arrived, without waiting."""
         while self._outstanding:
             sent = self._outstanding[0]
@@ -128,7 +128,7 @@ class InsertClient:
                 return
             self._outstanding.popleft()
 
-    def _settle(self, sent: _Sent) -> bool:
+    def _await_ack(self, sent: _Sent) -> bool:
         """Wait for one acknowledgement, sending again as often as necessary; return False if a stop was requested."""
         while True:
             try:

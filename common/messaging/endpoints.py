@@ -51,7 +51,7 @@ def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
     return unknown
 
 
-def why_not(listen: Sequence[str], error: Exception) -> str:
+def explain_listen_error(listen: Sequence[str], error: Exception) -> str:
     """Explain why Zenoh, which raised `error`, cannot listen."""
     if hosts := unknown_hosts(listen):
         return f"the host {hosts[0]!r} is not known"

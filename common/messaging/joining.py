@@ -15,15 +15,15 @@ from common.messaging.keys import join_key
 from common.messaging.messages.answers import Retry
 from common.messaging.messages.join import Join, Joined, Leave
 from common.messaging.transport import NoAnswer, Node, Refused
-from common.process.console import Sight, Standstill
+from common.process.console import PeerMonitor, StallDetector
 from common.process.lifecycle import Stop
 from common.settings.tables import first_difference, identity
 
 RETRY_PAUSE = 0.1  # seconds
-OCCUPIED = 5.0  # seconds that a replay service waits for another one to end; the learner gives up a dead one sooner
+HANDOVER_TIMEOUT = 5.0  # seconds that a replay service waits for another one to end; a dead one is given up sooner
 ASK_EVERY = 0.4  # seconds between a member's requests while its work depends on the answer
 LEAVE_WITHIN = 25.0  # seconds that a stopping process stays because the learner still needs it
-SELDOM = 5.0  # seconds between requests otherwise
+IDLE_ASK_EVERY = 5.0  # seconds between requests otherwise
 
 
 def join(
@@ -47,7 +47,7 @@ def join(
     """
     where = ", ".join(connect) or "no endpoint (give --connect)"
     deadline = time.monotonic() + timeout
-    standstill = Standstill()
+    stall = StallDetector()
     vacant_by: float | None = None
     answered = False
     while not stop.is_set():
@@ -58,7 +58,7 @@ def join(
         else:
             answered = True
             if isinstance(answer, str):
-                vacant_by = vacant_by or time.monotonic() + OCCUPIED
+                vacant_by = vacant_by or time.monotonic() + HANDOVER_TIMEOUT
                 if time.monotonic() > vacant_by:
                     raise JoinError(f"run {node.run!r}: {answer}")
             elif answer.replay_endpoints or not need_replay:
@@ -71,7 +71,7 @@ def join(
             others = [] if answered else other_runs(node)
             raise JoinError(f"{text}; there is run {', '.join(map(repr, others))}" if others else text)
         awaited = f"a replay service of run {node.run!r}" if answered else f"the learner of run {node.run!r} at {where}"
-        if text := standstill.look(time.monotonic(), 0, f"waiting for {awaited}"):
+        if text := stall.check(time.monotonic(), 0, f"waiting for {awaited}"):
             event(text)
         stop.wait(RETRY_PAUSE)
     return None
@@ -159,7 +159,7 @@ class Membership:
         self._thread.join()
 
     def _run(self) -> None:
-        learner, replay = Sight("the learner"), Sight("the replay service")
+        learner, replay = PeerMonitor("the learner"), PeerMonitor("the replay service")
         known, asked = self._node.presence.members("learner"), time.monotonic()
         while not self._stop.wait(ASK_EVERY):
             if self._node.presence.absence("learner") > self._patience:
@@ -168,13 +168,13 @@ class Membership:
                 return
             there = self._node.presence.members("learner")
             replay_there = self._replay_there is not None and self._replay_there()
-            if there - known or not replay_there or time.monotonic() - asked > SELDOM:
+            if there - known or not replay_there or time.monotonic() - asked > IDLE_ASK_EVERY:
                 asked = time.monotonic()
                 if self._ask(asked):
                     known = there
             for text in (
-                learner.look(bool(there & known), str(self._joined.learner)),
-                replay.look(replay_there, str(self._joined.replay)),
+                learner.check(bool(there & known), str(self._joined.learner)),
+                replay.check(replay_there, str(self._joined.replay)),
             ):
                 if text and not self._stop.is_set():
                     self._event(text)

@@ -7,7 +7,7 @@ from typing import Protocol
 REPLAY_SHARD = "0"
 
 
-class Place(Protocol):
+class KeySpace(Protocol):
     """A process's place in a run, which determines its keys."""
 
     def key(self, *parts: str) -> str:
@@ -19,31 +19,31 @@ def run_key(run: str, *parts: str) -> str:
     return "/".join(("coop", run, *parts))
 
 
-def replay_key(node: Place, what: str) -> str:
+def replay_key(node: KeySpace, what: str) -> str:
     """Key of one of the replay service's queryables; `what`: insert, sample, stats, limits or snapshot."""
     return node.key("replay", REPLAY_SHARD, what)
 
 
-def join_key(node: Place, role: str) -> str:
+def join_key(node: KeySpace, role: str) -> str:
     """Key for joining as a role; the replay service has its own, which access control can reserve for it."""
     return node.key("config", "replay") if role == "replay" else node.key("config")
 
 
-def weights_key(node: Place, network: int) -> str:
+def weights_key(node: KeySpace, network: int) -> str:
     """Key of the parameters of network 1 or 2, both for broadcasts and for queries."""
     return node.key("weights", str(network))
 
 
-def role_key(node: Place) -> str:
+def role_key(node: KeySpace) -> str:
     """Key of the acting role, for broadcasts and queries like the weights' keys."""
     return node.key("role")
 
 
-def stop_key(node: Place) -> str:
+def stop_key(node: KeySpace) -> str:
     """Key at which the learner ends the run."""
     return node.key("stop")
 
 
-def status_key(node: Place, role: str, incarnation: str = "*") -> str:
+def status_key(node: KeySpace, role: str, incarnation: str = "*") -> str:
     """Key of a process's status for displays; of all processes of the role if no incarnation is given."""
     return node.key("metrics", role, incarnation)

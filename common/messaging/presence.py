@@ -34,7 +34,7 @@ class Presence:
         self._began = time.monotonic()
         for role in ROLES:  # one subscriber each: access control may let a process see only some roles
             session.liveliness().declare_subscriber(
-                f"{prefix}/{role}/*", faults.guarded("watching who is there", self._tell), history=True
+                f"{prefix}/{role}/*", faults.guarded("watching who is there", self._on_token), history=True
             )
 
     def on_change(self, call: Callable[[int, bool], None]) -> None:
@@ -58,7 +58,7 @@ class Presence:
                 return 0.0
             return time.monotonic() - self._gone.get(role, self._began)
 
-    def _tell(self, sample: zenoh.Sample) -> None:
+    def _on_token(self, sample: zenoh.Sample) -> None:
         role, incarnation = str(sample.key_expr).split("/")[-2:]
         there = sample.kind == zenoh.SampleKind.PUT
         with self._lock:

@@ -20,7 +20,7 @@ import zenoh
 from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage, CoopError, RunError, UsageError
 from common.messaging import wire
-from common.messaging.endpoints import check_endpoints, first_line, why_not
+from common.messaging.endpoints import check_endpoints, explain_listen_error, first_line
 from common.messaging.faults import Faults
 from common.messaging.keys import run_key, stop_key
 from common.messaging.links import never_linger
@@ -88,7 +88,9 @@ def open_session(
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        raise RunError(f"can't listen on {', '.join(listen) or 'any endpoint'}: {why_not(listen, error)}") from error
+        raise RunError(
+            f"can't listen on {', '.join(listen) or 'any endpoint'}: {explain_listen_error(listen, error)}"
+        ) from error
     never_linger(session)
     return session
 
@@ -269,7 +271,7 @@ class Latest:
         self._node = node
         self._subscriber = subscriber
 
-    def take(self) -> Message | None:
+    def poll(self) -> Message | None:
         """The newest value not yet taken; None if there is none or it is not a valid message."""
         sample = self._subscriber.try_recv()
         if sample is None:

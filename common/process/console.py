@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 PROGRESS_EVERY = 10.0  # seconds
-STANDSTILL = 5.0  # seconds without progress after which a line is printed
+STALL_AFTER = 5.0  # seconds without progress after which a line is printed
 RECENT = 16  # events kept for displays in other processes
 
 
@@ -20,7 +20,7 @@ class Console:
         self._lock = threading.Lock()
         self._recent: deque[tuple[int, str]] = deque(maxlen=RECENT)
         self._progress_due = time.monotonic() + PROGRESS_EVERY
-        self._standstill = Standstill()
+        self._stall = StallDetector()
 
     def event(self, text: str) -> None:
         """Print an event."""
@@ -41,38 +41,38 @@ class Console:
         While it does not grow, no progress line is printed.
         """
         now = time.monotonic()
-        if text := self._standstill.look(now, count, reason):
+        if text := self._stall.check(now, count, reason):
             self.event(text)
         if now >= self._progress_due:
             self._progress_due = now + PROGRESS_EVERY
-            if not self._standstill.told:
+            if not self._stall.reported:
                 print(stamped(line()), flush=True)
 
 
-class Standstill:
-    """Notices that a count has not grown for longer than `STANDSTILL`, and that it grows again; time is an argument.
+class StallDetector:
+    """Notices that a count has not grown for longer than `STALL_AFTER`, and that it grows again; time is an argument.
 
-    told: the count does not grow, and a line has said so.
+    reported: the count does not grow, and a line has said so.
     """
 
     def __init__(self) -> None:
-        self.told = False
+        self.reported = False
         self._count = -1
         self._moved = 0.0
 
-    def look(self, now: float, count: int, reason: str) -> str:
+    def check(self, now: float, count: int, reason: str) -> str:
         """The line to print now, empty if there is none. reason: why the count may be waiting, in words."""
         if count != self._count:
             self._count, self._moved = count, now
-            told, self.told = self.told, False
-            return "goes on" if told else ""
-        if self.told or not reason or now - self._moved < STANDSTILL:
+            reported, self.reported = self.reported, False
+            return "goes on" if reported else ""
+        if self.reported or not reason or now - self._moved < STALL_AFTER:
             return ""
-        self.told = True
+        self.reported = True
         return reason if reason.startswith("waiting") else f"waiting: {reason}"
 
 
-class Sight:
+class PeerMonitor:
     """Notices that another member of the run has disappeared, and that it or its successor is there again.
 
     Args:
@@ -84,11 +84,11 @@ class Sight:
         self._seen = ""
         self._lost = False
 
-    def look(self, there: bool, where: str) -> str:
+    def check(self, there: bool, where: str) -> str:
         """The line to print now, empty if there is none. where: host and process id of the present member."""
         if not there:
-            told, self._lost = self._lost or not self._seen, bool(self._seen)
-            return "" if told else f"{self._role} on {self._seen} does not answer"
+            reported, self._lost = self._lost or not self._seen, bool(self._seen)
+            return "" if reported else f"{self._role} on {self._seen} does not answer"
         first, back = not self._seen, self._lost or where != self._seen
         self._seen, self._lost = where, False
         return f"{self._role} on {where} is back" if back and not first else ""

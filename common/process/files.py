@@ -76,7 +76,7 @@ class LineFile:
         self._file.close()
 
 
-def write_whole(path: Path, data: bytes) -> int:
+def write_atomic(path: Path, data: bytes) -> int:
     """Replace a file atomically; return the new CRC-32. Raises OSError, and then leaves the old file untouched."""
     part = path.with_name(path.name + ".part")
     try:
@@ -90,7 +90,7 @@ def write_whole(path: Path, data: bytes) -> int:
     return file.checksum
 
 
-def cut_back(path: Path, size: int) -> None:
+def truncate(path: Path, size: int) -> None:
     """Shorten a file to `size` bytes.
 
     Raises:

@@ -6,7 +6,7 @@ import secrets
 from pathlib import Path
 
 from common.errors import RunError
-from common.process.files import write_whole
+from common.process.files import write_atomic
 
 RUN_ID = "run-id"
 
@@ -43,7 +43,7 @@ def claim(folder: Path, run_id: int) -> None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / RUN_ID, f"{run_id}\n".encode())
+        write_atomic(folder / RUN_ID, f"{run_id}\n".encode())
     except OSError as error:
         raise RunError(f"{folder / RUN_ID}: {error.strerror or error}") from error
 

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from common.errors import RunError, UsageError
-from common.process.files import write_whole
+from common.process.files import write_atomic
 from experiments.report.columns import (
     Columns,
     csv_columns,
@@ -131,13 +131,13 @@ def unpack(path: Path, folder: Path) -> str:
     try:
         folder.mkdir(parents=True)
         if packed.sweep is not None:
-            write_whole(folder / SWEEP, packed.sweep.encode())
+            write_atomic(folder / SWEEP, packed.sweep.encode())
         for run in packed.names:
             (folder / run).mkdir()
             for file in FILES:
                 text = packed.text(run, file)
                 if text is not None:
-                    write_whole(folder / run / file, text.encode())
+                    write_atomic(folder / run / file, text.encode())
     except OSError as error:
         raise UsageError(f"--unpack {folder}: {error.strerror}") from error
     return f"{folder}: {len(packed.names)} runs"

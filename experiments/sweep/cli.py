@@ -58,7 +58,7 @@ def _run() -> None:
     grid = load_grid(options.grid, options.quick)
     folder = options.folder()
     cells = _chosen(options, grid, folder)
-    _settle(grid, cells, folder)
+    _claim_folder(grid, cells, folder)
     if options.slurm:
         left = [cell.cell.name for cell in cells if not (cell.finished() or cell.diverged())]
         print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
@@ -75,7 +75,7 @@ def _chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]
     return cells
 
 
-def _settle(grid: Grid, cells: list[CellFolder], folder: Path) -> None:
+def _claim_folder(grid: Grid, cells: list[CellFolder], folder: Path) -> None:
     """Assign the folder to this sweep, or refuse it before anything runs."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -30,7 +30,7 @@ def submit(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> 
     """
     folder = folder.resolve()
     held = _held(folder)
-    told = [f"job {job}: {_cells(number)} queued or running" for job, number in Counter(held.values()).items()]
+    lines = [f"job {job}: {_cells(number)} queued or running" for job, number in Counter(held.values()).items()]
     left = [cell for cell in cells if cell not in held]
     size = _array_size() if left else 1
     after: str | None = None
@@ -41,8 +41,8 @@ def submit(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> 
         except RunError as error:
             done = f" after {_cells(start)} submitted; the same command submits the rest" if start else ""
             raise RunError(f"{error}{done}") from error
-        told.append(f"job {after}: {_cells(len(part))} submitted")
-    return told
+        lines.append(f"job {after}: {_cells(len(part))} submitted")
+    return lines
 
 
 def _cells(number: int) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from common.process.files import measure, write_whole
+from common.process.files import measure, write_atomic
 
 DONE = "DONE"
 LEARNER = "learner.pt"
@@ -36,9 +36,9 @@ def save_epoch(run_dir: Path, number: int, learner_state: dict[str, Any], snapsh
         content = io.BytesIO()
         torch.save(learner_state, content)
         data = content.getvalue()
-        checksum = write_whole(path / LEARNER, data)
+        checksum = write_atomic(path / LEARNER, data)
         snapshot(folder)
-        write_whole(path / DONE, json.dumps({LEARNER: [len(data), checksum]}).encode())
+        write_atomic(path / DONE, json.dumps({LEARNER: [len(data), checksum]}).encode())
     except BaseException:
         shutil.rmtree(path, ignore_errors=True)
         raise
@@ -54,18 +54,18 @@ def complete_epochs(run_dir: Path) -> list[int]:
     return sorted(int(path.parent.name) for path in (run_dir / "checkpoints").glob(f"*/{DONE}"))
 
 
-def whole_epochs(run_dir: Path) -> list[int]:
+def intact_epochs(run_dir: Path) -> list[int]:
     """Numbers of the finished epochs whose learner.pt is intact, in ascending order."""
-    return [number for number in complete_epochs(run_dir) if _is_whole(run_dir / "checkpoints" / str(number))]
+    return [number for number in complete_epochs(run_dir) if _is_intact(run_dir / "checkpoints" / str(number))]
 
 
 def newest_epoch(run_dir: Path) -> Path | None:
     """The newest whole epoch; None if there is none."""
-    whole = whole_epochs(run_dir)
+    whole = intact_epochs(run_dir)
     return run_dir / "checkpoints" / str(whole[-1]) if whole else None
 
 
-def go_back(run_dir: Path, number: int) -> dict[str, Any] | None:
+def rewind(run_dir: Path, number: int) -> dict[str, Any] | None:
     """Load the learner's state of epoch `number` (0: the beginning, None) and delete newer epochs."""
     for newer in complete_epochs(run_dir):
         if newer > number:
@@ -79,9 +79,9 @@ def load_learner(path: Path) -> dict[str, Any]:
     return state
 
 
-def _is_whole(path: Path) -> bool:
+def _is_intact(path: Path) -> bool:
     try:
-        told = json.loads((path / DONE).read_text(encoding="utf-8"))
-        return bool(told == {LEARNER: list(measure(path / LEARNER))})
+        recorded = json.loads((path / DONE).read_text(encoding="utf-8"))
+        return bool(recorded == {LEARNER: list(measure(path / LEARNER))})
     except (OSError, ValueError):
         return False

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from common.errors import RunError
-from common.process.files import LineFile, cut_back, write_whole
+from common.process.files import LineFile, truncate, write_atomic
 from common.process.run_ids import draw_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.tables import to_toml
@@ -33,9 +33,9 @@ class RunDirectory:
         """Create a run's files, or continue them, cut back to `sizes` in bytes; raises RunError if that fails."""
         self.path = path
         try:
-            settle(path, config)
+            claim_run_directory(path, config)
             for name, size in (sizes or {}).items():
-                cut_back(path / name, size)
+                truncate(path / name, size)
             self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
             self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
             self._tensorboard = TensorBoardWriter(path / "tb")
@@ -74,7 +74,7 @@ class RunDirectory:
 
     def summary(self, summary: Summary) -> None:
         """Write summary.json atomically."""
-        write_whole(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
+        write_atomic(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
 
     def sizes(self) -> dict[str, int]:
         """The present sizes of the growing files, in bytes."""
@@ -102,7 +102,7 @@ class RunDirectory:
         self.close()
 
 
-def settle(path: Path, config: RunConfig) -> int:
+def claim_run_directory(path: Path, config: RunConfig) -> int:
     """Assign a directory to this run, or check that it is assigned; write its config and return the run's id.
 
     Raises:
@@ -110,7 +110,7 @@ def settle(path: Path, config: RunConfig) -> int:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        write_whole(path / "config.toml", to_toml(config).encode())  # first: an id alone is a replay service's folder
+        write_atomic(path / "config.toml", to_toml(config).encode())  # first: an id alone is a replay service's folder
     except OSError as error:
         raise RunError(f"run directory {path}: {error.strerror or error}") from error
     return draw_run_id(path)

@@ -10,7 +10,7 @@ from pathlib import Path
 from common.errors import RunError
 from replay.core import ReplayCore
 from replay.persistence.journal import Journal
-from replay.persistence.storage import Mark, TornSnapshot, is_whole, load_snapshot, read_mark, save_snapshot
+from replay.persistence.storage import Mark, TornSnapshot, is_intact, load_snapshot, read_mark, save_snapshot
 
 PART = "replay"
 
@@ -77,9 +77,9 @@ class ReplayEpochs:
             raise RunError(self._problem or f"{part_path(self._folder, number)}: the writer has ended without a word")
         return True
 
-    def whole(self) -> list[int]:
+    def intact(self) -> list[int]:
         """Numbers of the intact parts, in ascending order."""
-        return [number for number in part_numbers(self._folder) if is_whole(part_path(self._folder, number))]
+        return [number for number in part_numbers(self._folder) if is_intact(part_path(self._folder, number))]
 
     def restore(self, core: ReplayCore, number: int) -> tuple[int, str]:
         """Restore a new core from the newest intact part up to epoch `number`, if there is one.

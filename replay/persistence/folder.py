@@ -34,13 +34,13 @@ class ReplayFolder:
             check_owner(self.path, read_run_id(self.path), self.run_id)
         files = journal_files(self.journal)
         owners = [(part_path(self.path, number), read_mark(part_path(self.path, number))) for number in self._numbers()]
-        told = [(path, mark.run_id) for path, mark in owners if mark is not None]
-        told += [(self.journal, owner) for number in files if (owner := read_owner(self.journal, number)) is not None]
-        for path, owner in told:
+        owned = [(path, mark.run_id) for path, mark in owners if mark is not None]
+        owned += [(self.journal, owner) for number in files if (owner := read_owner(self.journal, number)) is not None]
+        for path, owner in owned:
             check_owner(path, owner, self.run_id)
         if not owners and not files:
             return f"starts: there is no table of this run in {self.path} yet"
-        if not told and not has_run_id(self.path):
+        if not owned and not has_run_id(self.path):
             raise RunError(f"{self.path}: holds epochs that do not tell which run they are of")
         if not resume:
             raise UsageError(f"--run-dir {self.path}: holds a run already; give another, or --resume")

@@ -11,7 +11,7 @@ from common.errors import RunError
 from common.messaging import wire
 from common.messaging.messages.insert import SegmentReader
 from common.messaging.messages.sample import DrawRequest
-from common.process.files import cut_back
+from common.process.files import truncate
 from replay.core import ReplayCore
 from replay.persistence.journal import (
     DRAW,
@@ -44,7 +44,7 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
         except TornFile as torn:
             if number != numbers[-1]:
                 raise
-            cut_back(torn.path, torn.end)
+            truncate(torn.path, torn.end)
     taken = core.table.inserted - before
     return first + len(numbers), f"{taken:,} transitions and {draws:,} batches from the journal"
 

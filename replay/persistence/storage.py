@@ -20,7 +20,7 @@ import numpy as np
 from common.errors import BadMessage
 from common.messaging import wire
 from common.messaging.messages.sample import BatchReader, EpisodeRecord, encode_batch
-from common.process.files import PIECE, SyncedFile, measure, sync_folder, write_whole
+from common.process.files import PIECE, SyncedFile, measure, sync_folder, write_atomic
 from common.process.run_ids import check_owner
 from common.types import Array, EpisodeEnd
 from replay.core import CoreSnapshot, ReplayCore
@@ -91,7 +91,7 @@ def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path, mark: 
         "files": files,
     }
     packed = msgpack.packb(state)
-    write_whole(part / STATE, zlib.crc32(packed).to_bytes(4, "little") + packed)
+    write_atomic(part / STATE, zlib.crc32(packed).to_bytes(4, "little") + packed)
 
 
 def load_snapshot(core: ReplayCore, path: Path, run_id: int) -> Mark:
@@ -124,7 +124,7 @@ def read_mark(path: Path) -> Mark | None:
         return None
 
 
-def is_whole(path: Path) -> bool:
+def is_intact(path: Path) -> bool:
     """Whether the snapshot in `path` is intact; reads all of it."""
     try:
         state = _read_state(path / STATE)

@@ -36,7 +36,7 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Read it; raises BadMessage."""
         check_kind(message, cls.kind)
         check_arrays(message, NO_ARRAYS)
-        return typed(message, cls)
+        return to_struct(message, cls)
 
 
 def check_kind(message: Message, kind: str) -> None:
@@ -68,7 +68,7 @@ def check_arrays(message: Message, layout: Layout, optional: Set[str] = frozense
     return lengths
 
 
-def typed(message: Message, kind: type[T], layout: Layout = NO_ARRAYS) -> T:
+def to_struct(message: Message, kind: type[T], layout: Layout = NO_ARRAYS) -> T:
     """Convert a message's fields, and its arrays checked against `layout`, into a struct; raises BadMessage."""
     fields, expected = message.fields, _names(kind)
     if layout:

@@ -9,7 +9,7 @@ import numpy as np
 from common.bounds import MAX_MAGNITUDE, MAX_N_STEP, MAX_SEGMENT_STEPS, MAX_UPDATES
 from common.errors import BadMessage
 from common.messaging import wire
-from common.messaging.messages.body import Layout, check_arrays, check_kind, typed
+from common.messaging.messages.body import Layout, check_arrays, check_kind, to_struct
 from common.messaging.wire import Message
 from common.types import Array, EnvSpec, Segment
 
@@ -43,18 +43,18 @@ def check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
     """Check the values of the arrays that segments and batches share, at least one row each; raises BadMessage."""
     frames = arrays["frames"]
     for name in ("obs_index", "next_index"):
-        within(f"arrays.{name}", arrays[name], 0, len(frames) - 1)
-    within("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
-    within("arrays.rewards", arrays["rewards"], -MAX_MAGNITUDE, MAX_MAGNITUDE)
+        check_range(f"arrays.{name}", arrays[name], 0, len(frames) - 1)
+    check_range("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
+    check_range("arrays.rewards", arrays["rewards"], -MAX_MAGNITUDE, MAX_MAGNITUDE)
     if frames.dtype == np.float32:
-        within("arrays.frames", frames, -MAX_MAGNITUDE, MAX_MAGNITUDE)
-    within("arrays.terminated", arrays["terminated"].view(np.uint8), 0, 1)
-    within("arrays.param_version", arrays["param_version"], 0, MAX_UPDATES)
+        check_range("arrays.frames", frames, -MAX_MAGNITUDE, MAX_MAGNITUDE)
+    check_range("arrays.terminated", arrays["terminated"].view(np.uint8), 0, 1)
+    check_range("arrays.param_version", arrays["param_version"], 0, MAX_UPDATES)
     if "span" in arrays:
-        within("arrays.span", arrays["span"], 1, MAX_N_STEP)
+        check_range("arrays.span", arrays["span"], 1, MAX_N_STEP)
 
 
-def within(field: str, array: Array, low: float, high: float) -> None:
+def check_range(field: str, array: Array, low: float, high: float) -> None:
     """Raise BadMessage for a value outside [low, high] and for NaN."""
     least, most = array.min(), array.max()
     if not (low <= least and most <= high):
@@ -76,7 +76,7 @@ class SegmentReader:
         if not 1 <= steps <= MAX_SEGMENT_STEPS:
             raise BadMessage("arrays.actions", f"{steps} steps; allowed: 1 to {MAX_SEGMENT_STEPS}")
         check_transitions(self._spec, message.arrays)
-        segment = typed(message, Segment, self._layout)
+        segment = to_struct(message, Segment, self._layout)
         if segment.carried > frames:
             raise BadMessage("fields.carried", f"{segment.carried} of {frames} frames")
         last = -1

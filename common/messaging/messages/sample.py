@@ -11,8 +11,8 @@ from common.bounded import Count, Counter, Incarnation, Updates
 from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_PRIORITIES, MAX_STREAMS, MAX_UPDATES
 from common.errors import BadMessage
 from common.messaging import wire
-from common.messaging.messages.body import Body, check_arrays, check_kind, typed
-from common.messaging.messages.insert import OPTIONAL, check_transitions, transitions, within
+from common.messaging.messages.body import Body, check_arrays, check_kind, to_struct
+from common.messaging.messages.insert import OPTIONAL, check_range, check_transitions, transitions
 from common.messaging.wire import Message, Source
 from common.types import Array, Batch, EnvSpec, EpisodeEnd
 
@@ -105,5 +105,5 @@ class BatchReader:
         if not check_arrays(message, self._layout, OPTIONAL)["batch"]:
             raise BadMessage("arrays.actions", "an empty batch")
         check_transitions(self._spec, arrays)
-        within("arrays.weights", arrays["weights"], 0.0, MAX_FLOAT32)
-        return Batch(**arrays), typed(message, Drawn)
+        check_range("arrays.weights", arrays["weights"], 0.0, MAX_FLOAT32)
+        return Batch(**arrays), to_struct(message, Drawn)

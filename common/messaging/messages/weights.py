@@ -8,7 +8,7 @@ from msgspec import Meta, Struct
 
 from common.bounded import Updates
 from common.messaging import wire
-from common.messaging.messages.body import Body, Layout, check_arrays, check_kind, typed
+from common.messaging.messages.body import Body, Layout, check_arrays, check_kind, to_struct
 from common.messaging.wire import Message
 from common.types import Array
 
@@ -38,7 +38,7 @@ class Weights(Struct, frozen=True):
         layout: Layout = {"flat": ("float32", (parameters,))}
         check_kind(message, "weights")
         check_arrays(message, layout)
-        return typed(message, cls, layout)
+        return to_struct(message, cls, layout)
 
 
 class Role(Body, frozen=True):
