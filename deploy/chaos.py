@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import time
@@ -108,6 +109,14 @@ def _children(pid: int) -> list[tuple[int, str]]:
     return found
 
 
+def _repeated(told: str) -> str:
+    """How many transitions of the closing table are there twice, from what coop-reexecute has printed."""
+    found = re.search(r"([\d,]+) of ([\d,]+) in the closing table", told)
+    if found is None:
+        raise RunError(f"coop-reexecute does not tell of the closing table: {told.strip()}")
+    return f"{found[1]} of {found[2]}"
+
+
 def main() -> None:
     """Entry point."""
     run_main("chaos", _run)
@@ -129,6 +138,7 @@ def _run() -> None:
         "seed": options.seed,
         "total-steps": options.total_steps,
         "checkpoint-every": options.checkpoint_every,
+        "replay.capacity": options.total_steps,  # the closing table shows what came in twice at any time
     }
     settings = (f"--{name}={value}" for name, value in flags.items())
     local = command("coop-local", *settings, "--replay.journal", "--replay.journal-keep")
@@ -160,7 +170,7 @@ def _run() -> None:
         "kills": f"{sum(monkey.kills.values())} ({killed})",
         "transitions accepted": f"{summary['transitions_accepted']:,}",
         "lost": summary["transitions_lost"],
-        "duplicated": 0,  # otherwise coop-reexecute would have failed
+        "duplicated": _repeated(proof.stdout),
         "restarts": restarts,
         "longest stall": f"{monkey.longest_stall:.1f} s",
         "wall time": f"{ended - started:.0f} s",

@@ -33,6 +33,7 @@ class Outcome:
 
     began: number of the first update; 0 if the journal reaches back to the beginning of the run.
     missing_segments: segments missing in the journal although it contains later ones of their stream.
+    repeated, held: transitions of the closing table that equal another one there, and all that it holds.
     digest: SHA-256 over both networks' parameters.
     """
 
@@ -40,6 +41,8 @@ class Outcome:
     updates: int
     transitions: int
     missing_segments: int
+    repeated: int
+    held: int
     digest: str
 
 
@@ -78,7 +81,10 @@ def reexecute(run_dir: Path) -> Outcome:
         accepted = summary["transitions_accepted"]
         raise RunError(f"{folder}: {core.table.inserted:,} transitions, but the run accepted {accepted:,}")
     digest = hashlib.sha256(b"".join(network.snapshot().tobytes() for network in agent.networks)).hexdigest()
-    return Outcome(began, agent.updates, core.table.inserted, core.missing_segments, digest)
+    closing = ReplayCore(config, core.table.spec)
+    ReplayEpochs(run_dir, run_id).restore(closing, int(final.name))
+    repeated, held = closing.table.repeated(), len(closing.table)
+    return Outcome(began, agent.updates, core.table.inserted, core.missing_segments, repeated, held, digest)
 
 
 def _beginning(config: RunConfig, run_dir: Path, folder: Path, run_id: int) -> tuple[Agent, ReplayCore, int]:

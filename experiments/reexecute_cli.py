@@ -29,7 +29,8 @@ def _run() -> None:
     options = cli.parse(ReexecuteOptions, "coop-reexecute", "Train a run's learner again from the run's journal.")
     outcome = reexecute(options.run_dir)
     print(
-        f"updates {outcome.began:,} to {outcome.updates:,} on {outcome.transitions:,} transitions, none twice, "
+        f"updates {outcome.began:,} to {outcome.updates:,} on {outcome.transitions:,} transitions, "
+        f"{outcome.repeated:,} of {outcome.held:,} in the closing table equal another, "
         f"{outcome.missing_segments} segments missing: parameters, optimizers and random state equal "
         f"the run's, bit for bit (sha256 {outcome.digest})"
     )

@@ -21,7 +21,7 @@ from common.types import EnvSpec
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
 from learner.join_service import JoinService
-from learner.records.epochs import intact_epochs, rewind
+from learner.records.epochs import intact_epochs, load_learner, rewind
 from learner.records.run_directory import RunDirectory, claim_run_directory
 from learner.roster import Roster
 from learner.service import LearnerService
@@ -69,6 +69,8 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
     held = intact_epochs(path) if options.resume else []
     if options.resume and not held:
         console.event(beginning(path))
+    if held:
+        _check_origin(path / "checkpoints" / str(held[-1]))
     trainer = Trainer(Agent(config, spec), time.monotonic())
     agent = trainer.agent
     epochs = SharedEpochs(held, str(path), restart=options.restart)
@@ -104,3 +106,9 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         raise RunError(trainer.diverged)
     if stop.failed or summary.exit == stop.reason:  # otherwise the run was complete before the signal
         stop.leave()
+
+
+def _check_origin(epoch: Path) -> None:
+    """Raise UsageError for an epoch of a lockstep run, before anything is deleted or written."""
+    if "told" not in load_learner(epoch):
+        raise UsageError(f"{epoch}: saved by a lockstep run; coop-lockstep --resume goes on with it")

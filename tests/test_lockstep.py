@@ -201,3 +201,18 @@ def test_steps_that_wait_for_their_return_come_back_with_a_resumed_run(tmp_path:
     assert tables[0].keys() == tables[1].keys()
     for name, column in tables[0].items():
         assert column.tobytes() == tables[1][name].tobytes(), name
+
+
+def test_processes_do_not_go_on_with_a_lockstep_run(tmp_path: Path) -> None:
+    flags = ["--total-steps", "300", "--run-dir", str(tmp_path / "run")]
+    learner, lockstep = (Path(sysconfig.get_path("scripts"), name) for name in ("coop-learner", "coop-lockstep"))
+    subprocess.run([lockstep, *flags], check=True, capture_output=True, timeout=60)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("[!.]*") if path.is_file()}
+    done = subprocess.run(
+        [learner, *flags, "--resume"], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("coop-learner: error: ")
+    assert done.stderr.endswith("saved by a lockstep run; coop-lockstep --resume goes on with it\n")
+    assert len(done.stderr.splitlines()) == 1
+    assert {path: path.read_bytes() for path in tmp_path.rglob("[!.]*") if path.is_file()} == before

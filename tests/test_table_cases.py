@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from samples import make_segment
 from table_reference import Copies, Stream, check_references, make_spec
 
 from common.errors import UsageError
 from common.settings.capacity import estimated_bytes
-from common.types import Segment
+from common.types import EnvSpec, Segment
 from replay.stats import reuse_histogram
 from replay.table import streams
 from replay.table.table import Table
@@ -171,3 +172,15 @@ def test_misuse_is_refused() -> None:
         table.load_state(meta, arrays)
     with pytest.raises(UsageError, match="capacity: 11, but the saved table had 10"):
         Table(make_spec(1), 11, sampling="prioritized", rng=np.random.default_rng(0)).load_state(meta, arrays)
+
+
+def test_what_has_come_in_twice_is_counted() -> None:
+    spec = EnvSpec("x", (4,), "float32", 1, 2)
+    table = Table(spec, 20, rng=np.random.default_rng(0))
+    for sequence in range(3):
+        table.insert(make_segment(spec, sequence))
+    assert table.repeated() == 0
+    table.insert(make_segment(spec, 1, incarnation=8))
+    other = make_segment(spec, 2, rewards=np.full(4, -1.0, np.float32))
+    table.insert(other)
+    assert (len(table), table.repeated()) == (20, 4)

@@ -106,6 +106,12 @@ class Table:
         """Transitions evicted, or never kept, that were never drawn."""
         return int(self._reuse_evicted[0])
 
+    def repeated(self) -> int:
+        """Count the transitions held that equal another one in their frames, action, reward, end and span."""
+        slots = self._slots[: len(self)].astype(np.intp)
+        values = zip(slots, self._actions, self._rewards, self._terminated, self._span, strict=False)
+        return len(self) - len({hash((self._frames.read(each).tobytes(), *rest)) for each, *rest in values})
+
     def insert(self, segment: Segment) -> None:
         """Insert a valid segment that is no duplicate; the eviction policy chooses the transitions to evict."""
         size = len(self)
