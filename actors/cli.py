@@ -40,7 +40,7 @@ def main() -> None:
 
 
 def _run() -> None:
-    options = cli.parse(ActorOptions, "coop-actor", "Play emulators for a run; the rest comes from its learner.")
+    options = cli.parse(ActorOptions, "coop-actor", "Play emulators for a run; its learner sends the config.")
     use_threads(1)
     keep_freed_memory()
     stop = Stop()

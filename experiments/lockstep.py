@@ -130,9 +130,7 @@ class Lockstep:
         if old_checkpoints.is_old(epoch):
             state = old_checkpoints.load(epoch, state, self._table, self._replay_actions)
         elif "player" not in state:
-            raise UsageError(
-                f"{epoch}: saved by processes, whose emulators are gone; coop-local --resume goes on with it"
-            )
+            raise UsageError(f"{epoch}: saved by a distributed run; coop-local --resume continues it")
         else:
             self._replay_actions(state["player"]["actions"].tolist())
             load_snapshot(self._replay, epoch / "replay", read_run_id(epoch.parents[1]))

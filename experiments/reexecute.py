@@ -59,7 +59,7 @@ def reexecute(run_dir: Path) -> Outcome:
     config = resolve(load_tables(None, run_dir / "config.toml"))
     final, folder, run_id = newest_epoch(run_dir), run_dir / "journal", read_run_id(run_dir)
     if final is None or not journal_files(folder):
-        raise UsageError(f"{run_dir}: no journal and finished epoch here; was the run started with --replay.journal?")
+        raise UsageError(f"{run_dir}: no journal with a finished epoch; was the run started with --replay.journal?")
     expected = load_learner(final)["agent"]
     use_threads(config.learner.threads)
     agent, core, first = _beginning(config, run_dir, folder, run_id)
@@ -100,7 +100,7 @@ def _beginning(config: RunConfig, run_dir: Path, folder: Path, run_id: int) -> t
             agent.load_state(load_learner(run_dir / "checkpoints" / str(number))["agent"])
             return agent, core, first
         core = ReplayCore(config, spec)
-    raise RunError(f"{folder}: begins at file {files[0]}, and no epoch goes before it")
+    raise RunError(f"{folder}: begins at file {files[0]}, and no epoch precedes it")
 
 
 def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:

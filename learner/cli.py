@@ -46,10 +46,10 @@ def main() -> None:
 
 def _run() -> None:
     options = parse_run(
-        LearnerOptions, "coop-learner", "Train the networks of a run; everybody else asks this process."
+        LearnerOptions, "coop-learner", "Train the networks of a run; the other roles join it through this process."
     )
     if options.restart and not options.resume:
-        raise UsageError("--restart: says what --resume does where it finds no epoch to go on from; give both")
+        raise UsageError("--restart: needs --resume; it applies where that finds no epoch to continue from")
     config = options.run_config()
     check_distributed(config)
     spec = env_spec(config.env)
@@ -83,7 +83,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         join_service = JoinService(node, config, spec, layout, run_id, epochs, roster, console.event)
         console.event(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}")
         if held:
-            console.event("waiting for the replay service to tell which epochs it holds")
+            console.event("waiting for the replay service's list of epochs")
         number = epochs.wait(stop)
         if number is None:
             stop.leave()

@@ -133,7 +133,7 @@ class JoinService:
             if key != join_key(self._node, "replay"):
                 raise BadMessage("fields.incarnation", "not an actor's")
             if not self.departure.ask(incarnation):
-                return Retry("an epoch is to be saved first").encode(self._node.run)
+                return Retry("an epoch must be saved first").encode(self._node.run)
             self._roster.dismiss(incarnation)
         self.members.leaving(incarnation)
         return Farewell().encode(self._node.run)

@@ -45,9 +45,7 @@ def main() -> None:
 
 
 def _run() -> None:
-    options = cli.parse(
-        ReplayOptions, "coop-replay", "Serve the replay table of a run; the rest comes from its learner."
-    )
+    options = cli.parse(ReplayOptions, "coop-replay", "Serve the replay table of a run; its learner sends the config.")
     keep_freed_memory()
     stop = Stop()
     stop.on_signals()

@@ -158,7 +158,7 @@ class ReplayCore:
     def apply_insert(self, segment: Segment) -> None:
         """Apply an admitted insert, a new one or one from a journal; raises RunError for a duplicate."""
         if not self._seen.accept(segment.incarnation, segment.stream, segment.sequence):
-            raise RunError(f"segment {segment.sequence} of actor {segment.incarnation:x} would be taken twice")
+            raise RunError(f"segment {segment.sequence} of actor {segment.incarnation:x} would be inserted twice")
         account = self._accounts.setdefault(segment.incarnation, _Account())
         account.accepted += segment.steps
         account.acked = max(account.acked, segment.acked)

@@ -31,7 +31,9 @@ def main() -> None:
 
 
 def _run() -> None:
-    options = cli.parse(LimitsOptions, "coop-limits", "Show, and change, how a run keeps acting and learning in step.")
+    options = cli.parse(
+        LimitsOptions, "coop-limits", "Show or change a run's limiter of acting and learning."
+    )
     stop = Stop()
     stop.on_signals()
     request = Join("watch", new_incarnation(), [])  # asks for the replay service's endpoints

@@ -29,7 +29,7 @@ from replay.core import ReplayCore, Wait
 from replay.persistence.epochs import ReplayEpochs
 
 HOLD = 1.0  # seconds
-LEAVING = "the replay service leaves"
+LEAVING = "the replay service is stopping"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"
 STATUS_EVERY = 0.5  # seconds
 INSERT_QUEUE = 256
@@ -108,7 +108,7 @@ class ReplayService:
     def progress(self) -> str:
         """The run's progress in one line."""
         stats = self.stats()
-        return f"{stats.inserted:,} transitions taken, {stats.size:,} held, {stats.drawn:,} batches drawn"
+        return f"{stats.inserted:,} transitions inserted, {stats.size:,} held, {stats.drawn:,} batches drawn"
 
     def close(self) -> None:
         """Wait for the epoch being written."""

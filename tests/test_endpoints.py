@@ -15,8 +15,8 @@ from common.process.lifecycle import Stop
 @pytest.mark.parametrize(
     ("endpoint", "words"),
     [
-        ("head:7447", "endpoint 'head:7447': no protocol; tcp/head:7447 is meant?"),
-        ("tcp://head:7447", "endpoint 'tcp://head:7447': tcp/head:7447 is meant?"),
+        ("head:7447", "endpoint 'head:7447': no protocol; did you mean tcp/head:7447?"),
+        ("tcp://head:7447", "endpoint 'tcp://head:7447': did you mean tcp/head:7447?"),
         ("", "no protocol"),
         ("tpc/head:7447", "no such protocol as 'tpc'; allowed: tcp, tls"),
         ("tcp/head", "tcp/HOST:PORT with a port from 0 to 65535"),

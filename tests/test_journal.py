@@ -69,7 +69,7 @@ def test_a_kill_loses_nothing(spec: EnvSpec, tmp_path: Path) -> None:
     content = bytearray((tmp_path / "00000001.log").read_bytes())
     content[len(content) // 2] ^= 1
     (tmp_path / "00000001.log").write_bytes(content)
-    with pytest.raises(RunError, match=r"00000001.log: no whole record at byte \d+"):
+    with pytest.raises(RunError, match=r"00000001.log: no complete record at byte \d+"):
         recover(ReplayCore(CONFIG, spec), tmp_path, 1, 5)
     (tmp_path / "00000001.log").unlink()
     with pytest.raises(RunError, match=r"has files \[2\], should have every one from 1 on"):

@@ -74,7 +74,7 @@ def test_a_journal_alone_tells_whose_it_is(spec: EnvSpec, tmp_path: Path) -> Non
 
 def test_parts_of_an_unknown_run_are_refused(tmp_path: Path) -> None:
     part_path(tmp_path, 500).mkdir(parents=True)
-    with pytest.raises(RunError, match="do not tell which run"):
+    with pytest.raises(RunError, match="do not name their run"):
         ReplayFolder(tmp_path, 5).check(resume=True)
 
 

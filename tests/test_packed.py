@@ -111,13 +111,13 @@ def test_the_report_is_the_same(
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("episodes.csv", HEADER + "0,5", "episodes.csv: a torn line; does the run go on?"),
-        ("metrics.jsonl", '{"env_step": 1}\n{"env', "metrics.jsonl: a torn line; does the run go on?"),
-        ("metrics.jsonl", '{"env_step":1}\n', "metrics.jsonl: would not come back byte for byte; nothing is packed"),
+        ("episodes.csv", HEADER + "0,5", "episodes.csv: a torn line; is the run still writing?"),
+        ("metrics.jsonl", '{"env_step": 1}\n{"env', "metrics.jsonl: a torn line; is the run still writing?"),
+        ("metrics.jsonl", '{"env_step":1}\n', "metrics.jsonl: cannot be restored byte for byte; nothing was packed"),
         (
             "episodes.csv",
             HEADER + "0,5,0,1,1,1,1,1",
-            "episodes.csv: would not come back byte for byte; nothing is packed",
+            "episodes.csv: cannot be restored byte for byte; nothing was packed",
         ),
     ],
 )

@@ -48,9 +48,7 @@ def test_a_config_that_does_not_know_other_methods_says_so(tmp_path: Path, capsy
     file = tmp_path / "old.toml"
     file.write_text('method = "coop"\n[learner]\noptimizer = "sgd"\n')
     assert base_config([f"--config={file}", "--method", "dqn"]).learner.optimizer == "sgd"
-    assert capsys.readouterr().err == (
-        f"warning: {file} does not say what methods set differently: dqn takes what coop had\n"
-    )
+    assert capsys.readouterr().err == (f"warning: {file} has no settings for single methods: dqn gets those of coop\n")
     file.write_text(to_toml(RunConfig()))
     base_config([f"--config={file}", "--method", "dqn"])
     base_config([f"--config={file}"])

@@ -25,9 +25,9 @@ def check_endpoints(endpoints: Sequence[str]) -> None:
     for endpoint in endpoints:
         protocol, slash, address = endpoint.partition("/")
         if not slash:
-            raise UsageError(f"endpoint {endpoint!r}: no protocol; tcp/{endpoint or 'HOST:PORT'} is meant?")
+            raise UsageError(f"endpoint {endpoint!r}: no protocol; did you mean tcp/{endpoint or 'HOST:PORT'}?")
         if protocol.endswith(":"):
-            raise UsageError(f"endpoint {endpoint!r}: {protocol[:-1]}/{address.lstrip('/')} is meant?")
+            raise UsageError(f"endpoint {endpoint!r}: did you mean {protocol[:-1]}/{address.lstrip('/')}?")
         if protocol not in PORTS + OTHERS:
             allowed = ", ".join(PORTS + OTHERS)
             raise UsageError(f"endpoint {endpoint!r}: no such protocol as {protocol!r}; allowed: {allowed}")

@@ -44,5 +44,5 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     if preset and known.total_steps is not None:
         tables = shortened(tables, known.total_steps)
     if file and known.method and "methods" not in tables and known.method != tables.get("method", known.method):
-        warn(f"{file} does not say what methods set differently: {known.method} takes what {tables['method']} had")
+        warn(f"{file} has no settings for single methods: {known.method} gets those of {tables['method']}")
     return resolve(tables, known.method)

@@ -147,7 +147,7 @@ def _check(packed: PackedStudy, folder: Path, files: Mapping[str, Mapping[str, s
     for run, texts in files.items():
         for file, text in texts.items():
             if (packed.text(run, file) or "") != (text or ""):
-                raise RunError(f"{folder / run / file}: would not come back byte for byte; nothing is packed")
+                raise RunError(f"{folder / run / file}: cannot be restored byte for byte; nothing was packed")
 
 
 def _file(path: Path) -> str | None:
@@ -163,7 +163,7 @@ def _read(path: Path, text: str | None) -> Columns:
     try:
         return READ[path.name](text) if text else {}
     except ValueError as error:
-        raise RunError(f"{path}: a torn line; does the run go on? {error}") from error
+        raise RunError(f"{path}: a torn line; is the run still writing? {error}") from error
 
 
 def _lists(file: str, runs: Sequence[Columns]) -> list[tuple[pa.Field, pa.Array]]:

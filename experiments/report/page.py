@@ -72,7 +72,7 @@ def _missing(study: Study, lacking: Sequence[str]) -> str:
 
 def _warnings(study: Study) -> str:
     items = "".join(f"<li>{html.escape(line)}</li>" for line in study.warnings)
-    return f"<p>Q-values too large to be true:</p><ul>{items}</ul>" if items else ""
+    return f"<p>Q-values above their bound:</p><ul>{items}</ul>" if items else ""
 
 
 def _table(table: ResultTable) -> str:

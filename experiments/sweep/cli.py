@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def _run() -> None:
-    options = parse(SweepOptions, "coop-sweep", "Run every cell of a grid, each one once.")
+    options = parse(SweepOptions, "coop-sweep", "Run every cell of a grid once.")
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: must be at least 1")
     grid = load_grid(options.grid, options.quick)
@@ -71,7 +71,7 @@ def _run() -> None:
 def _chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
     cells = [CellFolder(folder, cell) for cell in grid.cells if options.cell in (None, cell.name)]
     if not cells:
-        raise UsageError(f"--cell {options.cell}: not in the grid; its first one is {grid.cells[0].name}")
+        raise UsageError(f"--cell {options.cell}: not in the grid; its first cell is {grid.cells[0].name}")
     return cells
 
 
@@ -107,7 +107,7 @@ def _work(runner: Runner, folder: Path) -> None:
                     display.say(text)
                 display.update()
             if not runner.done:
-                display.say(f"{stop.reason}: the running cells save themselves")
+                display.say(f"{stop.reason}: the running cells save their state")
         finally:
             runner.abort()
         line = display.line()

@@ -74,7 +74,7 @@ class ReplayEpochs:
         if self._writer.is_alive():
             return False
         if not self._on_disk:
-            raise RunError(self._problem or f"{part_path(self._folder, number)}: the writer has ended without a word")
+            raise RunError(self._problem or f"{part_path(self._folder, number)}: the writer ended without a result")
         return True
 
     def intact(self) -> list[int]:

@@ -41,7 +41,7 @@ class ReplayFolder:
         if not owners and not files:
             return f"starts: there is no table of this run in {self.path} yet"
         if not owned and not has_run_id(self.path):
-            raise RunError(f"{self.path}: holds epochs that do not tell which run they are of")
+            raise RunError(f"{self.path}: holds epochs that do not name their run")
         if not resume:
             raise UsageError(f"--run-dir {self.path}: holds a run already; give another, or --resume")
         return f"goes on in {self.path}"

@@ -42,7 +42,7 @@ class TornFile(RunError):
     """A journal file that ends with an incomplete record; `end` is the offset after the last complete one."""
 
     def __init__(self, path: Path, end: int) -> None:
-        super().__init__(f"{path}: no whole record at byte {end}")
+        super().__init__(f"{path}: no complete record at byte {end}")
         self.path = path
         self.end = end
 

@@ -59,7 +59,7 @@ def replay_file(core: ReplayCore, folder: Path, number: int, run_id: int) -> Ite
             request, ids = read_draw(payload)
             batch, _ = core.apply_draw(request)
             if not np.array_equal(batch.columns["ids"], ids):
-                raise RunError(f"{folder}: file {number}, batch {request.sequence}: not the transitions taken down")
+                raise RunError(f"{folder}: file {number}, batch {request.sequence}: other transitions than recorded")
             yield request, batch
         elif kind == LIMITER:
             core.restore_limiter(read_limiter(payload))

@@ -261,7 +261,7 @@ class Table:
         Raises UsageError if the state's table has other settings, ValueError if this table is not new.
         """
         if self.inserted:
-            raise ValueError("only a new table can take over a state")
+            raise ValueError("only a new table can load a state")
         for name, value in self._settings.items():
             if meta["settings"][name] != value:
                 raise UsageError(f"{name}: {value!r}, but the saved table had {meta['settings'][name]!r}")
