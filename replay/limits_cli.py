@@ -31,9 +31,7 @@ def main() -> None:
 
 
 def _run() -> None:
-    options = cli.parse(
-        LimitsOptions, "coop-limits", "Show or change a run's limiter of acting and learning."
-    )
+    options = cli.parse(LimitsOptions, "coop-limits", "Show or change a run's limiter of acting and learning.")
     stop = Stop()
     stop.on_signals()
     request = Join("watch", new_incarnation(), [])  # asks for the replay service's endpoints
