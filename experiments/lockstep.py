@@ -17,7 +17,7 @@ from actors.player import Player, Turn
 from actors.policy import Policy
 from actors.segments import SegmentAssembler
 from common.envs.make import make_vector_env
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.messaging.messages.sample import EpisodeRecord
 from common.process.randomness import generator_state, set_generator_state
 from common.process.run_ids import read_run_id
@@ -103,7 +103,11 @@ class Lockstep:
         return math.floor(settings.ratio * max(0, step - settings.learning_starts))
 
     def save(self, directory: RunDirectory) -> None:
-        """Save an epoch that `restore` continues exactly to the bit."""
+        """Save an epoch that `restore` continues exactly to the bit.
+
+        Raises:
+            RunError: the run directory can't be written; nothing is left of this epoch.
+        """
         state = {
             **self.trainer.state(time.monotonic()),
             "player": {"policy": generator_state(self._policy_rng), "actions": torch.tensor(self._actions)},
@@ -115,7 +119,11 @@ class Lockstep:
             path = directory.path / folder / "replay"
             save_snapshot(self._replay.snapshot(self.agent.updates), threading.Condition(), path, mark)
 
-        save_epoch(directory.path, self.agent.updates, state, snapshot)
+        try:
+            save_epoch(directory.path, self.agent.updates, state, snapshot)
+        except OSError as error:
+            text = f"epoch {self.agent.updates} in {directory.path}: {error.strerror or error}"
+            raise RunError(text) from error
 
     def restore(self, epoch: Path) -> dict[str, int]:
         """Restore an epoch from `save`; return the sizes of the run's files at that time, in bytes.

@@ -6,12 +6,12 @@ import sys
 import time
 
 from common.errors import RunError
+from common.process.console import say
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
 from common.process.threads import use_threads
 from common.settings.options import RunOptions, beginning, parse_run
 from experiments.lockstep import Lockstep
-from learner.records.curve import draw_learning_curve
 from learner.records.epochs import newest_epoch
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
@@ -41,7 +41,7 @@ def _run() -> None:
         with RunDirectory(path, config, sizes) as directory:
             summary = run_lockstep(run, directory, stop)
     run.env.close()
-    print(f"{summary}; {path}")
+    say(f"{summary}; {path}")
     if run.trainer.diverged:
         raise RunError(run.trainer.diverged)
     if summary.exit == stop.reason:  # otherwise the run was complete before the signal
@@ -49,22 +49,34 @@ def _run() -> None:
 
 
 def run_lockstep(run: Lockstep, directory: RunDirectory, stop: Stop) -> Summary:
-    """Play until the run is over or stopped, and complete its files; prints its progress every few seconds."""
+    """Play until the run is over or stopped, and complete its files; prints its progress every few seconds.
+
+    Raises:
+        RunError: there is no space for the closing epoch or the summary.
+    """
     trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
     while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
         for effects in run.play():
             directory.record(effects.episodes, effects.metrics)
         if trainer.epoch_due() and not trainer.outcome():
             trainer.epoch_begun()
-            run.save(directory)
+            try:
+                run.save(directory)
+            except RunError as error:
+                say(f"{error}; the run goes on without it")
         if time.monotonic() >= due:
             due = time.monotonic() + PROGRESS_EVERY
-            print(_progress(run), end="\r" if sys.stdout.isatty() else "\n", flush=True)
-    if trainer.saveable():
-        run.save(directory)
-    summary = summarise(trainer, trainer.diverged or outcome, time.monotonic(), run.step)
-    directory.summary(summary)
-    draw_learning_curve(directory.path, f"{summary.title}, lockstep")
+            say(_progress(run), end="\r" if sys.stdout.isatty() else "\n")
+    outcome = trainer.diverged or outcome
+    try:
+        if trainer.saveable():
+            run.save(directory)
+    except RunError as error:
+        outcome = f"failed: {error}"
+        raise
+    finally:
+        summary = summarise(trainer, outcome, time.monotonic(), run.step)
+        directory.conclude(summary, f"{summary.title}, lockstep")
     return summary
 
 

@@ -10,7 +10,7 @@ from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.messaging.clients import SampleClient
 from common.messaging.transport import Node, locators, new_incarnation, open_session
-from common.process.console import Console
+from common.process.console import Console, say
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
 from common.process.threads import use_threads
@@ -101,7 +101,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         checkpoints = Checkpoints(node, path, samples, epochs, console.event)
         with RunDirectory(path, config, None if state is None else state["sizes"]) as directory:
             summary = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console).run()
-    print(summary, flush=True)
+    say(str(summary))
     if trainer.diverged:
         raise RunError(trainer.diverged)
     if stop.failed or summary.exit == stop.reason:  # otherwise the run was complete before the signal

@@ -19,7 +19,6 @@ from common.process.lifecycle import Stop
 from learner.broadcast import Broadcaster
 from learner.checkpoints import Checkpoints
 from learner.join_service import JoinService
-from learner.records.curve import draw_learning_curve
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
 from learner.trainer import Effects, Trainer
@@ -66,7 +65,8 @@ class LearnerService:
         """Train to the end; return the summary that was saved.
 
         Raises:
-            CoopError: the replay service rejected a request, gave an invalid answer, or could not save its state.
+            CoopError: the replay service rejected a request, gave an invalid answer, or could not save its state; or
+                there is no space for the closing epoch or the summary.
         """
         outcome = ""
         try:
@@ -180,8 +180,7 @@ class LearnerService:
                 else (stats.inserted, stats.lost, stats.duplicates)
             )
             summary = summarise(self._trainer, outcome, time.monotonic(), steps, lost, duplicates)
-            self._directory.summary(summary)
-            draw_learning_curve(self._directory.path, summary.title)
+            self._directory.conclude(summary, summary.title)
         finally:
             self._farewell(outcome)
         return summary

@@ -112,7 +112,10 @@ def _service(node: Node, joined: Joined, folder: ReplayFolder, console: Console)
     epochs = ReplayEpochs(folder.path, folder.run_id)
     if joined.anew:
         epochs.clear()
-        drop_journal(folder.journal)
+        try:
+            drop_journal(folder.journal)
+        except OSError as error:
+            raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
     first, found = epochs.restore(core, joined.epoch)
     if joined.config.replay.journal:
         number, carried_out = recover(core, folder.journal, first, folder.run_id)

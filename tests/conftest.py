@@ -1,6 +1,7 @@
 """Fixtures of real Zenoh sessions, and the check that a test session leaves nothing behind."""
 
 import os
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -61,6 +62,20 @@ def _left(before: tuple[set[int], set[str], set[threading.Thread]]) -> str:
     own = [thread for thread in threading.enumerate() if thread.name.startswith("pytest_timeout")]
     left += [f"thread {thread.name}" for thread in set(threading.enumerate()) - threads - set(own)]
     return ", ".join(left)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 256 KiB."""
+    if os.geteuid():
+        pytest.skip("mounting a small file system needs root")
+    path = tmp_path / "disk"
+    path.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(path)], check=True)
+    try:
+        yield path
+    finally:
+        subprocess.run(["umount", "--lazy", str(path)], check=True)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,8 +1,5 @@
 """The journal: what was acknowledged is there after a kill, torn ends are cut, a full disk loses nothing."""
 
-import os
-import subprocess
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +11,6 @@ from test_epochs import CONFIG, save
 from common.errors import RunError
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import DrawRequest
-from common.process.files import LineFile
 from common.types import EnvSpec
 from replay.core import ReplayCore, Wait
 from replay.persistence.epochs import ReplayEpochs
@@ -94,20 +90,6 @@ def test_files_that_epochs_cover(keep: bool, spec: EnvSpec, tmp_path: Path) -> N
     _assert_alike(core, twin)
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 256 KiB."""
-    if os.geteuid():
-        pytest.skip("mounting a small file system needs root")
-    path = tmp_path / "disk"
-    path.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(path)], check=True)
-    try:
-        yield path
-    finally:
-        subprocess.run(["umount", "--lazy", str(path)], check=True)
-
-
 def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
     journal = Journal(small_disk / "journal", 5, 1, keep=True)
     core, epochs = ReplayCore(CONFIG, spec, journal), ReplayEpochs(small_disk, 5, journal)
@@ -149,18 +131,3 @@ def test_priorities_are_carried_out_again(spec: EnvSpec, tmp_path: Path) -> None
     twin = ReplayCore(config, spec)
     recover(twin, tmp_path, 1, 5)
     _assert_alike(core, twin)
-
-
-def test_lines_wait_for_space(small_disk: Path) -> None:
-    lines = LineFile(small_disk / "lines", go_on=False)
-    (small_disk / "filler").write_bytes(bytes(250_000))
-    written = ""
-    while not lines.problem:
-        lines.write(line := f"line {len(written)}\n")
-        written += line
-    assert lines.problem == "No space left on device"
-    (small_disk / "filler").unlink()
-    lines.write("the end\n")
-    assert not lines.problem
-    lines.close()
-    assert (small_disk / "lines").read_text() == f"{written}the end\n"

@@ -51,7 +51,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 for _ in range(cell.config.total_steps):
                     for effects in run.play():
                         directory.record(effects.episodes, effects.metrics)
-                directory.summary(summarise(run.trainer, "complete", time.monotonic(), run.step))
+                directory.conclude(summarise(run.trainer, "complete", time.monotonic(), run.step), "a run")
             run.env.close()
     torn = folder / "edql-capacity=60-seed=0"
     torn.mkdir()

@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from common.process.files import NO_SPACE
+
 PROGRESS_EVERY = 10.0  # seconds
 STALL_AFTER = 5.0  # seconds without progress after which a line is printed
 RECENT = 16  # events kept for displays in other processes
@@ -28,7 +30,7 @@ class Console:
             line = stamped(text)
             last = self._recent[-1][0] if self._recent else 0
             self._recent.append((max(last + 1, time.time_ns() // 1_000_000), line))
-            print(line, flush=True)
+            say(line)
 
     def recent(self) -> list[list[int | str]]:
         """The newest events as [number, line]; numbers increase, also across restarts."""
@@ -46,7 +48,7 @@ class Console:
         if now >= self._progress_due:
             self._progress_due = now + PROGRESS_EVERY
             if not self._stall.reported:
-                print(stamped(line()), flush=True)
+                say(stamped(line()))
 
 
 class StallDetector:
@@ -92,6 +94,15 @@ class PeerMonitor:
         first, back = not self._seen, self._lost or where != self._seen
         self._seen, self._lost = where, False
         return f"{self._role} on {where} is back" if back and not first else ""
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Print a line. Where there is no space for it, Python's buffer keeps it for later: a full log ends no run."""
+    try:
+        print(text, end=end, flush=True)
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
 
 
 def stamped(text: str) -> str:

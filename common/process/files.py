@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import zlib
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Self
 
 from common.errors import RunError
 
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)  # error numbers
 PIECE = 1 << 24  # bytes read at once
 
 
@@ -50,7 +52,7 @@ class SyncedFile:
 
 
 class LineFile:
-    """A file that grows by whole lines. Lines that do not fit on the disk are kept, and written once there is space.
+    """A file that grows by whole lines or records. What does not fit on the disk is kept, and written once it does.
 
     problem: why lines are being kept; empty if none are.
     """
@@ -62,17 +64,25 @@ class LineFile:
 
     def write(self, text: str) -> None:
         """Append text that ends with a newline."""
-        self._late += text.encode()
+        self.append(text.encode())
+
+    def append(self, data: bytes) -> None:
+        """Append bytes that belong together."""
+        self._late += data
         try:
-            while self._late:
-                self._late = self._late[self._file.write(self._late) :]
+            self.finish()
             self.problem = ""
         except OSError as error:
             self.problem = error.strerror or str(error)
 
+    def finish(self) -> None:
+        """Write what is kept; raises OSError where there is still no space for it."""
+        while self._late:
+            self._late = self._late[self._file.write(self._late) :]
+
     def close(self) -> None:
         """Try once more to write kept lines, and close the file."""
-        self.write("")
+        self.append(b"")
         self._file.close()
 
 

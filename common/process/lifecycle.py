@@ -10,6 +10,7 @@ from collections.abc import Callable
 from types import FrameType
 
 from common.errors import CoopError, PeerLost
+from common.process.files import NO_SPACE
 
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -104,10 +105,24 @@ def run_main(program: str, main: Callable[[], None]) -> None:
     except CoopError as error:
         print(f"{program}: error: {error}", file=sys.stderr, flush=True)
         sys.exit(error.exit_status)
-    except BrokenPipeError:
-        # The reader of the output has gone; the interpreter must not try to flush the rest.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader of the output has gone
+        _give_up_output()
+        sys.exit(1)
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
+        print(f"{program}: error: {error.filename or 'output'}: {error.strerror}", file=sys.stderr, flush=True)
         sys.exit(1)
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr, flush=True)
         sys.exit(status_after(signal.SIGINT))
+    finally:
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _give_up_output()
+
+
+def _give_up_output() -> None:
+    """Keep the interpreter from flushing what is left, which fails and changes the exit status."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

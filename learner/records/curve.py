@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from common.process.files import write_atomic
 from common.returns import RETURN_WINDOW, running_mean
 
 
 def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
-    """Draw the curve of a run directory to `learning_curve.png` there; None if no episode has ended."""
+    """Draw the curve of a run directory to `learning_curve.png` there; None if no episode has ended. Raises OSError."""
     with (run_dir / "episodes.csv").open(encoding="utf-8") as file:
         rows = [(int(row["env_step"]), float(row["return"])) for row in csv.DictReader(file)]
     if not rows:
@@ -22,7 +24,11 @@ def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
 
 
 def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path) -> Path:
-    """Draw returns [episodes] against the environment steps [episodes] at which the episodes ended, as a PNG."""
+    """Draw returns [episodes] against the environment steps [episodes] at which the episodes ended, as a PNG.
+
+    Raises:
+        OSError: it can't be written; an older one is untouched then.
+    """
     import matplotlib as mpl  # noqa: PLC0415 (half a second, needed once at the end)
 
     mpl.use("Agg")
@@ -34,6 +40,8 @@ def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path) -> 
     axes.set(xlabel="environment steps", ylabel="return", title=title)
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    content = io.BytesIO()
+    figure.savefig(content, dpi=120)
     plt.close(figure)
+    write_atomic(path, content.getvalue())
     return path

@@ -12,10 +12,12 @@ from types import TracebackType
 from typing import Any, Self
 
 from common.errors import RunError
+from common.process.console import say
 from common.process.files import LineFile, truncate, write_atomic
 from common.process.run_ids import draw_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.tables import to_toml
+from learner.records.curve import draw_learning_curve
 from learner.records.summary import Summary
 from learner.records.tensorboard import TensorBoardWriter
 from learner.trainer import EpisodeRow
@@ -72,9 +74,23 @@ class RunDirectory:
             if name != "env_step" and isinstance(value, int | float):
                 self._tensorboard.add(f"train/{name}", value, row["env_step"])
 
-    def summary(self, summary: Summary) -> None:
-        """Write summary.json atomically."""
-        write_atomic(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
+    def conclude(self, summary: Summary, title: str) -> None:
+        """Write the lines that are left, then summary.json, and draw the learning curve, which a run can do without.
+
+        Raises:
+            RunError: there is no space for lines or summary; says how the run has ended all the same.
+        """
+        try:
+            for file in (self._episodes, self._metrics):
+                file.finish()
+            write_atomic(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
+        except OSError as error:
+            # Whatever has ended the run must be told, too.
+            raise RunError(f"{self.path}: {error.strerror or error}; how the run ended: {summary.exit}") from error
+        try:
+            draw_learning_curve(self.path, title)
+        except OSError as error:
+            say(f"{self.path}: no learning curve: {error.strerror or error}")
 
     def sizes(self) -> dict[str, int]:
         """The present sizes of the growing files, in bytes."""
@@ -88,9 +104,9 @@ class RunDirectory:
 
     def _look(self) -> None:
         """Report once that the disk is full, and once that it has space again; no line is lost in between."""
-        problem = self._episodes.problem or self._metrics.problem
+        problem = self._episodes.problem or self._metrics.problem or self._tensorboard.problem
         if problem != self._problem:
-            print(f"{self.path}: {problem or 'can be written again'}", flush=True)
+            say(f"{self.path}: {problem or 'can be written again'}")
         self._problem = problem
 
     def __enter__(self) -> Self:

@@ -1,32 +1,53 @@
-"""Writes a run's TensorBoard file, which may end early if the disk is full."""
+"""Writes a run's TensorBoard file."""
 
 from __future__ import annotations
 
-import contextlib
+import os
+import socket
+import time
 from pathlib import Path
 
-from torch.utils.tensorboard import SummaryWriter
+from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+from common.process.files import LineFile
 
 
 class TensorBoardWriter:
-    """Writes scalars for TensorBoard in a separate thread; a failure ends the file, not the run."""
+    """Writes scalars for TensorBoard, which wait for space as a run's lines do.
 
-    def __init__(self, path: Path) -> None:
-        self._writer: SummaryWriter | None = SummaryWriter(str(path))
+    PyTorch's `SummaryWriter` has a thread of its own, and that one dies of a full disk.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Begin a file; raises OSError where it can't be."""
+        folder.mkdir(parents=True, exist_ok=True)
+        name = f"events.out.tfevents.{int(time.time()):010}.{socket.gethostname()}.{os.getpid()}"
+        self._file = LineFile(folder / name, go_on=True)
+        self._records = RecordWriter(_Records(self._file))
+        self._add(Event(wall_time=time.time(), file_version="brain.Event:2"))
+
+    @property
+    def problem(self) -> str:
+        """Why scalars are being kept; empty while none are."""
+        return self._file.problem
 
     def add(self, name: str, value: float, step: int) -> None:
         """Add one value."""
-        if self._writer is None:
-            return
-        try:
-            self._writer.add_scalar(name, value, step)
-        except OSError as error:
-            print(f"TensorBoard's file ends here: {error.strerror or error}", flush=True)
-            self.close()
+        summary = Summary(value=[Summary.Value(tag=name, simple_value=value)])
+        self._add(Event(wall_time=time.time(), step=step, summary=summary))
 
     def close(self) -> None:
-        """Write the remaining values."""
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            with contextlib.suppress(OSError):
-                writer.close()
+        """Write what is left."""
+        self._file.close()
+
+    def _add(self, event: Event) -> None:
+        self._records.write(event.SerializeToString())
+
+
+class _Records:
+    """What a `RecordWriter` takes for a file; it writes each record at once."""
+
+    def __init__(self, file: LineFile) -> None:
+        self.write = file.append
