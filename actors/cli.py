@@ -13,7 +13,7 @@ from actors.policy import Policy
 from actors.service import ActorService
 from common.envs.make import make_vector_env
 from common.errors import JoinError
-from common.messaging.joining import Membership, join, take_leave
+from common.messaging.joining import Membership, join, leave_run
 from common.messaging.messages.join import Join, Joined
 from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
@@ -58,7 +58,7 @@ def _run() -> None:
             if joined is not None:
                 _play(node, stop, options, request, joined, console)
         finally:
-            take_leave(node, request)
+            leave_run(node, request)
     stop.leave()
 
 

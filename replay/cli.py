@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from common.errors import RunError
-from common.messaging.joining import Membership, join, take_leave
+from common.messaging.joining import Membership, join, leave_run
 from common.messaging.messages.join import MOST_EPOCHS, Join, Joined
 from common.messaging.presence import LEASE
 from common.messaging.transport import Node, locators, new_incarnation, open_session
@@ -94,7 +94,7 @@ def _serve(
         service.start()
         service.run(stop, console)
     if not stop.failed:
-        take_leave(node, request)
+        leave_run(node, request)
     service.close()
     console.event(f"{stop.reason}; {service.progress()}")
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from common.errors import RunError
 from common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
@@ -17,6 +16,7 @@ from common.types import Array, Batch, EnvSpec, Segment
 from replay.dedup import DuplicateFilter
 from replay.episodes import EpisodeLog
 from replay.limiter import RateLimiter
+from replay.recorder import NullRecorder, Recorder
 from replay.table.table import PinnedBatch, Table, TableSnapshot
 
 LEARNERS_KEPT = 64  # superseded learners, which are refused
@@ -27,36 +27,6 @@ class Wait:
     """The request is not admitted now; `reason` says why."""
 
     reason: str
-
-
-class Recorder(Protocol):
-    """Records the changes of a core, in order, before the requests are answered."""
-
-    def insert(self, payload: bytes) -> None:
-        """Record an insert request that is about to be applied.
-
-        Raises:
-            OSError: it could not be recorded, and must not be applied.
-        """
-
-    def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
-        """Record a draw and the ids of its transitions, int64 [batch]; never fails, because the draw has happened."""
-
-    def limit(self, limiter: RateLimiter) -> None:
-        """Record new settings of the limiter; raises OSError as `insert`."""
-
-
-class NullRecorder:
-    """The recorder of a core without a journal."""
-
-    def insert(self, payload: bytes) -> None:
-        """See `Recorder`."""
-
-    def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
-        """See `Recorder`."""
-
-    def limit(self, limiter: RateLimiter) -> None:
-        """See `Recorder`."""
 
 
 class CoreSnapshot(NamedTuple):

@@ -9,7 +9,7 @@ from samples import make_segment
 
 from common.errors import JoinError
 from common.messaging import joining, wire
-from common.messaging.joining import difference, join, take_leave
+from common.messaging.joining import difference, join, leave_run
 from common.messaging.keys import join_key, replay_key
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join, Joined, Leave
@@ -127,11 +127,11 @@ def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, m
     assert not join_service.departure.is_due
     assert actor.ask(join_key(actor, "replay"), payload).kind == "farewell"
     assert join(actor, Stop(), other, (), 5) is not None
-    take_leave(actor, Join("actor", 3, []))
+    leave_run(actor, Join("actor", 3, []))
     with pytest.raises(JoinError, match=r"the replay service on rep \(pid 8\) has taken over from this one"):
         join(actor, Stop(), replace(service, index=0), (), 5)
     join_service.departure.end()
-    take_leave(actor, other)
+    leave_run(actor, other)
     assert events == [
         "replay service on rep (pid 7) joined; it listens on tcp/rep:1",
         "replay service on rep (pid 8) joined; it listens on tcp/rep:1",

@@ -91,7 +91,7 @@ def ask_to_join(node: Node, request: Join) -> Joined | str:
         raise JoinError(f"the learner of run {node.run!r} refused: {error}") from error
 
 
-def take_leave(node: Node, request: Join) -> None:
+def leave_run(node: Node, request: Join) -> None:
     """Tell the learner that this process stops, and wait until the learner no longer needs it.
 
     Returns after `LEAVE_WITHIN` seconds at the latest, and at once if there is no learner.
