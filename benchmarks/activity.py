@@ -1,8 +1,8 @@
-"""Do the layers of a run's networks tell states apart? `python benchmarks/activity.py RUN_DIR`.
+"""Shows whether the layers of a run's networks distinguish states: `python benchmarks/activity.py RUN_DIR`.
 
-Shows the acting network of the newest epoch, and for comparison the same network as the run began, the states that the
-replay service's part of the epoch holds: after every ReLU the share of its units that are positive, and the standard
-deviation over states of a unit (mean over units); then that of the greatest Q-value, and how often each action is best.
+Evaluates the acting network of the newest epoch, and for comparison the same network at the run's beginning, on the
+states in the replay service's part of the epoch. Prints, after every ReLU, the share of positive units and the standard
+deviation of a unit over states (mean over units); then that of the greatest Q-value, and how often each action is best.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""An actor process beside a bare loop of the same emulators and network: `python benchmarks/actor.py`.
+"""Compares an actor process with a bare loop of the same emulators and network: `python benchmarks/actor.py`.
 
-The actor is a real `coop-actor` that publishes to a real `coop-replay`; it is stopped by signal while the bare loop, in
-a process of its own, takes its turn: emulation alone, inference alone, then both, and both in two processes at once.
-Ratios are taken in each round, so that they hold on a busy machine, and also from processor time, of all threads of the
-process; printed are medians with their range.
+The actor is a real `coop-actor` that inserts into a real `coop-replay`; a signal stops it while the bare loop, in its
+own process, takes its turn: emulation alone, inference alone, then both, and both in two processes at once.
+Ratios are taken in each round, so that they hold on a busy machine, both of wall time and of the processor time of all
+threads of the process. Prints medians with their range.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from learner.shared_epochs import SharedEpochs
 
 EPSILON = 0.1
 RUN = "bench"
-LOOK_EVERY = 0.02  # seconds; each look at the replay service's count costs the topology a little processor time
+LOOK_EVERY = 0.02  # seconds; each request for the replay service's count costs the topology a little processor time
 
 
 class Figures(NamedTuple):
-    """Seconds for a step, and of them those in the emulators and those in the network; processor seconds for a step."""
+    """Seconds per step, in all, in the emulators and in the network; processor seconds per step."""
 
     step: float
     emulation: float
@@ -55,7 +55,7 @@ class Figures(NamedTuple):
 
 
 def run_config(envs: int, dtype: str) -> RunConfig:
-    """Breakout as Mnih played it late in a run, with a limiter that never says no."""
+    """Breakout as Mnih et al. played it late in a run, with a limiter that admits everything."""
     tables = load_tables("breakout", None)
     tables["replay"] |= {"capacity": 20_000, "learning_starts": 1000, "tolerance": 1e12}
     tables["actor"] |= {"envs": envs, "epsilon_start": EPSILON, "epsilon_final": EPSILON}
@@ -115,7 +115,7 @@ class BareLoops:
 
 
 class Topology:
-    """A learner that only talks (this process), a replay service, and one actor that is stopped between turns."""
+    """A learner that does not train (this process), a replay service, and one actor that is stopped between turns."""
 
     def __init__(self, stack: ExitStack, config: RunConfig, folder: Path) -> None:
         head, replay = free_endpoint(), free_endpoint()
@@ -139,7 +139,7 @@ class Topology:
         self._actor.send_signal(signal.SIGSTOP)
 
     def figures(self, seconds: float) -> tuple[float, float]:
-        """Seconds and processor seconds for a step that the actor inserts, from one change of the count to another."""
+        """Seconds and processor seconds per step that the actor inserts, measured between two changes of the count."""
         self._actor.send_signal(signal.SIGCONT)
         changes = [(time.perf_counter(), self._processor_seconds(), self._inserted())]
         while len(changes) < 4 or changes[-1][0] - changes[0][0] < seconds:
@@ -147,7 +147,7 @@ class Topology:
             if (count := self._inserted()) != changes[-1][2]:
                 changes.append((time.perf_counter(), self._processor_seconds(), count))
         self._actor.send_signal(signal.SIGSTOP)
-        # The first turn after the stop is not whole.
+        # The first turn after the stop is incomplete.
         seconds, processor, steps = (last - first for first, last in zip(changes[1], changes[-1], strict=True))
         return seconds / steps, processor / steps
 

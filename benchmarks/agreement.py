@@ -1,9 +1,9 @@
-"""Do two studies learn alike? `python benchmarks/agreement.py STUDY STUDY`, each a folder of runs or a packed study.
+"""Tests whether two studies learn alike: `python benchmarks/agreement.py STUDY STUDY`, folders or packed studies.
 
 For every method, both studies' returns against environment steps: the mean over runs (sd over runs) of the episodes
-that ended in each tenth of the run. Then the area under each run's curve, and the share of all ways to deal the runs
-into two groups of these sizes in which the mean areas are at least as far apart (a permutation test): a small share
-says that the studies differ by more than seeds do.
+that ended in each tenth of the run. Then a permutation test on the area under each run's curve: the share of all
+divisions of the runs into two groups of these sizes in which the mean areas are at least as far apart. A small share
+means that the studies differ by more than seeds do.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def curves(folder: Path) -> dict[str, Curves]:
 
 
 def permutation_share(first: Curves, second: Curves) -> float:
-    """Share of the ways to deal the runs in which the mean areas are at least as far apart as here."""
+    """Share of the divisions of the runs in which the mean areas are at least as far apart as here."""
     areas, count = np.concatenate([first, second]).mean(1), len(first)
     gaps = []
     for chosen in itertools.combinations(range(len(areas)), count):

@@ -1,7 +1,7 @@
 """Short runs of the Atari presets over the real topology: `python benchmarks/atari_runs.py`.
 
-Each is `coop-local --preset GAME --total-steps 20000 --actors 2`. Printed are what the run lost, how far the replay
-ratio drifted, and a line fitted to the replay process's resident memory against the transitions that it held.
+Each is `coop-local --preset GAME --total-steps 20000 --actors 2`. Prints the run's losses, the drift of the replay
+ratio, and a line fitted to the replay process's resident memory against the number of transitions that it held.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def play(preset: str, method: str, steps: int, actors: int, folder: Path) -> tup
 
 
 def report(preset: str, steps: int, folder: Path, memory: Array) -> None:
-    """Print what a finished run shows."""
+    """Print the results of a finished run."""
     summary = json.loads((folder / "summary.json").read_text())
     lost, twice = summary["transitions_lost"], summary["duplicates_refused"]
     print(f"  lost {lost}, duplicates refused {twice}, transitions {summary['transitions_accepted']:,}")

@@ -1,4 +1,4 @@
-"""Counts what is missing and what is there twice in a CartPole run's table, not by its books but by what it holds.
+"""Counts missing and duplicate transitions in a CartPole run's table by its contents, not by its counters.
 
 The table of the closing epoch must hold the whole run (a capacity that was never reached).
 """
@@ -17,7 +17,7 @@ RESET = 0.05  # CartPole begins an episode with all four numbers within this
 def audit(run_dir: Path) -> tuple[int, int]:
     """(gaps, transitions held more than once).
 
-    A gap is an observation that no transition leads to and that begins no episode: something before it is missing.
+    A gap is an observation without a predecessor that begins no episode: the transition before it is missing.
     """
     (table,) = run_dir.glob("checkpoints/*/replay")
     slots, frames = np.load(table / "slots.npy"), np.load(table / "frames.npy")

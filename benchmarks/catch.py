@@ -1,4 +1,4 @@
-"""Does every method solve catch within ten minutes? `python benchmarks/catch.py`.
+"""Tests whether every method solves catch within ten minutes: `python benchmarks/catch.py`.
 
 Runs `coop-local --preset catch --method M --actors 1 --target-return 0.9` for each method, so a run stops once the
 mean return of its last 100 episodes, played with the run's own epsilon, reaches 0.9 of the maximum of 1.

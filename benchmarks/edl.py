@@ -1,12 +1,12 @@
-"""Time whole training updates: error-driven learning against backpropagation, by hand and by autograd.
+"""Times whole training updates: error-driven learning against backpropagation, hand-written and by autograd.
 
     python benchmarks/edl.py [--rounds 15]
 
-One thread, float32, batch 32. An update is the learner's: it takes a drawn batch of transitions and makes targets,
-forward pass, feedback and RMSProp step. The methods of a network take turns in one process, each with its own networks;
-a round gives each one turn. Printed are the median milliseconds and the ratio to the hand-written gradient's ("none"),
-with its lowest and highest value over five blocks. Yardsticks: "autograd" is the same update as PyTorch users write it,
-"weight-gradient svd" calls an SVD on each weight gradient.
+One thread, float32, batch 32. An update is the learner's: from a batch of transitions it computes targets, forward
+pass, feedback and RMSProp step. The methods of a network take turns in one process, each with its own networks; each
+round gives every method one turn. Prints the median milliseconds and the ratio to the hand-written gradient ("none"),
+with its lowest and highest value over five blocks. For reference, "autograd" is the same update as PyTorch users write
+it, and "weight-gradient svd" computes an SVD of each weight gradient.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Update = Callable[[], object]
 
 
 def random_batch(spec: EnvSpec) -> Batch:
-    """A batch of transitions that share no frame but within a transition."""
+    """A batch of transitions that share no frames with each other."""
     rng = np.random.default_rng(0)
     span = spec.stack + 1
     shape = (BATCH * span, *spec.frame_shape)
@@ -58,7 +58,7 @@ def random_batch(spec: EnvSpec) -> Batch:
 
 
 def settings(kind: str, method: str, double: bool) -> RunConfig:
-    """A run whose learner uses the feedback that `method` names."""
+    """The config of a run whose learner uses the feedback `method`."""
     feedback, _, dtype = method.partition(" ")
     gradient = method == "none" or feedback == "autograd" or dtype == "svd"
     edl = {"rate": RATE, "polar_dtype": "bfloat16" if dtype == "bf16" else "float32"}
@@ -85,7 +85,7 @@ class SvdRule(FeedbackRule):
 
 
 def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:
-    """A call of it is one update on the same batch."""
+    """Make a function that does one update, always on the same batch."""
     batch, config = random_batch(spec), settings(kind, method, double)
     if method == "autograd":
         return autograd(config, spec, batch)

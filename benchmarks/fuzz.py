@@ -1,12 +1,12 @@
 """Floods a live replay service and a live learner with hostile messages: `python benchmarks/fuzz.py --messages 200000`.
 
-Half of them arrive while an actor plays. Then the actor leaves, everything is written down, the other half arrives, and
-everything must be as it was, byte for byte: the table with its books and random state, both networks, the role. Every
-broken message must be refused and counted. Then the actor comes back and the run must go on, with nothing lost.
+Half of the messages arrive while an actor plays. Then the actor leaves, the state is recorded, the other half arrives,
+and the state must be unchanged, byte for byte: the table with its counters and random state, both networks, the role.
+Every broken message must be refused and counted. Then the actor returns and the run must go on, with nothing lost.
 
-At last come valid ones, of those that an actor's certificate may send: every number as large as it may be, and the
-mutations that left a message valid. They may waste the run's time and spoil what it learns; but the run goes on, its
-actor is served, and another one may join. Exit status 1 if not.
+Finally come valid messages that an actor's certificate may send: with every number at its largest allowed value, and
+mutations that left a message valid. They may waste the run's time and spoil its learning, but the run must go on, its
+actor must be served, and another actor must be able to join. Otherwise the exit status is 1.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from common.messaging.transport import Node, Pending, Refused, new_incarnation, 
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
 
-EPOCH = 1  # a snapshot says for which it is: the same one before and after
-WINDOW = 64  # broken messages under way at once
-QUIET = 2.0  # seconds without a change that count as rest
-VALID_EVERY = 15  # broken messages for one that stays valid
-RAW_EVERY = 1000  # broken messages between connections that do not even speak Zenoh
+EPOCH = 1  # the same number in the snapshots before and after
+WINDOW = 64  # broken messages in flight
+QUIET = 2.0  # seconds without a change that count as idle
+VALID_EVERY = 15  # broken messages for each valid one
+RAW_EVERY = 1000  # broken messages between connections that send other data than Zenoh's
 
 
 class Flood:
-    """Sends broken messages and keeps count of them by owner."""
+    """Sends broken messages, and counts them by the role that must refuse them."""
 
     def __init__(self, node: Node, targets: list[Target], rng: random.Random, ports: list[int]) -> None:
         self.sent: Counter[str] = Counter()
@@ -58,7 +58,7 @@ class Flood:
         self._outstanding: deque[Pending] = deque()
 
     def send(self, count: int) -> None:
-        """Send `count` of them; raises RunError where one is not refused."""
+        """Send `count` broken messages; raises RunError if one is not refused."""
         for number in range(count):
             target = self._rng.choice(self._targets)
             payload = bytearray(self._broken(target))
@@ -90,7 +90,7 @@ class Flood:
         return message.run == RUN
 
     def still_valid(self, count: int) -> Iterator[tuple[str, bytes]]:
-        """Key and payload of `count` mutations that leave a public message valid."""
+        """Yield key and payload of `count` mutations that leave a public message valid."""
         public = [target for target in self._targets if target.public]
         while count:
             target = self._rng.choice(public)
@@ -100,7 +100,7 @@ class Flood:
                 yield target.key, payload
 
     def send_valid(self, messages: list[tuple[str, bytes]]) -> None:
-        """Send valid messages, and wait for their answers, whatever these say."""
+        """Send valid messages, and wait for any answers."""
         for key, payload in messages:
             self._outstanding.append(self._node.begin(key, bytearray(payload), timeout=60.0))
             if len(self._outstanding) >= WINDOW:
@@ -109,7 +109,7 @@ class Flood:
             self._settle_valid()
 
     def _settle_valid(self) -> None:
-        with contextlib.suppress(Refused):  # a number that nobody has been given, for example
+        with contextlib.suppress(Refused):  # for example, an actor number that was never given
             self._outstanding.popleft().wait()
 
     def _settle(self) -> None:
@@ -120,14 +120,14 @@ class Flood:
         raise RunError(f"a broken message was taken, and answered with {answer.kind}")
 
     def _knock(self) -> None:
-        """Connect to each port and say something that is no Zenoh."""
+        """Connect to each port and send data that are not Zenoh's."""
         for port in self._ports:
             with socket.create_connection(("127.0.0.1", port)) as stranger:
                 stranger.sendall(self._rng.randbytes(self._rng.choice((1, 3, 100, 5000))))
 
 
 class Watch:
-    """What the live roles tell of themselves."""
+    """The state of the live roles, by their own account."""
 
     def __init__(self, node: Node, folder: Path) -> None:
         self.node = node
@@ -136,7 +136,7 @@ class Watch:
         self._told: dict[str, Any] = {}
 
     def steps(self) -> int:
-        """Transitions in the books of the replay service."""
+        """The replay service's count of transitions."""
         return replay_stats(self.node).inserted
 
     def learner(self, field: str) -> int:
@@ -147,7 +147,7 @@ class Watch:
         return int(self._told.get(field, 0))
 
     def rest(self) -> None:
-        """Wait until table and learner stand still."""
+        """Wait until table and learner are idle."""
         state, since = None, time.monotonic()
         while time.monotonic() - since < QUIET:
             stats = replay_stats(self.node)
@@ -157,7 +157,7 @@ class Watch:
             time.sleep(0.1)
 
     def everything(self) -> dict[str, bytes]:
-        """The state of both roles, in bytes."""
+        """The states of both roles, as bytes."""
         key = replay_key(self.node, "snapshot")
         self.node.ask(key, Snapshot(EPOCH, []).encode(RUN), 60.0)
         while self.node.ask(key, Written(EPOCH).encode(RUN), 60.0).kind == "retry":
@@ -173,7 +173,7 @@ class Watch:
 
 
 def fuzz(count: int, seed: int, folder: Path) -> None:
-    """Raise a CoopError where something is not as it should be."""
+    """Raise a CoopError if a check fails."""
     at = free_endpoint(), free_endpoint()
     ports = [int(endpoint.rpartition(":")[2]) for endpoint in at]
     flags = ("--preset=cartpole", "--total-steps=100000000", "--replay.ratio=0.1")
@@ -220,12 +220,12 @@ def fuzz(count: int, seed: int, folder: Path) -> None:
         stats = replay_stats(node)
         print(f"the run went on to {stats.inserted:,} steps: lost {stats.lost}, duplicated {stats.duplicates}")
         if stats.lost or stats.duplicates:
-            raise RunError("the books of the run are wrong")
+            raise RunError("the counters of the run are wrong")
         survive(roles, watch, flood, [*extremes(node, joined.spec), *flood.still_valid(count // VALID_EVERY)], at[0])
 
 
 def survive(roles: Roles, watch: Watch, flood: Flood, messages: list[tuple[str, bytes]], learner_at: str) -> None:
-    """Raise a CoopError where valid messages stop the run, its actor, or another one that wants to join."""
+    """Raise a CoopError if valid messages stop the run, its actor, or another actor that joins."""
     with ActorWatch(RUN, learner_at) as actors:
         wait_until("the actor's status", lambda: bool(actors.acked()))
         flood.send_valid(messages)

@@ -1,8 +1,8 @@
-"""What the journal costs: `python benchmarks/journal.py`. Atari segments, with journal and without.
+"""The cost of the journal: `python benchmarks/journal.py` inserts Atari segments with and without a journal.
 
 Real `coop-replay` processes on TCP, one inserting client with a window of 16 segments. Both services take turns
-for a second each, so that the ratio holds on a busy machine; beside transitions/s stands the processor time that the
-service spent on them, which does not depend on who else is busy. After each turn an epoch drops the journal's files.
+for a second each, so that the ratio holds on a busy machine. Prints transitions/s and the processor time that the
+service spent on them, which other load affects less. After each turn an epoch releases the journal's files.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Steps per second of lockstep runs against Stable-Baselines3's DQN: `python benchmarks/lockstep.py [--rounds 15]`.
 
 CartPole, one update per step, batch 32, three hidden layers of 128, one thread, no double-style targets (theirs has
-none). All run in one process and take turns: a round plays the same number of steps with each. Printed are the median
-steps per second and the median ratio to Stable-Baselines3's of the same round, with its quartiles. Needs the extra
-`bench`.
+none). All run in one process and take turns: a round plays the same number of steps with each. Prints the median steps
+per second, and the median ratio to Stable-Baselines3 in the same round with its quartiles. Needs the extra `bench`.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
 
 METHODS = ("dqn", "edql", "g-coop", "coop")
-WARM_UP = 500  # steps, more than either waits for before it learns
+WARM_UP = 500  # steps, more than either collects before it learns
 
 
 def rival() -> Callable[[int], None]:
-    """Plays that many steps with Stable-Baselines3's DQN, set up as the preset is."""
+    """Make a function that plays a number of steps with Stable-Baselines3's DQN, configured like the preset."""
     model = DQN(
         "MlpPolicy",
         gymnasium.make("CartPole-v1", max_episode_steps=200),
@@ -55,7 +54,7 @@ def rival() -> Callable[[int], None]:
 
 
 def ours(method: str, path: Path) -> Callable[[int], None]:
-    """Plays that many steps in lockstep, files included."""
+    """Make a function that plays a number of steps in lockstep, including the run's files."""
     config = base_config(["--preset", "cartpole", "--method", method])
     run = Lockstep(replace(config, learner=replace(config.learner, double=False)))
     directory = RunDirectory(path, run.config)

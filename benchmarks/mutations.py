@@ -1,4 +1,4 @@
-"""Breaks messages: bytes flipped, cut, spliced or invented, and headers that say something else."""
+"""Breaks messages: flips, cuts, splices or invents bytes, and changes headers."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _NASTY: tuple[Any, ...] = (
 
 
 def mutate(rng: random.Random, payload: bytes, others: Sequence[bytes]) -> bytes:
-    """One way or another to break `payload`; the result may still be a valid message."""
+    """Break `payload` in a random way; the result may still be a valid message."""
     return rng.choice(_WAYS)(rng, payload, others)
 
 
 def _flip(rng: random.Random, payload: bytes, others: Sequence[bytes]) -> bytes:
-    """Change a few bytes, of the header more often than their share."""
+    """Change a few bytes, preferably of the header."""
     broken = bytearray(payload)
     end = len(broken) if rng.random() < 0.5 else min(len(broken), 200)
     for _ in range(rng.randint(1, 8)):
@@ -43,7 +43,7 @@ def _splice(rng: random.Random, payload: bytes, others: Sequence[bytes]) -> byte
 
 
 def _move(rng: random.Random, payload: bytes, others: Sequence[bytes]) -> bytes:
-    """Send what belongs to another key."""
+    """Send another key's message."""
     return rng.choice(others)
 
 
@@ -57,7 +57,7 @@ def _prefix(rng: random.Random, payload: bytes, others: Sequence[bytes]) -> byte
 
 
 def _header(rng: random.Random, payload: bytes, others: Sequence[bytes]) -> bytes:
-    """Replace, drop or add one value of the header, however deep, and keep the arrays in their places."""
+    """Replace, drop or add one value of the header, at any depth, and keep the arrays' positions."""
     _, length = _PREFIX.unpack_from(payload)
     start = -(-(_PREFIX.size + length) // wire.ALIGNMENT) * wire.ALIGNMENT
     header = msgpack.unpackb(payload[_PREFIX.size : _PREFIX.size + length], raw=False)

@@ -1,8 +1,8 @@
 """Cuts the link between two hosts under load: `python benchmarks/netns.py --cut 20` (root).
 
 The hosts are network namespaces joined by a veth pair: learner and replay service in one, actors in the other. The link
-is cut at one end, then in another run at the other; each time everybody must be at work again within 5 s of its return,
-and the table must hold every step once. Exit status 1 if not.
+is cut at one end, and in another run at the other end. Each time every role must work again within 5 s after its
+return, and the table must hold every step once. Otherwise the exit status is 1.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ INSIDE = "COOP_NETNS"  # set in the process that runs inside the head's namespac
 
 
 def ip(*words: str) -> None:
-    """Run `ip`; raises RunError with its complaint."""
+    """Run `ip`; raises RunError with its error message."""
     done = subprocess.run(["ip", *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise RunError(f"ip {' '.join(words)}: {done.stderr.strip()}")
@@ -43,7 +43,7 @@ def ip(*words: str) -> None:
 
 @contextmanager
 def two_hosts() -> Iterator[tuple[str, str]]:
-    """Names of two namespaces that reach each other."""
+    """Make two connected namespaces; yields their names."""
     head, far = names = f"coop-head-{os.getpid()}", f"coop-far-{os.getpid()}"
     try:
         for name in names:
@@ -60,7 +60,7 @@ def two_hosts() -> Iterator[tuple[str, str]]:
 
 
 def cut_and_mend(folder: Path, end: str, host: str, far: str, seconds: float) -> None:
-    """Inside the head's namespace: cut the link at one end; a CoopError where something is not as it should be."""
+    """Inside the head's namespace, cut the link at one end; raises a CoopError if a check fails."""
     flags = ("--preset=cartpole", "--total-steps=100000000", "--replay.capacity=200000")
     roles = Roles(folder, RUN, AT, flags, ACTORS, lambda role: ["ip", "netns", "exec", far] if role == "actor" else [])
     with (
@@ -103,7 +103,7 @@ def cut_and_mend(folder: Path, end: str, host: str, far: str, seconds: float) ->
 
 
 def main() -> None:
-    """Make the hosts, then run inside the first."""
+    """Make the hosts, and run this script inside the first one."""
     parser = argparse.ArgumentParser(description="Cut the link between two hosts under load.")
     parser.add_argument("--cut", type=float, default=20.0, help="seconds")
     seconds = parser.parse_args().cut

@@ -1,9 +1,9 @@
 """Speed of the replay service over Zenoh on loopback: `python benchmarks/replay_service.py`.
 
-A real `coop-replay` process, two inserting processes and one sampling client (this process), on TCP and on shared
-memory. Beside them stands the yardstick: bare Zenoh with numpy, a process that gathers the same number of frames from
-a ring and copies segments into it, with no checks, books or limiter. Both take turns in every round, so that the ratios
-hold on a busy machine. Printed are medians with their range over the rounds.
+A real `coop-replay` process, two inserting processes and one sampling client (this process), over TCP and shared
+memory. The reference is bare Zenoh with numpy: a process that gathers the same number of frames from a ring and copies
+segments into it, without checks, counters or limiter. Both take turns in every round, so that the ratios hold on a busy
+machine. Prints medians with their range over the rounds.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ FRAMES = BATCH * (ATARI.stack + 1)  # of a batch without repeats
 FRAME_BYTES = 84 * 84
 RUN = "bench"
 MODES = ("coop", "bare")
-WINDOW = 16  # segments of an inserting process under way, as of an actor with 8 emulators
-# A run whose limiter never says no.
+WINDOW = 16  # segments of an inserting process in flight, as many as an actor with 8 emulators has
+# A run whose limiter admits everything.
 CONFIG = validated(
     {
         "run": RUN,
@@ -56,7 +56,7 @@ CONFIG = validated(
 
 
 def bare_server(endpoint: str, shared_memory: bool, end: Connection) -> None:
-    """Gather and copy with numpy behind two queryables, each with a thread of its own (Zenoh's callbacks)."""
+    """Gather and copy with numpy in two queryables, each in its own thread (Zenoh's callbacks)."""
     ring = np.ones((CAPACITY, FRAME_BYTES), np.uint8)
     keep_freed_memory()
     rng = np.random.default_rng(0)
@@ -68,7 +68,7 @@ def bare_server(endpoint: str, shared_memory: bool, end: Connection) -> None:
     def sample(query: zenoh.Query) -> None:
         nonlocal drawn
         with query:
-            # mode: without it numpy gathers into a buffer of its own first
+            # mode: without it numpy first gathers into a buffer
             np.take(ring, picks[drawn % 1000].reshape(-1), axis=0, out=out, mode="clip")
             drawn += 1
             query.reply("bare/sample", payload)
@@ -91,7 +91,7 @@ def bare_server(endpoint: str, shared_memory: bool, end: Connection) -> None:
 
 
 def inserter(endpoints: tuple[str, ...], shared_memory: bool, end: Connection) -> None:
-    """Insert on demand; answers each `Work` with the transitions that were acknowledged."""
+    """Insert on demand; answers each `Work` with the number of transitions acknowledged."""
     incarnation = new_incarnation()
     stream = (msgspec.structs.replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
     bare = encode_segment(RUN, next(segments(ATARI, STEPS)))
@@ -126,14 +126,14 @@ def inserter(endpoints: tuple[str, ...], shared_memory: bool, end: Connection) -
 
 
 class BareSampler:
-    """Keeps `PREFETCH` bare draws under way."""
+    """Keeps `PREFETCH` bare draws in flight."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._waiting = deque(self._ask() for _ in range(PREFETCH))
 
     def next(self) -> object:
-        """Frames of one batch, uint8 [FRAMES, FRAME_BYTES]."""
+        """The frames of one batch, uint8 [FRAMES, FRAME_BYTES]."""
         reply = self._waiting.popleft().recv()
         self._waiting.append(self._ask())
         assert reply.ok is not None
@@ -189,11 +189,11 @@ class Bench:
             self.sample(mode, 1.0, 1000.0)
 
     def insert(self, mode: str, seconds: float) -> float:
-        """Transitions/s inserted by both, as fast as they can."""
+        """Transitions/s that both processes insert at full speed."""
         return sum(self._work(mode, seconds, math.inf, lambda: None))
 
     def sample(self, mode: str, seconds: float, rate: float) -> tuple[float, float]:
-        """(batches/s drawn while both insert, transitions/s that they did)."""
+        """(batches/s drawn while both insert, transitions/s that they insert)."""
         sampler, batches = self._samplers[mode], 0
 
         def draw() -> None:

@@ -1,4 +1,4 @@
-"""Starts the roles of a run for the scripts beside this file, asks them how they are, and ends them."""
+"""Starts, queries and ends the roles of a run for the other scripts in this folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.transport import Node
 from common.process.processes import ChildProcess, command
 
-GRACE = 60.0  # seconds that a role gets to end
+GRACE = 60.0  # seconds for a role to end
 
 
 class Roles:
@@ -27,7 +27,7 @@ class Roles:
     Args:
         folder: run directory; logs go to its logs/.
         at: endpoints of learner and replay service.
-        inside: command that a role's own is started through ("ip netns exec NAME"), by the role's first word.
+        inside: command prefix of a role ("ip netns exec NAME"), by the role's first word.
     """
 
     def __init__(
@@ -65,10 +65,10 @@ class Roles:
                 raise RunError(self.processes[name].why())
 
     def finish(self) -> dict[str, Any]:
-        """Interrupt the learner, wait for everybody; the run's summary.
+        """Interrupt the learner, wait for all roles, and return the run's summary.
 
         Raises:
-            RunError: a role did not end well.
+            RunError: a role failed.
         """
         self.processes["learner"].interrupt()
         for process in self.processes.values():
@@ -81,7 +81,7 @@ class Roles:
 
 @contextmanager
 def running(roles: Roles, *later: str) -> Iterator[Roles]:
-    """Every role started but those that come `later`; those that are left at the end are killed."""
+    """Start every role except those that come `later`; kill the remaining ones at the end."""
     try:
         for name, process in roles.processes.items():
             if name not in later:
@@ -93,9 +93,9 @@ def running(roles: Roles, *later: str) -> Iterator[Roles]:
 
 
 class ActorWatch:
-    """Transitions that each actor holds receipts for, by its own word.
+    """The number of acknowledged transitions of each actor, by its own account.
 
-    Actors tell the learner, which passes on what it is told to its Zenoh clients, like this one.
+    Actors publish it to the learner, which forwards it to its Zenoh clients, like this one.
     """
 
     def __init__(self, run: str, learner_at: str) -> None:
@@ -109,7 +109,7 @@ class ActorWatch:
         self._told = self._session.declare_subscriber(f"coop/{run}/metrics/actor/*", zenoh.handlers.FifoChannel(256))
 
     def acked(self) -> dict[str, int]:
-        """By incarnation, as told last."""
+        """The latest numbers, by incarnation."""
         while (sample := self._told.try_recv()) is not None:
             self._acked[str(sample.key_expr)] = wire.decode(sample.payload.to_bytes()).fields["acked"]
         return dict(self._acked)
@@ -128,10 +128,10 @@ def replay_stats(node: Node, timeout: float = 5.0) -> ReplayStats:
 
 
 def wait_until(what: str, reached: Callable[[], bool], seconds: float = 60.0) -> float:
-    """Seconds that it took.
+    """Wait until `reached` is true; return the seconds that it took.
 
     Raises:
-        RunError: it did not come.
+        RunError: it did not become true within `seconds`.
     """
     began = time.monotonic()
     while not reached():

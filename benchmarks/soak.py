@@ -1,8 +1,8 @@
-"""Watches a run at full rate for as long as you like: `python benchmarks/soak.py --seconds 900`.
+"""Watches a run at full rate for a given time: `python benchmarks/soak.py --seconds 900`.
 
-Memory, threads and file descriptors of every role must stay flat after the first minute: the last quarter of the time
-is compared with the first one. Exit status 1 if they do not. Further flags go to the learner; the table must be full
-within the minute (`--preset catch --replay.capacity 2000 --replay.learning-starts 1000`).
+Memory, threads and file descriptors of every role must not grow after the first minute: the script compares the last
+quarter of the time with the first. Otherwise the exit status is 1. Further flags go to the learner; the table must be
+full within the first minute (`--preset catch --replay.capacity 2000 --replay.learning-starts 1000`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Sample = dict[str, float]
 
 
 def measure(pid: int) -> Sample:
-    """What a process holds now."""
+    """The present resources of a process."""
     proc = Path("/proc") / str(pid)
     status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
     return {
@@ -41,7 +41,7 @@ def measure(pid: int) -> Sample:
 
 
 def soak(seconds: float, folder: Path, flags: Sequence[str]) -> None:
-    """Print the table; raise a CoopError where something grows, or ends."""
+    """Print the table; raise a CoopError if a resource grows or a process ends."""
     roles = Roles(folder, "soak", (free_endpoint(), free_endpoint()), ("--total-steps=1000000000", *flags), ACTORS)
     samples: dict[str, list[Sample]] = defaultdict(list)
     with running(roles):

@@ -28,7 +28,7 @@ POLICIES = [(e, s) for e in ("fifo", "reservoir", "prioritized") for s in ("unif
 
 
 def segments(spec: EnvSpec, steps: int, streams: int = 8) -> Iterator[Segment]:
-    """Endless segments of several streams, all steps within episodes, each carrying one stack of frames."""
+    """Yield segments of several streams without end, all steps within episodes, each repeating one stack of frames."""
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (streams, steps + spec.stack, *spec.frame_shape)).astype(spec.frame_dtype)
     frames[:, : spec.stack] = frames[:, steps:]  # the next segment of a stream begins as the last one ended
@@ -53,7 +53,7 @@ def segments(spec: EnvSpec, steps: int, streams: int = 8) -> Iterator[Segment]:
 
 
 def seconds(action: Callable[[], object]) -> float:
-    """Seconds for one call, mean of `REPEATS`."""
+    """Seconds per call, mean of `REPEATS` calls."""
     start = time.perf_counter()
     for _ in range(REPEATS):
         action()
@@ -61,7 +61,7 @@ def seconds(action: Callable[[], object]) -> float:
 
 
 def bare_copies(spec: EnvSpec, capacity: int, steps: int) -> tuple[Callable[[], object], Callable[[], object]]:
-    """(copy a segment's new frames into a ring, gather a batch's frames from it): the least that any table must do."""
+    """(copy a segment's new frames into a ring, gather a batch's frames from it): the minimal work of any table."""
     rng = np.random.default_rng(1)
     ring = np.ones((capacity, *spec.frame_shape), spec.frame_dtype)
     source = np.ones((steps, *spec.frame_shape), spec.frame_dtype)
@@ -77,12 +77,12 @@ def bare_copies(spec: EnvSpec, capacity: int, steps: int) -> tuple[Callable[[], 
 
 
 def resident_bytes() -> int:
-    """Bytes of this process in memory."""
+    """Resident bytes of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 def speed(spec: EnvSpec, capacity: int, steps: int, eviction: str, sampling: str) -> None:
-    """Fill a table half as often again as it holds, then time it beside bare copies."""
+    """Insert one and a half times a table's capacity, then time it against bare copies."""
     table = Table(spec, capacity, eviction=eviction, sampling=sampling, rng=np.random.default_rng(0))
     stream = segments(spec, steps)
     while table.inserted < 1.5 * capacity:
@@ -104,13 +104,13 @@ def speed(spec: EnvSpec, capacity: int, steps: int, eviction: str, sampling: str
     for amount, ours, bare in ((steps, inserts, bare_inserts), (BATCH, samples, bare_samples)):
         rate = amount / ours
         figures.append(f"{np.median(rate):9,.0f} ({rate.min():9,.0f} to {rate.max():9,.0f})")
-        ratio = f"{np.median(ours / bare):4.1f}x" if spec is ATARI else ""  # copying 16 bytes is no yardstick
+        ratio = f"{np.median(ours / bare):4.1f}x" if spec is ATARI else ""  # copying 16 bytes is no useful reference
         figures.append(f"{1e6 * np.median(ours):5.0f} us {ratio:5}")
     print("  ".join(figures), flush=True)
 
 
 def memory(spec: EnvSpec, capacity: int, steps: int) -> None:
-    """Fill a fifo table and print what it holds, what the process grew by, and what a million would take."""
+    """Fill a fifo table, and print its size, the process's growth, and the size of a million transitions."""
     stream = segments(spec, steps)
     first = next(stream)
     before = resident_bytes()

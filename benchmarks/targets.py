@@ -1,4 +1,4 @@
-"""What the roles of a run listen to: a valid message for each key, and the most extreme ones that are still valid."""
+"""The roles' keys: a valid message for each key, and the most extreme messages that are still valid."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ RUN = "fuzz"
 
 @dataclass(frozen=True)
 class Target:
-    """A key, a valid message for it, who counts what is bad there, and who can tell (raises BadMessage).
+    """A key, a valid message for it, the role that counts bad messages there, and the check that raises BadMessage.
 
-    public: an actor's certificate is enough, so that a valid message must do no harm, whatever it says.
+    public: an actor's certificate may send it, so no valid message may do harm.
     """
 
     key: str
@@ -55,7 +55,7 @@ class Target:
 
 
 def targets(node: Node, joined: Joined) -> list[Target]:
-    """Everything that learner and replay service listen to."""
+    """All keys to which learner and replay service listen."""
     spec, batch_size = joined.spec, joined.config.learner.batch_size
     segment = _segment(spec)
 
@@ -100,7 +100,7 @@ def targets(node: Node, joined: Joined) -> list[Target]:
 
 
 def extremes(node: Node, spec: EnvSpec) -> Iterator[tuple[str, bytes]]:
-    """Key and payload of messages that an actor's certificate may send, each number as large as it may be."""
+    """Yield key and payload of messages that an actor's certificate may send, with all numbers at their largest."""
     for number, segment in enumerate(_extreme_segments(spec)):
         changed = msgspec.structs.replace(segment, stream=number)
         for sequence in (0, MAX_COUNT - 1, MAX_COUNT):

@@ -1,10 +1,10 @@
-"""A learner process beside updates on a constant batch and Stable-Baselines3: `python benchmarks/updates.py`.
+"""Compares a learner process with updates on a constant batch and Stable-Baselines3: `python benchmarks/updates.py`.
 
 The learner is a real `coop-learner` with the nature network, fed by a real `coop-replay` and broadcasting to a
-subscriber; it is stopped by signal while the others, in a process of their own, take their turns: `Agent.update` on one
-batch in memory, and Stable-Baselines3's `DQN.train` at the same batch size and threads. Beside updates per second
-stand those per second of processor time of the thread that trains, which holds where the cores are shared. Needs the
-extra `bench`. Give the learner a core of its own with `--core 1`: everything else then keeps off it.
+subscriber. A signal stops it while the others, in their own process, take their turns: `Agent.update` on one
+batch in memory, and Stable-Baselines3's `DQN.train` with the same batch size and threads. Prints updates per second,
+and updates per second of processor time of the training thread, which is valid on shared cores. Needs the
+extra `bench`. `--core 1` reserves a core for the learner: the other processes stay off it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Figures = tuple[float, float]  # updates per second, updates per second of proce
 
 
 def run_config(method: str, dtype: str, batch_size: int, device: str) -> RunConfig:
-    """Breakout as Mnih played it, with a limiter that never says no."""
+    """Breakout as Mnih et al. played it, with a limiter that admits everything."""
     tables = load_tables("breakout", None)
     tables["network"] |= {"dtype": dtype}
     tables["learner"] |= {"batch_size": batch_size, "device": device}
@@ -83,7 +83,7 @@ def rival(batch_size: int, device: str) -> Callable[[], None]:
     from stable_baselines3.common.logger import Logger  # noqa: PLC0415
 
     class Pictures(gymnasium.Env):
-        """Only the spaces matter."""
+        """An environment of which only the spaces matter."""
 
         observation_space = gymnasium.spaces.Box(0, 255, ATARI.obs_shape, np.uint8)
         action_space = gymnasium.spaces.Discrete(ATARI.num_actions)
@@ -99,7 +99,7 @@ def rival(batch_size: int, device: str) -> Callable[[], None]:
 
 
 def keep_off(core: int | None, own: bool = False) -> None:
-    """Keep this process, and those that it starts, off the learner's core, or on it alone."""
+    """Keep this process, and those that it starts, off the learner's core, or only on it."""
     if core is not None:
         everything = set(range(os.cpu_count() or 1))
         os.sched_setaffinity(0, {core} if own else everything - {core})
@@ -139,7 +139,7 @@ class Topology:
         self._learner.send_signal(signal.SIGSTOP)
 
     def figures(self, seconds: float) -> Figures:
-        """What the learner does while this process inserts as many steps as the replay ratio asks for."""
+        """Measure the learner while this process inserts as many steps as the replay ratio requires."""
         self._learner.send_signal(signal.SIGCONT)
         time.sleep(0.3)
         first, begun, processor = self._drawn() or 0, time.perf_counter(), self._processor_seconds()
@@ -163,13 +163,13 @@ class Topology:
             return None
 
     def _processor_seconds(self) -> float:
-        """Of the learner's main thread."""
+        """Processor time of the learner's main thread, in seconds."""
         pid = self._learner.pid
         return int(Path(f"/proc/{pid}/task/{pid}/schedstat").read_text().split()[0]) / 1e9
 
 
 def measure(config: RunConfig, rounds: int, seconds: float, core: int | None) -> dict[str, list[Figures]]:
-    """Figures of each round: of a constant batch, of Stable-Baselines3, of the learner."""
+    """Figures of each round for a constant batch, Stable-Baselines3 and the learner."""
     figures: dict[str, list[Figures]] = {"constant": [], "sb3": [], "learner": []}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         spawn = multiprocessing.get_context("spawn")
