@@ -35,7 +35,7 @@ class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def obs_shape(self) -> tuple[int, ...]:
-        """Shape of one observation: (stack, *frame_shape), or frame_shape where nothing is stacked."""
+        """Shape of one observation: (stack, *frame_shape), or frame_shape if stack is 1."""
         return self.frame_shape if self.stack == 1 else (self.stack, *self.frame_shape)
 
 
@@ -86,7 +86,7 @@ class Segment(Struct, frozen=True, forbid_unknown_fields=True):
     episodes: Annotated[tuple[EpisodeEnd, ...], Meta(max_length=MAX_SEGMENT_STEPS)] = ()
 
     def __post_init__(self) -> None:
-        """Let each transition span one step where nothing else was said."""
+        """Let each transition span one step by default."""
         if self.span is _NOT_GIVEN:
             msgspec.structs.force_setattr(self, "span", _one_each(self.steps))
 
@@ -125,7 +125,7 @@ class Batch:
     span: NDArray[np.uint8] = field(default_factory=lambda: _NOT_GIVEN)
 
     def __post_init__(self) -> None:
-        """Let each transition span one step where nothing else was said."""
+        """Let each transition span one step by default."""
         if self.span is _NOT_GIVEN:
             object.__setattr__(self, "span", _one_each(len(self)))
 

@@ -16,9 +16,9 @@ _start = attrgetter("start")
 
 @dataclass(slots=True)
 class _Stream:
-    """Everything up to `highest` was seen, the numbers in `gaps` excepted: disjoint, none empty, in ascending order.
+    """All numbers up to `highest` were seen except those in `gaps`: disjoint, not empty, in ascending order.
 
-    A gap is a range, however long: what one arrival adds to a stream does not depend on how far it jumps.
+    A gap is a range of any length, so the memory that an arrival adds does not depend on how far it jumps.
     """
 
     highest: int = -1

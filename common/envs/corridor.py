@@ -14,9 +14,9 @@ LEFT, RIGHT = 0, 1
 
 
 class Corridor(gymnasium.Env[NDArray[np.float32], np.int64]):
-    """Five cells in a row; an observation is float32 [5], 1 where the walker stands and 0 elsewhere.
+    """Five cells in a row; an observation is float32 [5], 1 at the walker's cell and 0 elsewhere.
 
-    An episode begins in a random cell. Action 0 goes left, where the first cell has a wall; action 1 goes right. To
+    An episode begins in a random cell. Action 0 goes left, and stays in the first cell; action 1 goes right. To
     step out at the right end gives reward 1 and ends the episode; every other reward is 0.
     """
 

@@ -15,7 +15,7 @@ from common.types import Array, EnvSpec
 class Steps:
     """One step of every emulator. Callers must not write into the arrays; later calls do not reuse them.
 
-    obs: <frame_dtype>[envs, *obs_shape], the next observation to act on (of the new episode where one began).
+    obs: <frame_dtype>[envs, *obs_shape], the next observation to act on (of the new episode if one began).
     next_obs: <frame_dtype>[envs, *obs_shape], the result of the step; the same object as `obs` if nothing restarted.
     rewards: float32 [envs], for learning. raw_rewards: float64 [envs], unclipped, for reported returns.
     terminated: bool [envs], for learning: the next state has no value. A truncated step is not terminal.

@@ -1,4 +1,4 @@
-"""Who takes part in a run: the roles, and where a member of a run lives."""
+"""The members of a run: their roles, and their hosts and process ids."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ class PeerMonitor:
 
 
 def say(text: str, end: str = "\n") -> None:
-    """Print a line. Where there is no space for it, Python's buffer keeps it for later: a full log ends no run."""
+    """Print a line. If there is no space for it, Python's buffer keeps it for later: a full disk must not end a run."""
     try:
         print(text, end=end, flush=True)
     except OSError as error:

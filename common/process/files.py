@@ -52,7 +52,7 @@ class SyncedFile:
 
 
 class LineFile:
-    """A file that grows by whole lines or records. What does not fit on the disk is kept, and written once it does.
+    """A file that grows by whole lines or records. Data that do not fit on the disk are kept, and written once there is space.
 
     problem: why lines are being kept; empty if none are.
     """
@@ -67,7 +67,7 @@ class LineFile:
         self.append(text.encode())
 
     def append(self, data: bytes) -> None:
-        """Append bytes that belong together."""
+        """Append the bytes of one line or record."""
         self._late += data
         try:
             self.finish()
@@ -76,7 +76,7 @@ class LineFile:
             self.problem = error.strerror or str(error)
 
     def finish(self) -> None:
-        """Write what is kept; raises OSError where there is still no space for it."""
+        """Write the kept data; raises OSError if there is still no space."""
         while self._late:
             self._late = self._late[self._file.write(self._late) :]
 
@@ -105,7 +105,7 @@ def truncate(path: Path, size: int) -> None:
 
     Raises:
         RunError: it is already shorter, so data have been lost that cannot be replaced.
-        OSError: it can't be written.
+        OSError: it cannot be written.
     """
     there = path.stat().st_size
     if there < size:

@@ -124,5 +124,5 @@ def run_main(program: str, main: Callable[[], None]) -> None:
 
 
 def _give_up_output() -> None:
-    """Keep the interpreter from flushing what is left, which fails and changes the exit status."""
+    """Keep the interpreter from flushing the rest of the output, which would fail and change the exit status."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -205,7 +205,7 @@ class RunConfig:
 
     @property
     def two_networks(self) -> bool:
-        """True for the cooperative methods, false where the second network is a copy of the first."""
+        """True for the cooperative methods; False if the second network is a copy of the first."""
         return self.method in ("g-coop", "coop")
 
     @property

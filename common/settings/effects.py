@@ -10,7 +10,7 @@ from common.settings.config import RunConfig
 
 @dataclass(frozen=True)
 class _Condition:
-    """Settings that have an effect only where a condition holds.
+    """Settings that have an effect only if a condition holds.
 
     names: dotted; "edl." stands for the whole section.
     otherwise: why the settings have no effect if it does not hold, a format string over the config c.

@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 Setting = tuple[Any, ...]  # a value for each axis
 
 SERIES = ("env_step", "q_gap", "sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
-Q_SIZE, Q_BOUND = "q_abs_mean", "q_bound"  # runs of earlier versions do not have them
+Q_SIZE, Q_BOUND = "q_abs_mean", "q_bound"  # missing in runs of earlier versions
 NOT_AXES = {"run", "method", "seed"}
 PRESET = "cartpole"
 
@@ -36,7 +36,7 @@ class Run:
 
     end_steps: float64 [episodes], environment steps when each episode ended. returns, s, q1_means, q2_means: float64
     [episodes], of the columns `return`, `s`, `q1_mean` and `q2_mean`. metrics: float64 [rows] of each name of SERIES.
-    above_bound: rows of metrics.jsonl whose mean |Q| is larger than the rewards seen allow.
+    above_bound: number of rows of metrics.jsonl whose mean |Q| exceeds its bound, `q_bound`.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Study:
 
     @property
     def warnings(self) -> list[str]:
-        """A line for each finished run whose Q-values were larger at times than they can be."""
+        """A line for each finished run whose mean |Q| exceeded its bound at times."""
         return [
             f"{run.name}: mean |Q| is above the largest that the rewards seen allow in {run.above_bound} of "
             f"{len(run.metrics['env_step'])} rows of {METRICS}"

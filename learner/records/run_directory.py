@@ -75,7 +75,7 @@ class RunDirectory:
                 self._tensorboard.add(f"train/{name}", value, row["env_step"])
 
     def conclude(self, summary: Summary, title: str) -> None:
-        """Write the lines that are left, then summary.json, and draw the learning curve, which a run can do without.
+        """Write the kept lines, then summary.json, and try to draw the learning curve.
 
         Raises:
             RunError: there is no space for lines or summary; says how the run has ended all the same.
@@ -85,7 +85,7 @@ class RunDirectory:
                 file.finish()
             write_atomic(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
         except OSError as error:
-            # Whatever has ended the run must be told, too.
+            # The message must also say how the run ended.
             raise RunError(f"{self.path}: {error.strerror or error}; how the run ended: {summary.exit}") from error
         try:
             draw_learning_curve(self.path, title)

@@ -15,13 +15,13 @@ from common.process.files import LineFile
 
 
 class TensorBoardWriter:
-    """Writes scalars for TensorBoard, which wait for space as a run's lines do.
+    """Writes scalars for TensorBoard; while the disk is full they are kept, like a run's lines.
 
-    PyTorch's `SummaryWriter` has a thread of its own, and that one dies of a full disk.
+    PyTorch's `SummaryWriter` writes in its own thread, which a full disk would end.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Begin a file; raises OSError where it can't be."""
+        """Create a file; raises OSError if that fails."""
         folder.mkdir(parents=True, exist_ok=True)
         name = f"events.out.tfevents.{int(time.time()):010}.{socket.gethostname()}.{os.getpid()}"
         self._file = LineFile(folder / name, go_on=True)
@@ -30,7 +30,7 @@ class TensorBoardWriter:
 
     @property
     def problem(self) -> str:
-        """Why scalars are being kept; empty while none are."""
+        """Why scalars are being kept; empty if none are."""
         return self._file.problem
 
     def add(self, name: str, value: float, step: int) -> None:
@@ -39,7 +39,7 @@ class TensorBoardWriter:
         self._add(Event(wall_time=time.time(), step=step, summary=summary))
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the kept scalars, and close the file."""
         self._file.close()
 
     def _add(self, event: Event) -> None:
@@ -47,7 +47,7 @@ class TensorBoardWriter:
 
 
 class _Records:
-    """What a `RecordWriter` takes for a file; it writes each record at once."""
+    """The file object for a `RecordWriter`; writes each record at once."""
 
     def __init__(self, file: LineFile) -> None:
         self.write = file.append
