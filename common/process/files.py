@@ -52,7 +52,7 @@ class SyncedFile:
 
 
 class LineFile:
-    """A file that grows by whole lines or records. Data that do not fit on the disk are kept, and written once there is space.
+    """A file that grows by whole lines or records; data that do not fit on the disk are kept, and written later.
 
     problem: why lines are being kept; empty if none are.
     """
