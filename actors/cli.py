@@ -31,7 +31,7 @@ class ActorOptions(RoleOptions):
     """Flags of `coop-actor`."""
 
     envs: int | None = None
-    """Emulators in this process (default: the run's actor.envs)."""
+    """Emulators in this process; the run's actor.envs if not given."""
 
 
 def main() -> None:

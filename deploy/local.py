@@ -35,7 +35,7 @@ class LocalOptions(RunOptions):
     restart: bool = False
     """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
     listen: str | None = None
-    """Endpoint of the learner, for actors on other machines (default: a free port on loopback)."""
+    """Endpoint of the learner, for actors on other machines; a free port on loopback if not given."""
 
 
 class Topology:

@@ -33,8 +33,7 @@ class ReplayOptions(RoleOptions):
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
     """Endpoints to listen on; port 0 chooses a free port."""
     run_dir: Path | None = None
-    """Folder for this service's part of the epochs, under checkpoints/ (default: runs/RUN-replay-ID, with the run's
-    name and id)."""
+    """Folder for this service's part of the epochs; runs/RUN-replay-ID if not given, with the run's name and id."""
     resume: bool = False
     """Continue from the state in --run-dir; start afresh if it holds nothing of this run yet."""
 

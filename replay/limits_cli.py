@@ -20,9 +20,9 @@ class LimitsOptions(RoleOptions):
     """Flags of `coop-limits`."""
 
     ratio: float | None = None
-    """New ratio of updates per environment step, from now on (default: unchanged)."""
+    """New ratio of updates per environment step, from now on; unchanged if not given."""
     tolerance: float | None = None
-    """New tolerance in environment steps between acting and learning (default: unchanged)."""
+    """New tolerance in environment steps between acting and learning; unchanged if not given."""
 
 
 def main() -> None:

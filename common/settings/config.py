@@ -40,8 +40,7 @@ class NetworkSettings:
     hidden: Annotated[tuple[Positive, ...], Field(max_length=MAX_LAYERS)] = (128, 128, 128)
     """Widths of the mlp's hidden layers."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16 halves the bits of acting, of the targets, and of all passes of the gradient methods; parameters and
-    optimizers stay in float32."""
+    """bfloat16: of acting, targets and all passes of the gradient methods; the parameters stay in float32."""
 
 
 @dataclass(frozen=True)
@@ -50,30 +49,31 @@ class LearnerSettings:
 
     __pydantic_config__ = _STRICT
     batch_size: Annotated[int, Field(gt=0, le=MAX_BATCH)] = 32
+    """Transitions per update."""
     swap_every: Positive = 30
     """C: updates between swaps of the acting role."""
     target_update_every: Positive | None = None
-    """Updates between copies to the target network (dqn, edql); equals swap_every if not given, so that all methods
-    share one C."""
+    """C of dqn and edql: updates between copies to the target network; equals swap_every if not given."""
     swap_unit: Literal["updates", "steps"] = "updates"
     """Unit of swap_every and target_update_every; "steps" means environment steps, in lockstep runs only."""
     reset_role_at_episode: bool = False
     """Make network 1 the acting one at the start of each episode, as Algorithm 1 writes; lockstep runs only."""
     gamma: Share = 0.99
+    """Discount factor."""
     loss: Literal["squared", "mse", "huber"] = "squared"
-    """squared: 1/2 e^2, as in the paper; mse: e^2, as in PyTorch and the authors' code, which halves the relative
-    weight of s; huber: 1/2 e^2 with its slope clipped to [-1, 1]."""
+    """squared: 1/2 e^2 (paper); mse: e^2 (authors' code; halves the weight of s); huber: slope clipped to [-1, 1]."""
     double: bool = False
     """Double Q-learning: the trained network chooses the action at which the target network is evaluated."""
     optimizer: OptimizerName = "rmsprop"
-    """rmsprop: PyTorch's; rmsprop-mnih: centred, with eps inside the square root and gradients summed over the
-    batch."""
+    """rmsprop: PyTorch's; rmsprop-mnih: centred, eps inside the square root, gradients summed over the batch."""
     learning_rate: PositiveFloat = 1e-3
+    """Learning rate at the first update."""
     learning_rate_final: PositiveShare = 1.0
     """The learning rate falls exponentially to this share of itself over the whole run."""
     learning_rate_decay: PositiveShare = 1.0
     """The learning rate is also multiplied by this after every `learning_rate_decay_every` updates."""
     learning_rate_decay_every: Positive = 1000
+    """Updates between multiplications by `learning_rate_decay`."""
     momentum: Decay = 0.0
     """Momentum of the parameter steps (sgd, rmsprop)."""
     alpha: Decay = 0.99
@@ -89,6 +89,7 @@ class LearnerSettings:
     weight_decay: Annotated[tuple[NonNegative, ...], Field(max_length=MAX_LAYERS + 1)] = ()
     """lambda(i) of each layer, starting at the input; one value applies to all layers; empty means 0."""
     device: str = "cpu"
+    """PyTorch device of the networks, for example cpu or cuda."""
     compile: bool = False
     """Run the passes through torch.compile, for GPUs; on a CPU this needs a C++ compiler and gains nothing."""
     threads: Positive = 1
@@ -109,11 +110,13 @@ class EdlSettings:
     decay: PositiveShare = 1.0
     """Factor by which s is multiplied every `decay_every` updates."""
     decay_every: Positive = 1000
+    """Updates per application of `decay`."""
     decay_stepwise: bool = False
     """Apply the whole factor once every `decay_every` updates, instead of a fraction of it at each update."""
     noise: Literal["constant", "normal"] = "constant"
     """normal: s is the rate times one draw from N(0, 1) per update."""
     feedback: Literal["transform", "weight-gradient", "random"] = "transform"
+    """U, S and V: of each layer's Jacobian (transform), of its weight gradient, or a fixed random B instead."""
     polar_dtype: Literal["float32", "bfloat16"] = "float32"
     """Precision of the s U V^T part of the transform feedback; T^T e is always float32."""
 
@@ -134,11 +137,15 @@ class ReplaySettings:
     n_step: Annotated[int, Field(gt=0, le=MAX_N_STEP)] = 1
     """Rewards that a transition sums before it bootstraps (1: the paper); fewer at the end of an episode."""
     eviction: Literal["fifo", "reservoir", "prioritized"] = "fifo"
+    """Policy by which a full table evicts transitions; prioritized evicts the lowest priority."""
     sampling: Literal["uniform", "prioritized"] = "uniform"
+    """Policy by which batches are drawn."""
     replacement: bool = True
     """Draw batches with replacement; without it, a batch holds no transition twice (uniform sampling only)."""
     priority_exponent: Share = 0.6
+    """alpha of prioritized sampling; 0 draws uniformly."""
     importance_exponent: Share = 0.4
+    """beta of the importance-sampling weights; 0 corrects nothing, 1 corrects fully."""
     journal: bool = False
     """Write each accepted segment and each draw to disk before answering, so that a kill loses nothing."""
     journal_keep: bool = False
@@ -158,8 +165,11 @@ class ActorSettings:
     envs: Annotated[int, Field(gt=0, le=MAX_STREAMS)] = 1
     """Emulators in one actor process."""
     epsilon_start: Share = 1.0
+    """Probability of a random action at the run's beginning."""
     epsilon_final: Share = 0.05
+    """Probability of a random action at the end of the decay."""
     epsilon_decay: Literal["exponential", "linear"] = "exponential"
+    """Shape of the decay of epsilon."""
     epsilon_steps: Steps = 10_000
     """Environment steps: time constant of the exponential decay, or length of the linear decay."""
     segment_steps: Annotated[int, Field(gt=0, le=MAX_SEGMENT_STEPS)] = 16
@@ -176,7 +186,9 @@ class RunConfig:
     run: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")] = "coop"
     """Name of the run: roles with the same name find each other."""
     method: Method = "coop"
+    """Training method: gradient (dqn, g-coop) or error-driven (edql, coop); with two networks: g-coop, coop."""
     seed: Count = 0
+    """Seed of all random numbers."""
     total_steps: Steps = 50_000
     """Environment steps of the complete run."""
     total_updates: Count = 0

@@ -34,8 +34,7 @@ class EnvSettings:
     max_episode_steps: Annotated[int, Field(ge=0, le=MAX_GAME_STEPS)] = 0
     """Truncate episodes after this many steps; 0 keeps the environment's own limit (ALE: 108,000 frames)."""
     time_limit_terminal: bool = False
-    """Treat the end of an episode by its time limit as terminal for learning, as old gym did; otherwise the last
-    state bootstraps."""
+    """Treat the time limit's end of an episode as terminal, as old gym did; otherwise the last state bootstraps."""
 
     @property
     def atari(self) -> bool:

@@ -44,11 +44,11 @@ class RunOptions(RunConfig):
     """The fields of a run's config, their source, and the run directory."""
 
     preset: str | None = None
-    """Settings that come with the package (default: cartpole, unless --config or a resumed run gives them)."""
+    """Settings that come with the package; cartpole if neither --config nor a resumed run gives any."""
     config: Path | None = None
     """A TOML file with the fields of a run, for example the config.toml of another run."""
     run_dir: Path | None = None
-    """Folder for the run's files (default: runs/ENV-METHOD-sSEED-TIME)."""
+    """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
     resume: bool = False
     """Continue the run in --run-dir, with its config, from its newest epoch; start it if there is none yet."""
     zenoh_config: Path | None = None

@@ -21,7 +21,7 @@ class ReportOptions:
     runs: Annotated[Positional[Path], tyro.conf.arg(metavar="RUNS")]
     """A sweep's folder, any folder of run directories, or a file made with --pack."""
     out: Path | None = None
-    """Folder of the report (default: RUNS/report, without the suffix if RUNS is a file)."""
+    """Folder of the report; RUNS/report if not given, without the suffix if RUNS is a file."""
     pack: Path | None = None
     """Instead of a report: write the folder's runs into this Parquet file."""
     curves: Path | None = None

@@ -32,9 +32,9 @@ class SweepOptions:
     quick: bool = False
     """Use the grid's small version, for two cores."""
     jobs: int | None = None
-    """Number of cells to run concurrently (default: the number of cores)."""
+    """Number of cells to run concurrently; the number of cores if not given."""
     dir: Path | None = None
-    """Folder of the sweep (default: runs/sweeps/GRID)."""
+    """Folder of the sweep; runs/sweeps/GRID if not given."""
     cell: str | None = None
     """Run only this cell."""
     slurm: bool = False
