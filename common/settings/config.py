@@ -40,7 +40,7 @@ class NetworkSettings:
     hidden: Annotated[tuple[Positive, ...], Field(max_length=MAX_LAYERS)] = (128, 128, 128)
     """Widths of the mlp's hidden layers."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16: of acting, targets and all passes of the gradient methods; the parameters stay in float32."""
+    """bfloat16 applies to acting, targets and all passes of the gradient methods; parameters stay in float32."""
 
 
 @dataclass(frozen=True)
