@@ -83,7 +83,7 @@ class Lockstep:
                 table.update_priorities(batch.ids, effects.priorities)
             yield effects
         ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in turn.ended.items())
-        yield self.trainer.note(msgspec.structs.replace(drawn, episodes=ended))
+        yield self.trainer.receive(msgspec.structs.replace(drawn, episodes=ended))
         if learner.swap_unit == "steps" and self.step % self.config.swap_period == 0:
             self.agent.swap()
         if learner.reset_role_at_episode and turn.ended and self.agent.acting:

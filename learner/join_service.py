@@ -17,7 +17,7 @@ from common.messaging.wire import Message
 from common.settings.config import RunConfig
 from common.types import EnvSpec
 from learner.members import MemberTracker
-from learner.roster import Occupied, Roster
+from learner.roster import AlreadyServed, Roster
 from learner.shared_epochs import SharedEpochs
 
 
@@ -103,7 +103,7 @@ class JoinService:
             elif request.role == "replay" and request.endpoints:  # without endpoints it only asks which run this is
                 index = self._admit(request)
                 epoch, anew = self._epochs.offered(request)
-        except Occupied as other:
+        except AlreadyServed as other:
             return Retry(str(other)).encode(self._node.run)
         if request.role == "actor" or request.endpoints:
             name = f"actor {index}" if request.role == "actor" else "replay service"

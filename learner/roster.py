@@ -21,7 +21,7 @@ from common.process.files import write_atomic
 ROSTER = "roster.json"
 
 
-class Occupied(RunError):
+class AlreadyServed(RunError):
     """Another replay service serves this run, or may still be serving it."""
 
 
@@ -94,7 +94,7 @@ class Roster:
         there: incarnations of the replay services whose liveliness tokens exist.
 
         Raises:
-            Occupied: another one serves, or may still be serving.
+            AlreadyServed: another one serves, or may still be serving.
             RunError: another one has taken over from this one, or the roster cannot be saved.
         """
         with self._lock:
@@ -104,7 +104,7 @@ class Roster:
                 if entries.serving >= 0 and request.index >= 0:
                     raise RunError(f"the replay service on {other} has taken over from this one")
                 if entries.serving >= 0 and (entries.serving in there or now - self._confirmed < LEASE):
-                    raise Occupied(f"the replay service on {other} serves this run")
+                    raise AlreadyServed(f"the replay service on {other} serves this run")
                 host, pid = request.origin
                 self._keep(_Entries(entries.actors, entries.replays + 1, request.incarnation, host, pid))
             self._confirmed = now

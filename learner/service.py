@@ -95,7 +95,7 @@ class LearnerService:
             if trainer.epoch_due() and self._checkpoints.begin(self._state):
                 trainer.epoch_begun()
         elif trainer.all_updates_done() and (stats := self._replay_stats()) is not None:
-            self._apply(trainer.note(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
+            self._apply(trainer.receive(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
         if got is None and self._join_service.departure.is_due:
             self._save_for_departure()
         if time.monotonic() >= self._status_due:

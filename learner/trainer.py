@@ -86,7 +86,7 @@ class Trainer:
             metrics=self._metrics(now) if agent.updates % METRICS_EVERY == 0 else None,
         )
 
-    def note(self, drawn: Drawn) -> Effects:
+    def receive(self, drawn: Drawn) -> Effects:
         """Process counters and episodes that arrived without a batch."""
         return Effects(episodes=self._number_episodes(drawn))
 

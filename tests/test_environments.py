@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Discrete
 from common.envs import catch
 from common.envs.catch import Catch
 from common.envs.make import env_spec, make_vector_env
-from common.envs.pictures import Shrink
+from common.envs.pictures import PictureResizer
 from common.envs.protocol import Steps
 from common.errors import UsageError
 from common.settings.environment import EnvSettings
@@ -323,8 +323,8 @@ def test_pictures_of_any_size_become_stacked_frames(name: str) -> None:
 def test_shrinking_averages_areas() -> None:
     picture = np.zeros((168, 126), np.uint8)
     picture[0:2, 0:3] = [[12, 30, 90], [12, 30, 90]]
-    small = Shrink(picture.shape)(picture)
+    small = PictureResizer(picture.shape)(picture)
     assert small[0, :3].tolist() == [18, 70, 0]  # (12 + 30/2) / 1.5 and (30/2 + 90) / 1.5
     colour = np.zeros((84, 84, 3), np.uint8)
     colour[...] = (100, 200, 50)
-    assert np.unique(Shrink(colour.shape)(colour)).tolist() == [153]  # 29.9 + 117.4 + 5.7
+    assert np.unique(PictureResizer(colour.shape)(colour)).tolist() == [153]  # 29.9 + 117.4 + 5.7

@@ -8,7 +8,7 @@ from common.errors import BadMessage, RunError
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join
 from common.messaging.presence import LEASE
-from learner.roster import Occupied, Roster
+from learner.roster import AlreadyServed, Roster
 
 
 def actor(incarnation: int, index: int = -1) -> Join:
@@ -37,9 +37,9 @@ def test_one_replay_service_serves(tmp_path: Path) -> None:
     roster = Roster(tmp_path, now=100.0)
     assert roster.replay(replay(1), 100.0, {1}) == 0
     assert roster.replay(replay(1), 101.0, {1}) == 0, "asks again"
-    with pytest.raises(Occupied, match=r"the replay service on host1 \(pid 1\) serves this run"):
+    with pytest.raises(AlreadyServed, match=r"the replay service on host1 \(pid 1\) serves this run"):
         roster.replay(replay(2), 200.0, {1, 2})
-    with pytest.raises(Occupied):
+    with pytest.raises(AlreadyServed):
         roster.replay(replay(2), 101.0 + LEASE / 2, {2})  # its token is gone, but it may still believe that it serves
     assert roster.replay(replay(2), 101.0 + LEASE, {2}) == 1
     with pytest.raises(RunError, match=r"the replay service on host2 \(pid 2\) has taken over from this one"):
@@ -53,11 +53,11 @@ def test_a_learner_that_comes_back_knows_who_serves(tmp_path: Path) -> None:
     again = Roster(tmp_path, now=20.0)
     with pytest.raises(RunError, match="has taken over"):
         again.replay(replay(1, index=0), 20.1, {1})
-    with pytest.raises(Occupied, match="host2"):
+    with pytest.raises(AlreadyServed, match="host2"):
         again.replay(replay(3), 20.1, {3})
     assert again.replay(replay(2, index=1), 20.2, {2}) == 1
     again.dismiss(2)
-    with pytest.raises(Occupied):
+    with pytest.raises(AlreadyServed):
         again.replay(replay(3), 20.3, {2, 3})
     assert again.replay(replay(3), 20.3, {3}) == 2, "nobody waits for one that has left"
 

@@ -98,7 +98,7 @@ def test_q1_and_q2_are_compared_on_the_first_256_states() -> None:
 def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
     trainer = Trainer(Agent(CONFIG, SPEC), 0.0)
     first = trainer.train(next(batches()), drawn(200, 5.0, 7.0), 0.0)
-    later = trainer.note(drawn(210, 9.0))
+    later = trainer.receive(drawn(210, 9.0))
     rows = [*first.episodes, *later.episodes]
     assert [row.number for row in rows] == [0, 1, 2]
     assert [row.record.end.episode_return for row in rows] == [5.0, 7.0, 9.0]

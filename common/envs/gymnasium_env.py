@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from common.envs import catch as _registers_catch  # noqa: F401
 from common.envs import corridor as _registers_corridor  # noqa: F401
-from common.envs.pictures import SIDE, Shrink
+from common.envs.pictures import SIDE, PictureResizer
 from common.envs.protocol import Steps
 from common.errors import UsageError
 from common.settings.environment import EnvSettings
@@ -39,7 +39,7 @@ class GymnasiumEnv:
         assert space.shape is not None
         assert isinstance(actions, Discrete)
         self._first_action = int(actions.start)
-        self._shrink = Shrink(space.shape) if self._pictures else None
+        self._shrink = PictureResizer(space.shape) if self._pictures else None
         self._lengths = [0] * self.num_envs
         self._obs = np.empty(0)
         self._actions = np.empty(0, np.int32)

@@ -11,7 +11,7 @@ SIDE = 84
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
-class Shrink:
+class PictureResizer:
     """Converts uint8 pictures [height, width], [height, width, 1] or [height, width, 3] to uint8 [84, 84].
 
     Each output pixel is the mean of the input area that it covers; an 84x84 gray picture passes unchanged.
