@@ -39,7 +39,7 @@ class GymnasiumEnv:
         assert space.shape is not None
         assert isinstance(actions, Discrete)
         self._first_action = int(actions.start)
-        self._shrink = PictureResizer(space.shape) if self._pictures else None
+        self._resize = PictureResizer(space.shape) if self._pictures else None
         self._lengths = [0] * self.num_envs
         self._obs = np.empty(0)
         self._actions = np.empty(0, np.int32)
@@ -104,8 +104,8 @@ class GymnasiumEnv:
 
     def _put(self, obs: Array, row: int, frame: Array) -> None:
         """Store an environment's observation as the newest frame of `obs[row]`."""
-        if self._shrink is not None:
-            frame = self._shrink(frame)
+        if self._resize is not None:
+            frame = self._resize(frame)
         if self.spec.stack > 1:
             obs[row, -1] = frame
         else:
