@@ -161,7 +161,8 @@ class Trainer:
 
     def _metrics(self, now: float) -> dict[str, Any] | None:
         """The row of the interval that ends here, or None if the agent's values are not finite."""
-        row = self.telemetry.row(self.agent, self.drawn, self.epsilon(), now)
+        with np.errstate(all="ignore"):  # what is not finite is found below
+            row = self.telemetry.row(self.agent, self.drawn, self.epsilon(), now)
         bad = [name for name, value in row.items() if isinstance(value, float) and not math.isfinite(value)]
         if bad and not self.diverged:
             self.diverged = f"diverged: {bad[0]} is not finite at update {self.agent.updates}"

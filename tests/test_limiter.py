@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from random import Random
 
+import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -135,6 +136,20 @@ def test_a_changed_ratio_holds_from_there_on(
     assert limiter.total is not None
     assert inserted >= limiter.total
     assert drawn == limiter.draws_total
+
+
+def test_changed_settings_hold_from_now_on_and_the_others_stay() -> None:
+    before = THOUSAND.changed(999, 0, ratio=0.5)
+    assert before == replace(THOUSAND, ratio=0.5)  # nothing was drawn yet: the ratio holds from the start on
+    assert THOUSAND.changed(1000, 0, ratio=0.5) == replace(THOUSAND, ratio=0.5, origin=(1000, 0))
+    everything = THOUSAND.changed(2000, 900, ratio=0.5, tolerance=7.0, total=60_000)
+    assert everything == replace(THOUSAND, ratio=0.5, tolerance=7.0, total=60_000, origin=(2000, 900))
+
+
+@pytest.mark.parametrize("limiter", [THOUSAND, THOUSAND.changed(2000, 900, ratio=0.5)])
+def test_a_limiter_comes_back_from_its_table(limiter: RateLimiter) -> None:
+    packed = msgpack.unpackb(msgpack.packb(asdict(limiter)))
+    assert RateLimiter.from_table(packed) == limiter
 
 
 def test_a_raised_start_does_not_wedge() -> None:

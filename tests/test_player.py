@@ -43,6 +43,7 @@ def test_episodes_sum_the_unclipped_rewards_of_their_stream() -> None:
             rewards = [turns[k].steps.raw_rewards[stream] for k in range(begun[stream], number + 1)]
             assert (end.episode_return, end.length) == (sum(rewards), len(rewards))
             assert end.param_version == turn.version == number
+            assert end.step_in_segment == 0  # until it is in a segment
             begun[stream] = number + 1
             ended += 1
     assert ended > 10
@@ -87,6 +88,7 @@ def test_the_same_actions_bring_emulators_back_to_where_they_were() -> None:
         replayed = again.replay(turn.actions)
         np.testing.assert_array_equal(replayed.steps.next_obs, turn.steps.next_obs)
         assert [end.length for end in replayed.ended.values()] == [end.length for end in turn.ended.values()]
+        assert {end.epsilon for end in replayed.ended.values()} <= {0.0}
     env.close()
 
 

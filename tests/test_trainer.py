@@ -112,11 +112,14 @@ def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
 @pytest.mark.parametrize(
     ("config", "told", "updates", "outcome"),
     [
+        ({}, drawn(10_000, planned=1), 1, "complete"),
         ({}, drawn(10_000, planned=3), 3, "complete"),
         ({}, drawn(10_000, planned=3), 2, ""),
         ({}, drawn(9_999, planned=3), 3, ""),
+        ({"total_updates": 1}, drawn(200), 1, "complete: total_updates reached"),
         ({"total_updates": 2}, drawn(200), 2, "complete: total_updates reached"),
         ({"total_updates": 3}, drawn(200), 2, ""),
+        ({"total_episodes": 1}, drawn(200, 1.0), 1, "complete: total_episodes reached"),
         ({"total_episodes": 2}, drawn(200, 1.0, 1.0), 1, "complete: total_episodes reached"),
         ({"total_episodes": 3}, drawn(200, 1.0, 1.0), 1, ""),
         ({"target_return": 6.0}, drawn(200, *[5.0, 7.0] * 50), 1, "complete: target_return reached"),
@@ -132,6 +135,12 @@ def test_when_a_run_is_over(config: dict[str, float], told: Drawn, updates: int,
     trainer.train(next(source), told, 0.0)
     assert trainer.outcome() == outcome
     assert trainer.all_updates_done() == (updates == told.planned)
+
+
+def test_a_new_run_has_neither_diverged_nor_done_all_its_updates() -> None:
+    trainer = Trainer(Agent(CONFIG, SPEC), 0.0)
+    assert trainer.diverged == trainer.outcome() == ""
+    assert not trainer.all_updates_done()  # it is not known yet how many there will be
 
 
 def test_an_epoch_is_due_until_it_is_begun() -> None:
@@ -171,6 +180,29 @@ def test_parameters_that_are_not_finite_are_neither_broadcast_nor_saved() -> Non
     assert not trainer.epoch_due()
     assert trainer.outcome() == "diverged: parameters are not finite at update 6"
     assert not trainer.train(next(source), drawn(), 0.0).broadcast
+
+
+def test_an_update_that_leaves_parameters_that_are_not_finite_is_not_broadcast() -> None:
+    learner = replace(CONFIG.learner, optimizer="rmsprop", learning_rate=1e38, publish_every=1)
+    trainer = Trainer(Agent(replace(CONFIG, learner=learner), SPEC), 0.0)
+    effects = train(trainer, 1)[0]  # its TD errors are those of before the step
+    assert not effects.broadcast
+    assert trainer.outcome() == "diverged: parameters are not finite at update 1"
+
+
+def test_values_that_are_not_finite_on_the_fixed_states_end_a_run_with_the_row() -> None:
+    learner = replace(CONFIG.learner, swap_every=1000, publish_every=1000)
+    trainer, source = Trainer(Agent(replace(CONFIG, method="dqn", learner=learner), SPEC), 0.0), batches()
+    for _ in range(199):
+        assert trainer.train(next(source), drawn(), 0.0).metrics is None
+    assert trainer.telemetry.fixed is not None
+    trainer.telemetry.fixed[0] = 1e30
+    for network in trainer.agent.networks:
+        flat = network.snapshot()
+        flat[-18:-2] *= 1e10  # the weights of the output: too much for that state, and for no other
+        network.load(flat)
+    assert trainer.train(next(source), drawn(), 0.0).metrics is None
+    assert trainer.outcome() == "diverged: q_gap is not finite at update 200"
 
 
 def test_values_beyond_what_the_rewards_allow_are_told() -> None:
