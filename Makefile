@@ -39,6 +39,10 @@ chaos: $(READY)
 soak: $(READY)
 	@$(BIN)/python benchmarks/soak.py
 
+mutants: $(READY)
+	@$(PIP) --editable '.[dev,mutants]' > $(VENV)/mutants.log 2>&1 || { cat $(VENV)/mutants.log; exit 1; }
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/mutants.py
+
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -88,7 +88,7 @@ def test_the_same_actions_bring_emulators_back_to_where_they_were() -> None:
         replayed = again.replay(turn.actions)
         np.testing.assert_array_equal(replayed.steps.next_obs, turn.steps.next_obs)
         assert [end.length for end in replayed.ended.values()] == [end.length for end in turn.ended.values()]
-        assert {end.epsilon for end in replayed.ended.values()} <= {0.0}
+        assert {(end.epsilon, end.param_version) for end in replayed.ended.values()} <= {(0.0, 0)}
     env.close()
 
 
