@@ -1,10 +1,13 @@
 """Small valid messages for tests to send and to break, and real play cut into segments."""
 
+import time
+
 import numpy as np
 
 from actors.segments import SegmentAssembler
 from common.envs.make import make_vector_env
 from common.envs.protocol import Steps
+from common.messaging.transport import Node
 from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec, EpisodeEnd, Segment
 
@@ -32,6 +35,16 @@ def make_segment(spec: EnvSpec, sequence: int = 0, steps: int = 4, incarnation: 
         "episodes": (EpisodeEnd(steps - 1, 1.5, steps, 0.1, 0.2, 0.3, 5),),
     }
     return Segment(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def await_service(asker: Node, key: str) -> None:
+    """Wait until a node has heard that another one answers queries on `key`; before, its queries find nobody."""
+    querier = asker.session.declare_querier(key)
+    deadline = time.monotonic() + 10
+    while not querier.matching_status.matching:
+        assert time.monotonic() < deadline, f"nobody answers on {key}"
+        time.sleep(0.01)
+    querier.undeclare()
 
 
 Seen = list[tuple[Array, Array, Steps, Array]]

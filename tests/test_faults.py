@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from samples import make_segment
+from samples import await_service, make_segment
 
 from common.messaging.keys import replay_key
 from common.messaging.messages.answers import Ack, Retry
@@ -43,6 +43,7 @@ def test_a_serving_thread_outlives_an_error(nodes: tuple[Node, Node], capfd: pyt
         return Ack(1).encode("test")
 
     server.serve(server.key("role"), answer)
+    await_service(client, server.key("role"))
     for _ in range(2):
         with pytest.raises(Refused, match="error of this program: ZeroDivisionError"):
             client.ask(client.key("role"), Current().encode("test"))
@@ -75,6 +76,7 @@ def test_a_table_that_may_be_half_changed_is_not_used_any_more(
     core, stop = ReplayCore(RunConfig(run="test"), spec), Stop()
     service = ReplayService(server, core, ReplayEpochs(tmp_path, 5))
     service.start()
+    await_service(client, replay_key(client, "snapshot"))  # the last one that it declares
     running = threading.Thread(target=service.run, args=(stop, Console()))
     running.start()
     first, second = (encode_segment("test", make_segment(spec, number)) for number in range(2))

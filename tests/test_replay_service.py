@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import make_segment
+from samples import await_service, make_segment
 
 from common.bounds import MAX_COUNT
 from common.errors import RunError
@@ -38,13 +38,8 @@ def _serve(node: Node, core: ReplayCore, folder: Path, asker: Node | None = None
     """A service that has started, and that `asker` has heard of."""
     service = ReplayService(node, core, ReplayEpochs(folder, 5))
     service.start()
-    deadline = time.monotonic() + 5
-    while asker is not None and time.monotonic() < deadline:
-        try:
-            asker.ask(replay_key(asker, "stats"), StatsQuestion().encode("test"))
-            break
-        except NoAnswer:
-            time.sleep(0.02)
+    if asker is not None:
+        await_service(asker, replay_key(asker, "snapshot"))  # the last one that it declares
     return service
 
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from samples import make_segment
+from samples import await_service, make_segment
 from test_topology import lines, running, wait_for
 
 from common.messaging.clients import InsertClient
@@ -36,6 +36,7 @@ def test_a_service_that_is_not_confirmed_neither_acknowledges_nor_draws(
     core = ReplayCore(RunConfig(run="test"), spec)
     service = ReplayService(server, core, ReplayEpochs(tmp_path, 5), confirmed=0.0)
     service.start()
+    await_service(client, replay_key(client, "snapshot"))  # the last one that it declares
     segment = encode_segment("test", make_segment(spec))
     draw = DrawRequest(1, 0, 0, core.batch_size, 0).encode("test")
     for question, payload in (("insert", segment), ("sample", draw)):
