@@ -50,7 +50,7 @@ class Topology:
         logs = directory / "logs"
         try:
             logs.mkdir(parents=True, exist_ok=True)
-            resolved = directory / "config.toml"
+            resolved = logs / "config.toml"  # the run's own is the learner's to write
             write_atomic(resolved, to_toml(config).encode())
         except OSError as error:
             raise RunError(f"run directory {directory}: {error.strerror or error}") from error

@@ -145,3 +145,10 @@ def check_references(table: Table, pinned: Array | None = None) -> None:
     expected = np.bincount(np.concatenate(named).astype(np.intp), minlength=len(references))
     np.testing.assert_array_equal(references, expected)
     assert table._frames.held == np.count_nonzero(references)
+
+
+def whole_state(table: Table) -> tuple[dict[str, Any], dict[str, Array]]:
+    """A snapshot of a table as `Table.load_state` takes it, with all frames read."""
+    meta, arrays, frames = table.snapshot()
+    with frames:
+        return meta, {**arrays, "frames": frames.read(0, len(frames))}

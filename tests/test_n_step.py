@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import INCARNATION
-from table_reference import Stream, make_spec
+from table_reference import Stream, make_spec, whole_state
 
 from actors.segments import SegmentAssembler
 from common.envs.protocol import Steps
@@ -174,7 +174,7 @@ def test_what_was_recorded_before_spans_one_step() -> None:
     assert old.span.tolist() == [1] * 6
     table, again = (Table(spec, 10, rng=np.random.default_rng(1)) for _ in range(2))
     table.insert(old)
-    meta, arrays = table.state()
+    meta, arrays = whole_state(table)
     del arrays["span"]
     again.load_state(meta, arrays)
     assert again.sample(20).span.tolist() == [1] * 20
@@ -188,6 +188,6 @@ def test_spans_survive_the_wire_and_a_snapshot() -> None:
     assert read.span.tolist() == span.tolist()
     table, again = (Table(spec, 10, rng=np.random.default_rng(1)) for _ in range(2))
     table.insert(read)
-    again.load_state(*table.state())
+    again.load_state(*whole_state(table))
     batch = again.sample(64)
     assert batch.span.tolist() == span[batch.ids].tolist()

@@ -58,7 +58,7 @@ def test_another_run_s_folder_is_refused_and_stays_as_it_is(named: bool, spec: E
         claim(tmp_path, 5)
     before = contents(tmp_path)
     for resume in (False, True):
-        with pytest.raises(RunError, match="belongs to the run with id 5, the learner's has 6"):
+        with pytest.raises(RunError, match="belongs to another run than the learner's"):
             ReplayFolder(tmp_path, 6).check(resume=resume)
     assert contents(tmp_path) == before
     with pytest.raises(UsageError, match="holds a run already"):
@@ -68,7 +68,7 @@ def test_another_run_s_folder_is_refused_and_stays_as_it_is(named: bool, spec: E
 
 def test_a_journal_alone_tells_whose_it_is(spec: EnvSpec, tmp_path: Path) -> None:
     a_replay_folder(tmp_path, spec, run_id=5, epochs=())
-    with pytest.raises(RunError, match="journal: belongs to the run with id 5"):
+    with pytest.raises(RunError, match="journal: belongs to another run"):
         ReplayFolder(tmp_path, 6).check(resume=True)
 
 
@@ -86,7 +86,7 @@ def test_a_new_folder_is_the_run_s_from_its_first_write(tmp_path: Path) -> None:
         assert read_run_id(folder.path) == 5
         with pytest.raises(RunError, match=rf"in use by coop-replay on .* \(pid {os.getpid()}\)"):
             folder.lock()
-    with pytest.raises(RunError, match="belongs to the run with id 5"):
+    with pytest.raises(RunError, match="belongs to another run"):
         ReplayFolder(folder.path, 6).lock()
 
 
@@ -158,7 +158,7 @@ def test_a_run_id_is_drawn_once(tmp_path: Path) -> None:
     first = draw_run_id(tmp_path)
     assert draw_run_id(tmp_path) == first
     claim(tmp_path, first)
-    with pytest.raises(RunError, match="belongs to the run with id"):
+    with pytest.raises(RunError, match="belongs to another run"):
         claim(tmp_path, first + 1)
 
 
@@ -276,7 +276,7 @@ def test_a_replay_service_refuses_restores_and_begins_anew(
         learner(node, 500, 1000, 1500)
         refused = serve_replay(endpoint, theirs, "--resume")
         assert refused.returncode == 1
-        assert "belongs to the run with id 6, the learner's has 5" in refused.stderr
+        assert "belongs to another run than the learner's" in refused.stderr
         assert contents(theirs) == before
         done = serve_replay(endpoint, ours, "--resume")
         assert "restored epoch 1000" in done.stdout, done.stderr

@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from table_reference import Copies, Stream, check_references, held_ids, make_spec
+from table_reference import Copies, Stream, check_references, held_ids, make_spec, whole_state
 
 from common.types import Batch
 from replay.table.selection import EVICTIONS, SAMPLINGS
@@ -89,7 +89,7 @@ def test_restored_table_continues_to_the_bit(
     case: dict[str, Any], steps: list[tuple[str, int]], tail: list[tuple[str, int]]
 ) -> None:
     *_, (table, _, streams) = play(case, steps)
-    meta, arrays = table.state()
+    meta, arrays = whole_state(table)
     meta = msgpack.unpackb(msgpack.packb(meta))
     arrays = {name: array.copy() for name, array in arrays.items()}
     spec = make_spec(case["stack"], case["dtype"])
@@ -148,7 +148,7 @@ def test_snapshot_stays_while_the_table_goes_on(
     case: dict[str, Any], steps: list[tuple[str, int]], tail: list[tuple[str, int]]
 ) -> None:
     *_, (table, _, streams) = play(case, steps)
-    _, then = table.state()
+    _, then = whole_state(table)
     _, arrays, frames = table.snapshot()
     with frames:
         check_references(table, frames._slots)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from samples import make_segment
-from table_reference import Copies, Stream, check_references, make_spec
+from table_reference import Copies, Stream, check_references, make_spec, whole_state
 
 from common.errors import UsageError
 from common.settings.capacity import estimated_bytes
@@ -167,7 +167,7 @@ def test_misuse_is_refused() -> None:
             table.update_priorities(np.array([1, 2]), np.array([1.0, bad]))
     with pytest.raises(ValueError, match="priorities"):
         table.update_priorities(np.array([1, 2]), np.array([1.0]))
-    meta, arrays = table.state()
+    meta, arrays = whole_state(table)
     with pytest.raises(ValueError, match="new table"):
         table.load_state(meta, arrays)
     with pytest.raises(UsageError, match="capacity: 11, but the saved table had 10"):

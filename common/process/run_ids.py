@@ -51,4 +51,4 @@ def claim(folder: Path, run_id: int) -> None:
 def check_owner(place: Path, found: int, run_id: int) -> None:
     """Raise RunError if the run id found in `place` differs from the learner's, `run_id`."""
     if found != run_id:
-        raise RunError(f"{place}: belongs to the run with id {found}, the learner's has {run_id}")
+        raise RunError(f"{place}: belongs to another run than the learner's")

@@ -249,14 +249,8 @@ class Table:
         arrays["tails"] = tail_index
         return TableSnapshot(meta, arrays, self._frames.pin(distinct))
 
-    def state(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """The state for `load_state`: scalars for msgpack, and arrays of all that is held, including frames."""
-        meta, arrays, frames = self.snapshot()
-        with frames:
-            return meta, {**arrays, "frames": frames.read(0, len(frames))}
-
     def load_state(self, meta: dict[str, Any], arrays: dict[str, Array]) -> None:
-        """Restore a state from `state` to the bit; `arrays["frames"]` may be a memory map.
+        """Restore a snapshot to the bit; `arrays["frames"]`, all its frames, may be a memory map.
 
         Raises UsageError if the state's table has other settings, ValueError if this table is not new.
         """
