@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 from actors.policy import Policy
@@ -12,6 +13,7 @@ from common.messaging.transport import NoAnswer, Node
 from common.messaging.wire import Message
 
 GRACE = 0.5  # seconds to wait for a broadcast before asking for the weights
+ANSWER_TIMEOUT = 2.0  # seconds to wait for each answer
 
 
 class WeightsFollower:
@@ -26,7 +28,7 @@ class WeightsFollower:
         self._size = policy.networks[0].flat.numel()
         self._held = [-1, -1]
         self._told = [-1, -1]
-        self._overdue: float | None = None
+        self._ask_at = math.inf  # monotonic time; inf while nothing is missing
         self._keys = [weights_key(node, 1), weights_key(node, 2)]
         self._weights = [node.latest(key) for key in self._keys]
         self._role = node.latest(role_key(node))
@@ -51,12 +53,12 @@ class WeightsFollower:
         if not self.ready:
             self.fetch()
         elif self._held[self._policy.acting] >= self._told[self._policy.acting]:
-            self._overdue = None
+            self._ask_at = math.inf
         else:
             now = time.monotonic()
-            self._overdue = self._overdue or now + GRACE
-            if now > self._overdue:
-                self._overdue = None
+            self._ask_at = min(self._ask_at, now + GRACE)
+            if now >= self._ask_at:
+                self._ask_at = math.inf
                 self.fetch()
 
     def fetch(self) -> None:
@@ -64,8 +66,8 @@ class WeightsFollower:
         question = Current().encode(self._node.run)
         try:
             for key in self._keys:
-                self._load(self._node.ask(key, question, timeout=2.0))
-            self._follow(self._node.ask(role_key(self._node), question, timeout=2.0))
+                self._load(self._node.ask(key, question, timeout=ANSWER_TIMEOUT))
+            self._follow(self._node.ask(role_key(self._node), question, timeout=ANSWER_TIMEOUT))
         except NoAnswer:
             return
 

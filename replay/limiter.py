@@ -84,7 +84,7 @@ class RateLimiter:
         if short <= 0 and (left is None or left > 0):
             return None
         updates = -ahead * self.ratio
-        if updates >= 0.5:
+        if updates > 0.5:
             return f"updates are {updates:,.0f} ahead of inserts"
         return f"the next update is due in {ceil(short):,} steps"
 

@@ -22,6 +22,14 @@ use_threads(1)
 
 # How long an example takes says nothing on a busy machine.
 hypothesis.settings.register_profile("coop", deadline=None)
+# Of a mutant it only matters whether an example fails, and each one is to meet the same examples.
+hypothesis.settings.register_profile(
+    "mutants",
+    deadline=None,
+    derandomize=True,
+    database=None,
+    phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate],
+)
 hypothesis.settings.load_profile("coop")
 
 SETTLE = 10.0  # seconds that threads and processes get to end

@@ -1,7 +1,6 @@
 """The four methods: who is trained, who gives the targets, and what happens every C updates."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +9,9 @@ import torch
 from samples import make_segment
 
 from common.errors import UsageError
-from common.settings.config import EdlSettings, LearnerSettings, Method, NetworkSettings, OptimizerName, RunConfig
+from common.settings.config import EdlSettings, LearnerSettings, Method, NetworkSettings, RunConfig
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
-from learner.optimizers import MnihRMSProp, make_optimizer
 from replay.table.table import Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
@@ -122,70 +120,12 @@ def test_weight_decay_by_layer() -> None:
         Agent(_config("dqn", weight_decay=(0.1, 0.1)), SPEC)
 
 
-def test_rmsprop_of_mnih() -> None:
-    rng = np.random.default_rng(1)
-    theta, gradient = torch.tensor([1.0, -2.0, 3.0]), torch.zeros(3)
-    optimizer = MnihRMSProp(theta, gradient, alpha=0.9, eps=0.01, gradient_alpha=0.95)
-    expected, mean, square = theta.numpy().astype(np.float64), np.zeros(3), np.zeros(3)
-    for _ in range(5):
-        g = rng.standard_normal(3)
-        gradient.copy_(torch.tensor(g))
-        optimizer.step(0.1)
-        mean = 0.95 * mean + 0.05 * g
-        square = 0.9 * square + 0.1 * g * g
-        expected = expected - 0.1 * g / np.sqrt(square - mean * mean + 0.01)
-    np.testing.assert_allclose(theta.numpy(), expected, rtol=1e-5)
-
-
-def test_rmsprop_of_mnih_moves_as_with_gradients_summed_over_the_batch() -> None:
-    settings = LearnerSettings(optimizer="rmsprop-mnih", batch_size=32, gradient_alpha=0.95, alpha=0.95, eps=0.01)
-    moved, summed = torch.zeros(50), torch.zeros(50)
-    gradient = torch.zeros(50)
-    of_means, of_sums = make_optimizer(settings, moved, gradient), MnihRMSProp(summed, 32 * gradient, 0.95, 0.01, 0.95)
-    for k in range(20):
-        gradient.copy_(1e-3 * torch.linspace(-1, 1, 50).roll(k))
-        of_sums.gradient.copy_(32 * gradient)
-        of_means.step(0.1)
-        of_sums.step(0.1)
-    torch.testing.assert_close(moved, summed)
-
-
 @pytest.mark.parametrize("gradient_alpha", [0.0, 0.9])
 def test_mnihs_rmsprop_stays_finite_where_the_two_constants_differ(gradient_alpha: float) -> None:
     settings = {"optimizer": "rmsprop-mnih", "gradient_alpha": gradient_alpha, "eps": 0.01, "learning_rate": 3e-5}
     agent = Agent(_config("dqn", **settings), SPEC)
     for batch in _batches(20):
         assert np.isfinite(agent.update(batch).td_errors).all()
-
-
-@pytest.mark.parametrize("momentum", [0.0, 0.8])
-@pytest.mark.parametrize(
-    ("name", "reference"),
-    [
-        ("sgd", lambda p, momentum: torch.optim.SGD(p, 0.1, momentum=momentum)),
-        ("rmsprop", lambda p, momentum: torch.optim.RMSprop(p, 0.1, alpha=0.9, eps=1e-3, momentum=momentum)),
-        ("adam", lambda p, _: torch.optim.Adam(p, 0.1, betas=(0.8, 0.95), eps=1e-3)),
-    ],
-)
-def test_optimizers_are_pytorchs(
-    name: OptimizerName, momentum: float, reference: Callable[[list[torch.nn.Parameter], float], torch.optim.Optimizer]
-) -> None:
-    settings = LearnerSettings(optimizer=name, momentum=momentum, alpha=0.9, beta1=0.8, beta2=0.95, eps=1e-3)
-    parameter = torch.nn.Parameter(torch.linspace(-1, 1, 50))
-    theta, gradient = parameter.detach().clone(), torch.zeros(50)
-    other = reference([parameter], momentum)
-    optimizer = make_optimizer(settings, theta, gradient)
-    for k in range(20):
-        parameter.grad = gradient.copy_(parameter.detach().roll(k).sin())
-        rate = 0.1 / (k + 1)
-        other.param_groups[0]["lr"] = rate
-        other.step()
-        optimizer.step(rate)
-        torch.testing.assert_close(theta, parameter.detach(), rtol=1e-6, atol=1e-6)
-        if k == 10:
-            state = optimizer.state()
-            optimizer = make_optimizer(settings, theta, gradient)
-            optimizer.load_state(state)
 
 
 def test_s_is_drawn_from_a_normal_distribution_of_the_falling_rate() -> None:

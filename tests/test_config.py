@@ -12,7 +12,6 @@ from common.errors import UsageError
 from common.messaging import wire
 from common.settings import schedules
 from common.settings.capacity import check_messages
-from common.settings.config import ActorSettings, EdlSettings, LearnerSettings
 from common.settings.options import RunOptions, parse_run
 from common.settings.sources import base_config
 from common.settings.tables import first_difference, load_tables, preset_names, resolve, to_tables, to_toml
@@ -179,27 +178,6 @@ def test_a_file_that_is_not_toml(tmp_path: Path) -> None:
     path.write_text("a = = 1")
     with pytest.raises(UsageError, match=r"c\.toml"):
         load_tables(None, path)
-
-
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [
-        (schedules.epsilon(ActorSettings(epsilon_start=1, epsilon_final=0.1, epsilon_steps=100), 0), 1.0),
-        (schedules.epsilon(ActorSettings(epsilon_start=1, epsilon_final=0, epsilon_steps=100), 100), 0.36787944),
-        (schedules.epsilon(ActorSettings(1, 1.0, 0.1, "linear", 100), 50), 0.55),
-        (schedules.epsilon(ActorSettings(1, 1.0, 0.1, "linear", 100), 500), 0.1),
-        (schedules.exploration_rate(EdlSettings(rate=0.1, decay=0.5, decay_every=10), 20), 0.025),
-        (schedules.exploration_rate(EdlSettings(rate=0.1, decay=0.5, decay_every=10), 15), 0.035355339),
-        (schedules.exploration_rate(EdlSettings(rate=0.1, decay=0.5, decay_every=10, decay_stepwise=True), 9), 0.1),
-        (schedules.exploration_rate(EdlSettings(rate=0.1, decay=0.5, decay_every=10, decay_stepwise=True), 15), 0.05),
-        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_final=0.01), 100, 200), 0.1),
-        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_final=0.01), 600, 200), 0.01),
-        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_decay=0.8), 999, 9000), 1.0),
-        (schedules.learning_rate(LearnerSettings(learning_rate=1.0, learning_rate_decay=0.8), 2000, 9000), 0.64),
-    ],
-)
-def test_schedules(value: float, expected: float) -> None:
-    assert value == pytest.approx(expected)
 
 
 def test_a_shorter_run_of_a_preset_is_how_the_longer_one_begins() -> None:

@@ -52,6 +52,8 @@ def test_why_not_insert(limiter: RateLimiter, inserted: int, drawn: int, reason:
         (QUARTER, 100, 2, "updates are 2 ahead of inserts"),
         (replace(QUARTER, tolerance=2), 100, 0, "the next update is due in 2 steps"),
         (replace(QUARTER, tolerance=2), 102, 0, None),
+        (replace(QUARTER, tolerance=2), 102, 1, "the next update is due in 4 steps"),  # half an update ahead
+        (replace(QUARTER, tolerance=4), 100, 1, "updates are 1 ahead of inserts"),
     ],
 )
 def test_why_not_sample(limiter: RateLimiter, inserted: int, drawn: int, reason: str | None) -> None:
@@ -157,6 +159,13 @@ def test_a_raised_start_does_not_wedge() -> None:
     for inserted in (2000, 2500, 2999):
         assert limiter.why_not_insert(inserted, 1000) is None
         assert limiter.why_not_sample(inserted, 1000, inserted) == f"waiting for 3,000 transitions, have {inserted:,}"
+    assert limiter.why_not_insert(3000, 1000) == "inserts are 1,000 steps ahead of updates"
+    assert limiter.why_not_sample(3000, 1000, 3000) is None
+
+
+def test_a_run_may_start_with_a_full_table() -> None:
+    limiter = RateLimiter(ratio=1.0, start=50, tolerance=5, total=50, capacity=50)
+    assert limiter.why_not_sample(49, 0, 49) == "waiting for 50 transitions, have 49"
 
 
 @pytest.mark.parametrize(

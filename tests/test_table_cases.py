@@ -176,11 +176,18 @@ def test_misuse_is_refused() -> None:
 
 def test_what_has_come_in_twice_is_counted() -> None:
     spec = EnvSpec("x", (4,), "float32", 1, 2)
-    table = Table(spec, 20, rng=np.random.default_rng(0))
+    table = Table(spec, 50, rng=np.random.default_rng(0))
     for sequence in range(3):
         table.insert(make_segment(spec, sequence))
     assert table.repeated() == 0
     table.insert(make_segment(spec, 1, incarnation=8))
-    other = make_segment(spec, 2, rewards=np.full(4, -1.0, np.float32))
-    table.insert(other)
-    assert (len(table), table.repeated()) == (20, 4)
+    assert table.repeated() == 4
+    differences: list[dict[str, object]] = [
+        {"actions": np.ones(4, np.int32)},
+        {"rewards": np.full(4, -1.0, np.float32)},
+        {"terminated": np.ones(4, np.bool_)},
+        {"span": np.full(4, 2, np.uint8)},
+    ]
+    for number, change in enumerate(differences):
+        table.insert(make_segment(spec, 2, incarnation=10 + number, **change))  # type: ignore[arg-type]
+    assert (len(table), table.repeated()) == (32, 4)

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import zenoh
 from msgspec.structs import replace as changed
+from samples import await_service
 
 from actors.cli import _networks
 from actors.policy import Policy
@@ -13,7 +15,7 @@ from actors.weights import GRACE, WeightsFollower
 from common.errors import JoinError
 from common.messaging.keys import role_key, weights_key
 from common.messaging.messages.join import Joined
-from common.messaging.messages.weights import Role
+from common.messaging.messages.weights import Role, Weights
 from common.messaging.transport import Node
 from common.networks.network import FlatNetwork, build_network
 from common.settings.config import NetworkSettings, RunConfig
@@ -104,6 +106,31 @@ def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(nodes: tuple[No
         time.sleep(0.01)
     assert policy.acting == 0
     assert_equal(policy, agent)
+
+
+@pytest.mark.parametrize("silent", ["weights", "role"])
+def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
+    silent: str, nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("actors.weights.ANSWER_TIMEOUT", 0.1)
+    learner, actor = nodes
+    policy = make_policy(spec)
+    follower = WeightsFollower(actor, policy)
+    flat = policy.networks[0].snapshot()
+    answers = {weights_key(learner, number): Weights(number, 4, flat).encode("test") for number in (1, 2)}
+    answers[role_key(learner)] = Role(2, (4, 4), 4).encode("test")
+    unanswered = weights_key(learner, 2) if silent == "weights" else role_key(learner)
+    for key in answers.keys() - {unanswered}:
+        learner.serve(key, lambda _, answer=answers[key]: answer)  # type: ignore[misc]
+    mute = learner.session.declare_queryable(unanswered, zenoh.handlers.FifoChannel(8), complete=True)
+    for key in answers:
+        await_service(actor, key)
+    began = time.monotonic()
+    follower.refresh()
+    assert time.monotonic() - began < 5
+    mute.undeclare()
+    assert policy.acting == 0
+    assert follower.version == 4
 
 
 def test_a_layout_that_differs_is_refused(spec: EnvSpec) -> None:
