@@ -1,5 +1,6 @@
 """Fixtures of real Zenoh sessions, and the check that a test session leaves nothing behind."""
 
+import json
 import os
 import subprocess
 import threading
@@ -32,7 +33,15 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("coop")
 
+STATS_OF_MUTMUT = Path("mutmut-stats.json")  # only where it runs mutants
 SETTLE = 10.0  # seconds that threads and processes get to end
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A mutant meets the quickest tests first, as most are killed by one of these."""
+    if STATS_OF_MUTMUT.exists():
+        durations = json.loads(STATS_OF_MUTMUT.read_text(encoding="utf-8"))["duration_by_test"]
+        items.sort(key=lambda item: durations.get(item.nodeid, 0.0))
 
 
 def _children() -> set[int]:

@@ -6,7 +6,7 @@ import pytest
 from common.types import Batch
 from learner.losses import LOSSES, output_error, td_errors
 
-ERRORS = np.array([-3.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0], np.float32)
+ERRORS = np.array([-3.0, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5], np.float32)
 
 
 def make_batch(**fields: list[float]) -> Batch:
@@ -32,9 +32,9 @@ def make_batch(**fields: list[float]) -> Batch:
 @pytest.mark.parametrize(
     ("name", "costs", "slopes"),
     [
-        ("squared", [4.5, 0.5, 0.125, 0.0, 0.125, 0.5, 2.0], ERRORS.tolist()),
-        ("mse", [9.0, 1.0, 0.25, 0.0, 0.25, 1.0, 4.0], [-6.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0]),
-        ("huber", [2.5, 0.5, 0.125, 0.0, 0.125, 0.5, 1.5], [-1.0, -1.0, -0.5, 0.0, 0.5, 1.0, 1.0]),
+        ("squared", [4.5, 0.5, 0.125, 0.0, 0.125, 0.5, 1.125], ERRORS.tolist()),
+        ("mse", [9.0, 1.0, 0.25, 0.0, 0.25, 1.0, 2.25], [-6.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]),
+        ("huber", [2.5, 0.5, 0.125, 0.0, 0.125, 0.5, 1.0], [-1.0, -1.0, -0.5, 0.0, 0.5, 1.0, 1.0]),
     ],
 )
 def test_costs_and_slopes(name: str, costs: list[float], slopes: list[float]) -> None:
