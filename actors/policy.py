@@ -42,6 +42,6 @@ class Policy:
     def _values(self, number: int, obs: Array) -> NDArray[np.floating[Any]]:
         network = self.networks[number]
         if network.dense is not None:
-            return network.dense(obs)
+            return network.dense(preprocess(obs, self._spec))
         with torch.inference_mode():
             return network(preprocess(torch.from_numpy(obs), self._spec).to(network.flat.dtype)).float().numpy()

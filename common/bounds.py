@@ -11,6 +11,9 @@ MAX_STREAMS = 65_536  # emulators of one actor process
 MAX_GAPS = 1024  # segments of a stream that may be missing while later ones have arrived
 MAX_STACK = 64  # frames of an observation
 MAX_ENV_ID = 256  # characters
+MAX_KWARGS = 65_536  # bytes of an environment's keyword arguments in a message
+MAX_SIDE = 65_536  # values of a frame along one dimension
+MAX_ACTIONS = 100_000
 
 MAX_PAYLOAD = 1 << 28  # bytes of a message; a session accepts no larger one from a peer
 MAX_LAYERS = 64  # hidden layers of a network

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any
 
@@ -11,7 +12,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from common.bounded import Count, Float32, Incarnation, Name, Share
-from common.bounds import MAX_COUNT, MAX_SEGMENT_STEPS, MAX_STACK, MAX_STREAMS, MAX_UPDATES
+from common.bounds import MAX_ACTIONS, MAX_COUNT, MAX_SEGMENT_STEPS, MAX_SIDE, MAX_STACK, MAX_STREAMS, MAX_UPDATES
 
 Array = NDArray[Any]
 
@@ -21,22 +22,31 @@ _NOT_GIVEN: NDArray[np.uint8] = np.empty(0, np.uint8)
 class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
     """The properties of an environment that networks and tables need.
 
-    frame_shape: shape of one stored frame, e.g. (84, 84) on Atari, (4,) on CartPole.
-    frame_dtype: "uint8" or "float32".
+    frame_shape: shape of one stored frame: a vector, e.g. (4,) on CartPole, or a picture, (height, width) or (height,
+        width, channels), e.g. (84, 84) on Atari.
+    frame_dtype: "uint8", "bool" or "float32".
     stack: frames in one observation (1: the frame is the observation).
     num_actions: size of the Discrete action space.
     """
 
     env_id: Name
-    frame_shape: Annotated[tuple[Annotated[int, Meta(ge=1, le=65_536)], ...], Meta(max_length=4)]
-    frame_dtype: Annotated[str, Meta(pattern="^(uint8|float32)$")]
+    frame_shape: Annotated[tuple[Annotated[int, Meta(ge=1, le=MAX_SIDE)], ...], Meta(min_length=1, max_length=3)]
+    frame_dtype: Annotated[str, Meta(pattern="^(uint8|bool|float32)$")]
     stack: Annotated[int, Meta(ge=1, le=MAX_STACK)]
-    num_actions: Annotated[int, Meta(ge=1, le=100_000)]
+    num_actions: Annotated[int, Meta(ge=1, le=MAX_ACTIONS)]
 
     @property
     def obs_shape(self) -> tuple[int, ...]:
         """Shape of one observation: (stack, *frame_shape), or frame_shape if stack is 1."""
         return self.frame_shape if self.stack == 1 else (self.stack, *self.frame_shape)
+
+    @property
+    def input_shape(self) -> tuple[int, ...]:
+        """Shape of a network's input for one observation: that of a vector, or (stack x channels, height, width)."""
+        if len(self.frame_shape) == 1:
+            return self.obs_shape
+        height, width, *channels = self.frame_shape
+        return self.stack * math.prod(channels), height, width
 
 
 class EpisodeEnd(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

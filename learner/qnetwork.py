@@ -56,7 +56,7 @@ class QNetwork:
         """The input of both networks for a batch: [2 batch, *input], obs first, then next_obs."""
         index = np.concatenate((batch.obs_index, batch.next_index)).reshape(-1)
         if self._trained.in_numpy:
-            return batch.frames.take(index, axis=0)
+            return preprocess(batch.frames.take(index, axis=0).reshape(-1, *spec.obs_shape), spec)
         device = self.network.flat.device
         # Copies, because arrays from the wire are read-only and PyTorch warns about views of those.
         frames, places = torch.tensor(batch.frames, device=device), torch.tensor(index, device=device)

@@ -9,10 +9,9 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from common.envs.pictures import SIDE
-
 CELLS = 7
-CELL = SIDE // CELLS
+CELL = 12  # pixels
+SIDE = CELLS * CELL
 MAX_RETURN = 1.0
 
 

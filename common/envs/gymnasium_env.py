@@ -1,20 +1,19 @@
-"""Any gymnasium environment with a Box or picture observation and Discrete actions, as a vector environment."""
+"""Any gymnasium environment with vectors or pictures and Discrete actions, as a vector environment."""
 
 from __future__ import annotations
 
 import dataclasses
-from difflib import get_close_matches
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
-from common.envs import catch as _registers_catch  # noqa: F401
-from common.envs import corridor as _registers_corridor  # noqa: F401
-from common.envs.pictures import SIDE, PictureResizer
+from common.bounds import MAX_ACTIONS, MAX_SIDE
+from common.envs.observations import FrameMaker
 from common.envs.protocol import Steps
+from common.envs.registry import find_registered
 from common.errors import UsageError
 from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
@@ -23,23 +22,20 @@ from common.types import Array, EnvSpec
 class GymnasiumEnv:
     """Plain gymnasium environments stepped one after another, as `VectorEnv`.
 
-    A vector observation is one float32 frame. A picture becomes an 84x84 grayscale frame (unless it is one
-    already), and `stack` frames make one observation; zeros stand for frames before an episode's first.
+    `stack` frames make one observation; zeros stand for frames before an episode's first.
     """
 
     def __init__(self, settings: EnvSettings, seeds: list[int]) -> None:
         self._envs, self._limit = _make(settings, len(seeds))
-        self.spec = _spec_of(settings, self._envs[0])
+        self._frame = FrameMaker(settings, self._envs[0].observation_space)
+        self.spec = _spec_of(settings, self._envs[0], self._frame)
         self.num_envs = len(seeds)
         self._seeds = seeds
         self._clip = settings.clip_rewards
         self._limit_terminal = settings.time_limit_terminal
-        self._pictures = self.spec.frame_dtype == "uint8"
-        space, actions = self._envs[0].observation_space, self._envs[0].action_space
-        assert space.shape is not None
+        actions = self._envs[0].action_space
         assert isinstance(actions, Discrete)
         self._first_action = int(actions.start)
-        self._resize = PictureResizer(space.shape) if self._pictures else None
         self._lengths = [0] * self.num_envs
         self._obs = np.empty(0)
         self._actions = np.empty(0, np.int32)
@@ -48,11 +44,16 @@ class GymnasiumEnv:
         self._none.flags.writeable = False
 
     def reset(self) -> Array:
-        """Start every emulator from its seed: <frame_dtype>[envs, *obs_shape]."""
+        """Start every emulator from its seed: <frame_dtype>[envs, *obs_shape].
+
+        Raises:
+            UsageError: the observations differ from what the environment's space says.
+        """
         frames = [env.reset(seed=seed)[0] for env, seed in zip(self._envs, self._seeds, strict=True)]
         self._lengths = [0] * self.num_envs
         self._obs = np.zeros((self.num_envs, *self.spec.obs_shape), self.spec.frame_dtype)
         for row, frame in enumerate(frames):
+            self._frame.check(frame)
             self._put(self._obs, row, frame)
         return self._obs
 
@@ -102,10 +103,9 @@ class GymnasiumEnv:
             self._lengths[row] = 0
         return obs
 
-    def _put(self, obs: Array, row: int, frame: Array) -> None:
+    def _put(self, obs: Array, row: int, observation: Array) -> None:
         """Store an environment's observation as the newest frame of `obs[row]`."""
-        if self._resize is not None:
-            frame = self._resize(frame)
+        frame = self._frame(observation)
         if self.spec.stack > 1:
             obs[row, -1] = frame
         else:
@@ -123,43 +123,44 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
     """The specification of a gymnasium id.
 
     Raises:
-        UsageError: the id is unknown, or a space is not supported.
+        UsageError: the id is unknown, or a space or setting is not supported.
     """
     envs, _ = _make(settings, 1)
     try:
-        return _spec_of(settings, envs[0])
+        return _spec_of(settings, envs[0], FrameMaker(settings, envs[0].observation_space))
     finally:
         envs[0].close()
 
 
 def _make(settings: EnvSettings, count: int) -> tuple[list[gymnasium.Env[Any, Any]], int]:
     """Make environments without gymnasium's checks and step limit; return them and that limit (0: none)."""
+    registered = find_registered(settings)
+    # By the specification and not by the id, because `make` warns about ids that have a newer version.
+    plain = dataclasses.replace(
+        registered,
+        order_enforce=False,
+        disable_env_checker=True,
+        max_episode_steps=None,
+        kwargs={**registered.kwargs, **settings.kwargs},
+    )
     try:
-        # By the specification and not by the id, because `make` warns about ids that have a newer version.
-        registered = gymnasium.spec(settings.id)
-        plain = dataclasses.replace(registered, order_enforce=False, disable_env_checker=True, max_episode_steps=None)
         envs = [gymnasium.make(plain) for _ in range(count)]
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"env.id: {settings.id!r} needs a package that is not installed: {error}") from None
-    except gymnasium.error.Error:
-        near = ", ".join(get_close_matches(settings.id, gymnasium.registry, n=3)) or "CartPole-v0, coop/Catch-v0"
-        raise UsageError(
-            f"env.id: unknown environment {settings.id!r}; known are gymnasium's ids, such as {near}, and ALE's games"
-        ) from None
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise UsageError(f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {text}") from error
     return envs, settings.max_episode_steps or registered.max_episode_steps or 0
 
 
-def _spec_of(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> EnvSpec:
-    space, actions = env.observation_space, env.action_space
+def _spec_of(settings: EnvSettings, env: gymnasium.Env[Any, Any], frame: FrameMaker) -> EnvSpec:
+    actions = env.action_space
     if not isinstance(actions, Discrete):
         raise UsageError(f"env.id: {settings.id!r} has the action space {actions}; allowed is Discrete")
-    num_actions, shape = int(actions.n), space.shape or ()
-    if isinstance(space, Box) and len(shape) == 1:
-        return EnvSpec(settings.id, shape, "float32", 1, num_actions)
-    picture = len(shape) == 2 or (len(shape) == 3 and shape[2] in {1, 3})
-    if isinstance(space, Box) and space.dtype == np.uint8 and picture:
-        return EnvSpec(settings.id, (SIDE, SIDE), "uint8", settings.stack, num_actions)
-    raise UsageError(
-        f"env.id: {settings.id!r} has the observation space {space}; allowed is a one-dimensional Box or a uint8 "
-        "picture, Box of height x width, height x width x 1 or height x width x 3"
-    )
+    for what, most, limit in (
+        ("actions", int(actions.n), MAX_ACTIONS),
+        ("values on a side", max(frame.shape), MAX_SIDE),
+    ):
+        if most > limit:
+            raise UsageError(f"env.id: {settings.id!r} has {most:,} {what}; allowed: at most {limit:,}")
+    return EnvSpec(settings.id, frame.shape, frame.dtype, settings.stack, int(actions.n))

@@ -7,7 +7,7 @@ import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -15,16 +15,18 @@ import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself use
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
 from common.networks.dense import Dense
 from common.types import EnvSpec
 
-ArrayT = TypeVar("ArrayT", Tensor, NDArray[np.float32])
+ArrayT = TypeVar("ArrayT", Tensor, NDArray[Any])
 
 # (out channels, kernel, stride) of each convolution, then the width of the hidden linear layer.
 _CONV_NETWORKS: dict[str, tuple[tuple[tuple[int, int, int], ...], int]] = {
     "nature": (((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512),  # Mnih et al. 2015
     "nips2013": (((16, 8, 4), (32, 4, 2)), 256),  # Mnih et al. 2013
+    "minatar": (((16, 3, 1),), 128),  # Young and Tian 2019
 }
 NETWORK_KINDS = ("mlp", *_CONV_NETWORKS)
 
@@ -32,7 +34,7 @@ NETWORK_KINDS = ("mlp", *_CONV_NETWORKS)
 def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) -> nn.Sequential:
     """A Q-network float32 [batch, *input] -> [batch, num_actions] with PyTorch's default initialisation.
 
-    kind: "mlp" (linear layers of the widths in `hidden`, ReLU between), "nature" or "nips2013" (`hidden` unused).
+    kind: "mlp" (linear layers of the widths in `hidden`, ReLU between), or a convolutional network (`hidden` unused).
     The parameters depend only on `seed`; the global random state is unchanged.
 
     Raises UsageError for an unknown kind, and for a convolutional kind if frames are not images or are too small.
@@ -48,9 +50,9 @@ def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) ->
 
 def _mlp(spec: EnvSpec, hidden: Sequence[int]) -> nn.Sequential:
     layers: OrderedDict[str, nn.Module] = OrderedDict()
-    if len(spec.obs_shape) > 1:
+    if len(spec.input_shape) > 1:
         layers["flatten"] = nn.Flatten()
-    width = math.prod(spec.obs_shape)
+    width = math.prod(spec.input_shape)
     for i, size in enumerate(hidden, start=1):
         layers[f"fc{i}"] = nn.Linear(width, size)
         layers[f"relu{i}"] = nn.ReLU()
@@ -60,34 +62,45 @@ def _mlp(spec: EnvSpec, hidden: Sequence[int]) -> nn.Sequential:
 
 
 def _conv(kind: str, spec: EnvSpec) -> nn.Sequential:
-    if len(spec.frame_shape) != 2:
-        raise UsageError(f"network kind: {kind!r} needs frames [height, width], {spec.env_id} has {spec.frame_shape}")
+    if len(spec.input_shape) != 3:
+        raise UsageError(f"network.kind = {kind!r}: needs pictures; {spec.env_id} has frames {list(spec.frame_shape)}")
     convs, width = _CONV_NETWORKS[kind]
-    channels, (height, breadth) = spec.stack, spec.frame_shape
+    channels, height, breadth = spec.input_shape
     layers: OrderedDict[str, nn.Module] = OrderedDict()
     for i, (out, kernel, stride) in enumerate(convs, start=1):
         layers[f"conv{i}"] = nn.Conv2d(channels, out, kernel, stride)
         layers[f"relu{i}"] = nn.ReLU()
         channels, height, breadth = out, (height - kernel) // stride + 1, (breadth - kernel) // stride + 1
         if min(height, breadth) < 1:
-            raise UsageError(f"network kind: {kind!r} needs larger frames than {spec.frame_shape} of {spec.env_id}")
+            shape = list(spec.frame_shape)
+            raise UsageError(f"network.kind = {kind!r}: needs larger frames than {shape} of {spec.env_id}")
+    inputs = channels * height * breadth
+    if 4 * inputs * width > MAX_PAYLOAD:
+        raise UsageError(
+            f"network.kind = {kind!r}: {inputs * width:,} parameters with frames {list(spec.frame_shape)} of "
+            f"{spec.env_id}; allowed: at most {MAX_PAYLOAD // 4:,}, what a message carries (env.resize makes less)"
+        )
     layers["flatten"] = nn.Flatten()
-    layers["fc1"] = nn.Linear(channels * height * breadth, width)
+    layers["fc1"] = nn.Linear(inputs, width)
     layers[f"relu{len(convs) + 1}"] = nn.ReLU()
     layers["out"] = nn.Linear(width, spec.num_actions)
     return nn.Sequential(layers)
 
 
-def preprocess(obs: Tensor, spec: EnvSpec) -> Tensor:
-    """The network's input for stored observations: <frame_dtype>[batch, *obs_shape] -> float32 on the same device.
+def preprocess(obs: ArrayT, spec: EnvSpec) -> ArrayT:
+    """The network's input for stored observations: <frame_dtype>[batch, *obs_shape] -> float32 [batch, *input_shape].
 
-    uint8 images are scaled to [0, 1] and get a channel axis if frames are not stacked; float32 vectors are unchanged.
+    It stays with its library, PyTorch or numpy, and on its device. uint8 is scaled to [0, 1]; bool becomes 0 and 1.
+    Planes are ordered by frame, oldest first, then by channel.
     """
-    if spec.frame_dtype == "uint8":
-        obs = obs.to(torch.float32).mul_(1 / 255)
-    if spec.stack == 1 and len(spec.frame_shape) == 2:
-        obs = obs.unsqueeze(1)
-    return obs
+    xp: Any = torch if isinstance(obs, Tensor) else np
+    if spec.frame_dtype != "float32":
+        obs = xp.asarray(obs, dtype=xp.float32)
+        if spec.frame_dtype == "uint8":
+            obs *= 1 / 255
+    if len(spec.frame_shape) == 3:
+        obs = xp.moveaxis(obs, -1, -3)
+    return obs if obs.shape[1:] == spec.input_shape else obs.reshape(-1, *spec.input_shape)
 
 
 def layer_functions(layers: Iterable[nn.Module]) -> list[Callable[[Tensor], Tensor]]:

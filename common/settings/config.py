@@ -35,8 +35,8 @@ class NetworkSettings:
     """The Q-network."""
 
     __pydantic_config__ = _STRICT
-    kind: Literal["mlp", "nature", "nips2013"] = "mlp"
-    """mlp: linear layers with ReLU; nature: 3 convolutions + 2 linear; nips2013: 2 convolutions + 2 linear."""
+    kind: Literal["mlp", "nature", "nips2013", "minatar"] = "mlp"
+    """mlp: linear layers; nature: 3 convolutions + 2 linear; nips2013: 2 + 2; minatar: 1 + 2; ReLU between."""
     hidden: Annotated[tuple[Positive, ...], Field(max_length=MAX_LAYERS)] = (128, 128, 128)
     """Widths of the mlp's hidden layers."""
     dtype: Literal["float32", "bfloat16"] = "float32"

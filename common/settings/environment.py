@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from common.bounds import MAX_ENV_ID, MAX_FRAME_SKIP, MAX_GAME_STEPS, MAX_NOOPS, MAX_STACK
+from common.bounds import MAX_ENV_ID, MAX_FRAME_SKIP, MAX_GAME_STEPS, MAX_NOOPS, MAX_SIDE, MAX_STACK
+from common.settings.fields import Table
+
+Side = Annotated[int, Field(gt=0, le=MAX_SIDE)]
 
 
 @dataclass(frozen=True)
@@ -16,7 +19,9 @@ class EnvSettings:
 
     __pydantic_config__ = ConfigDict(extra="forbid")
     id: Annotated[str, Field(min_length=1, max_length=MAX_ENV_ID)] = "CartPole-v0"
-    """A gymnasium id ("CartPole-v0", "coop/Catch-v0") or an ALE game ("breakout", "ALE/Breakout-v5")."""
+    """A gymnasium id ("CartPole-v0", "my_envs:Room-v0" of the module my_envs) or an ALE game ("breakout")."""
+    kwargs: Table = field(default_factory=dict, hash=False)
+    """Keyword arguments of the environment, a TOML table, such as {side = 12}; not for ALE games."""
     noop_max: Annotated[int, Field(ge=0, le=MAX_NOOPS)] = 30
     """Largest number of no-ops at the start of a game, which is drawn from 0..noop_max; ALE only."""
     episodic_life: bool = False
@@ -25,8 +30,12 @@ class EnvSettings:
     """Learn from rewards clipped to [-1, 1]; reported returns are unclipped."""
     frame_skip: Annotated[int, Field(gt=0, le=MAX_FRAME_SKIP)] = 4
     """Emulator frames per step, of which the last two are max-pooled; ALE only."""
-    stack: Annotated[int, Field(gt=0, le=MAX_STACK)] = 4
-    """Frames per observation, for pictures only; a vector is an observation by itself."""
+    stack: Annotated[int, Field(gt=0, le=MAX_STACK)] = 1
+    """Frames per observation."""
+    resize: tuple[Side, Side] | None = None
+    """Height and width to which pictures are resized; ALE games always have 84 x 84."""
+    grayscale: bool = False
+    """Convert colour pictures to grayscale; ALE games always are."""
     repeat_action_probability: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Probability that the emulator repeats the previous action (sticky actions); ALE only."""
     full_action_space: bool = False
@@ -38,5 +47,11 @@ class EnvSettings:
 
     @property
     def atari(self) -> bool:
-        """Whether the id names an ALE game: in namespace ALE/, or with neither a slash nor a version."""
-        return self.id.startswith("ALE/") or not ("/" in self.id or "-v" in self.id)
+        """Whether the id names an ALE game: in namespace ALE/, or with neither a module, a slash nor a version."""
+        return self.id.startswith("ALE/") or not any(part in self.id for part in (":", "/", "-v"))
+
+    @property
+    def module(self) -> str | None:
+        """The module that registers the id ("my_envs" of "my_envs:Room-v0"); None if it names none."""
+        module, colon, _ = self.id.rpartition(":")
+        return module if colon else None

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+import tomllib
+from collections.abc import Sequence
+from typing import Annotated, Any
 
-from pydantic import Field
+import msgspec
+import tomli_w
+from pydantic import AfterValidator, Field
+from tyro.constructors import PrimitiveConstructorSpec
 
-from common.bounds import MAX_INTEGER, MAX_STEPS
+from common.bounds import MAX_INTEGER, MAX_KWARGS, MAX_STEPS
 
 Positive = Annotated[int, Field(gt=0, le=MAX_INTEGER)]
 Count = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
@@ -16,3 +22,61 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 PositiveShare = Annotated[float, Field(gt=0, le=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
+
+
+def _read_table(words: Sequence[str]) -> dict[str, Any]:
+    """Read an inline TOML table from the command line, such as "{side = 12}"."""
+    try:
+        tables = tomllib.loads(f"table = {words[0]}")
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{words[0]!r} is no inline TOML table: {error}") from None
+    if tables.keys() != {"table"} or not isinstance(tables["table"], dict):
+        raise ValueError(f"{words[0]!r} is no inline TOML table, such as {{side = 12}}")
+    return tables["table"]
+
+
+def _show_table(table: dict[str, Any]) -> list[str]:
+    """The table as inline TOML, which tomli_w writes within a list."""
+    return [tomli_w.dumps({"t": [table]}).split("[", 1)[1].rpartition("]")[0].strip().rstrip(",")]
+
+
+def _transferable(table: dict[str, Any]) -> dict[str, Any]:
+    """Refuse values that a TOML file or a message could not carry."""
+    _check_values(table)
+    if (size := len(msgspec.msgpack.encode(table))) > MAX_KWARGS:
+        raise ValueError(f"{size:,} bytes; allowed: at most {MAX_KWARGS:,}")
+    return table
+
+
+def _check_values(value: Any) -> None:  # noqa: ANN401 (whatever the table holds)
+    match value:
+        case dict():
+            if not all(isinstance(key, str) for key in value):
+                raise ValueError("names must be strings")
+            for each in value.values():
+                _check_values(each)
+        case list():
+            for each in value:
+                _check_values(each)
+        case bool() | str():
+            pass
+        case int() if -MAX_INTEGER <= value <= MAX_INTEGER:
+            pass
+        case float() if math.isfinite(value):
+            pass
+        case _:
+            raise ValueError(f"{value!r}: allowed: strings, booleans, finite numbers, lists and tables of them")
+
+
+Table = Annotated[
+    dict[str, Any],
+    AfterValidator(_transferable),
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="TABLE",
+        instance_from_str=_read_table,
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=_show_table,
+    ),
+]
+"""A TOML table with any values; on the command line an inline table."""

@@ -1,4 +1,4 @@
-"""Reads settings under their names of earlier versions, in tables and on command lines."""
+"""Reads settings of earlier versions: their names, in tables and on command lines, and what they meant."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 from common.errors import UsageError
 from common.process.notices import note_renamed
 from common.settings.config import LearnerSettings
+from common.settings.environment import EnvSettings
 
 _RENAMED = {
     "replay": {"start": "learning_starts"},
@@ -51,6 +52,19 @@ def current_flags(args: Sequence[str], optimizer: str) -> list[str]:
     renamed = list(_flags(args, optimizer, found))
     note_renamed(found)
     return renamed
+
+
+def with_stack(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Give a resolved config from before `env.grayscale` the stack that its run had.
+
+    Such a config states `env.stack` in any case, but vectors were never stacked; of the environments that those
+    versions accepted beside ALE's games, only Catch has pictures.
+    """
+    env = tables.get("env")
+    if not isinstance(env, Mapping) or "grayscale" in env or not {"id", "noop_max", "stack"} <= env.keys():
+        return dict(tables)
+    unstacked = not EnvSettings(id=str(env["id"])).atari and env["id"] != "coop/Catch-v0"
+    return {**tables, "env": {**env, "stack": 1}} if unstacked else dict(tables)
 
 
 def _flags(args: Sequence[str], optimizer: str, found: dict[str, str]) -> Iterator[str]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
 from common.errors import UsageError
 from common.settings.config import RunConfig
+from common.settings.environment import EnvSettings
 
 
 def check_rules(config: RunConfig) -> None:
@@ -33,6 +34,11 @@ def _problems(config: RunConfig) -> Iterator[str]:
             f"total_steps = {config.total_steps}: plans no update; allowed: at least {least} "
             f"with replay.learning_starts = {replay.learning_starts} and replay.ratio = {replay.ratio:g}"
         )
+    if config.env.atari:
+        plain = EnvSettings()
+        for name in ("kwargs", "resize", "grayscale"):
+            if (value := getattr(config.env, name)) != getattr(plain, name):
+                yield f"env.{name} = {value!r}: not for {config.env.id!r}; ALE's games show 84x84 grayscale pictures"
     if not replay.replacement and replay.sampling != "uniform":
         yield f"replay.sampling = {replay.sampling!r}: allowed: 'uniform' with replay.replacement = False"
     if replay.journal_keep and not replay.journal:

@@ -15,7 +15,7 @@ import tomli_w
 from common.errors import UsageError
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.settings.methods import merged, of_method
-from common.settings.renamed import current
+from common.settings.renamed import current, with_stack
 from common.settings.rules import check_rules
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
@@ -71,12 +71,12 @@ def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
 def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     """Turn tables into a checked config; a `[methods.NAME]` table overrides the rest for that method.
 
-    It also reads settings under their names of earlier versions.
+    It also reads configs of earlier versions.
 
     Raises:
         UsageError: an unknown field or a value out of range; names the field, the value and what is allowed.
     """
-    return validated(of_method(current(tables), method))
+    return validated(of_method(with_stack(current(tables)), method))
 
 
 def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:

@@ -46,7 +46,9 @@ def check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
         check_range(f"arrays.{name}", arrays[name], 0, len(frames) - 1)
     check_range("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
     check_range("arrays.rewards", arrays["rewards"], -MAX_MAGNITUDE, MAX_MAGNITUDE)
-    if frames.dtype == np.float32:
+    if frames.dtype == np.bool_:
+        check_range("arrays.frames", frames.view(np.uint8), 0, 1)
+    elif frames.dtype == np.float32:
         check_range("arrays.frames", frames, -MAX_MAGNITUDE, MAX_MAGNITUDE)
     check_range("arrays.terminated", arrays["terminated"].view(np.uint8), 0, 1)
     check_range("arrays.param_version", arrays["param_version"], 0, MAX_UPDATES)

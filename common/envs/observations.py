@@ -1,0 +1,67 @@
+"""What an environment's observations become: stored frames of one shape and dtype."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+
+from common.envs.pictures import grayscale, make_resizer
+from common.errors import UsageError
+from common.settings.environment import EnvSettings
+from common.types import Array
+
+KEPT = ("uint8", "bool")  # dtypes that are stored as they are; all others become float32
+
+
+class FrameMaker:
+    """Makes a frame of each observation: a vector, or a picture height x width (x channels).
+
+    Frames are the observations themselves, unless `env.resize` or `env.grayscale` asks for other pictures.
+
+    shape, dtype: of a frame; dtype is "uint8", "bool" or "float32".
+    """
+
+    def __init__(self, settings: EnvSettings, space: gymnasium.Space[Array]) -> None:
+        """Raise UsageError for a space, or a change of pictures, that is not supported."""
+        name = f"env.id: {settings.id!r}"
+        if not isinstance(space, Box) or not 1 <= len(space.shape) <= 3:
+            raise UsageError(
+                f"{name} has the observation space {space}; allowed is a Box of one dimension, or of pictures, height "
+                "x width or height x width x channels"
+            )
+        self._name, self._space = name, space
+        self.shape: tuple[int, ...] = space.shape
+        self.dtype = str(space.dtype) if str(space.dtype) in KEPT else "float32"
+        self._to_gray = settings.grayscale
+        if settings.grayscale:
+            self._need("env.grayscale = true", len(self.shape) == 3 and self.shape[2] == 3, "three colour channels")
+            self.shape = self.shape[:2]
+        self._resize = None
+        if settings.resize is not None:
+            self._need(f"env.resize = {list(settings.resize)}", len(self.shape) > 1, "pictures")
+            self._resize = make_resizer(self.shape[:2], settings.resize)
+            self.shape = (*settings.resize, *self.shape[2:])
+        self._changes = self._to_gray or self._resize is not None
+
+    def __call__(self, observation: Array) -> Array:
+        """The frame of an observation, of this shape; its dtype is cast where it is stored."""
+        if not self._changes:
+            return observation
+        picture = grayscale(observation) if self._to_gray else observation
+        picture = picture if self._resize is None else self._resize(picture)
+        return np.rint(picture) if self.dtype == "uint8" else picture
+
+    def check(self, observation: Array) -> None:
+        """Raise UsageError for an observation that its space does not describe."""
+        found = np.asarray(observation)
+        if found.shape != self._space.shape or not np.can_cast(found.dtype, self._space.dtype, "same_kind"):
+            raise UsageError(
+                f"{self._name} gives observations {found.dtype}{list(found.shape)}; its observation space says "
+                f"{self._space.dtype}{list(self._space.shape)}"
+            )
+
+    def _need(self, asked: str, holds: bool, what: str) -> None:
+        if not holds or self.dtype == "bool":
+            found = f"{self._space.dtype}{list(self._space.shape)}"
+            raise UsageError(f"{asked}: needs {what} in uint8 or float32; {self._name} has {found}")

@@ -1,0 +1,63 @@
+"""Finds the environment that an id names: registered, in a module to import, or of an installed package."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec, namespace
+
+from common.envs import catch as _registers_catch  # noqa: F401
+from common.envs import corridor as _registers_corridor  # noqa: F401
+from common.errors import UsageError
+from common.process.modules import import_named
+from common.settings.environment import EnvSettings
+
+_PACKAGES = {"MinAtar": "minatar"}  # known packages by the namespace of their ids
+_ANY_NAMESPACE = "__root__"  # name of entry points that register ids of any namespace
+
+
+def find_registered(settings: EnvSettings) -> EnvSpec:
+    """The entry for the id in gymnasium's registry.
+
+    Raises:
+        UsageError: the id is unknown, or its module or package cannot be imported.
+    """
+    asked = f"env.id = {settings.id!r}"
+    if settings.module is not None:
+        import_named(asked, settings.module)
+    name = settings.id.rpartition(":")[2]
+    space = name.rpartition("/")[0]
+    for point in entry_points(group="gymnasium.envs"):  # gymnasium 1 leaves them to its users
+        if name not in gymnasium.registry and point.name in {space, _ANY_NAMESPACE}:
+            try:
+                _load(point)
+            except Exception as error:
+                raise UsageError(f"{asked}: {point.value} fails: {type(error).__name__}: {error}") from error
+    try:
+        return gymnasium.spec(name)
+    except gymnasium.error.Error:
+        raise UsageError(_unknown(settings, name, space)) from None
+
+
+@cache
+def _load(point: EntryPoint) -> None:
+    """Let an installed package register its environments, once."""
+    register = point.load()
+    if point.name == _ANY_NAMESPACE:
+        register()
+    else:
+        with namespace(point.name):
+            register()
+
+
+def _unknown(settings: EnvSettings, name: str, space: str) -> str:
+    asked = f"env.id: unknown environment {settings.id!r}"
+    if space in _PACKAGES and not any(known.startswith(f"{space}/") for known in gymnasium.registry):
+        return f"{asked}; ids of {space} need the package {_PACKAGES[space]}, which is not installed"
+    near = ", ".join(get_close_matches(name, gymnasium.registry, n=3)) or "CartPole-v0, coop/Catch-v0"
+    if settings.module is not None:
+        return f"{asked}; the module {settings.module} does not register {name}; known are {near}"
+    return f"{asked}; known are gymnasium's ids, such as {near}, ids of modules (my_envs:Room-v0), and ALE's games"
