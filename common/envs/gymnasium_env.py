@@ -15,6 +15,7 @@ from common.envs.observations import FrameMaker
 from common.envs.protocol import Steps
 from common.envs.registry import find_registered
 from common.errors import UsageError
+from common.imports import describe
 from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
 
@@ -148,8 +149,8 @@ def _make(settings: EnvSettings, count: int) -> tuple[list[gymnasium.Env[Any, An
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"env.id: {settings.id!r} needs a package that is not installed: {error}") from None
     except Exception as error:
-        text = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise UsageError(f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {text}") from error
+        text = f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {describe(error)}"
+        raise UsageError(text) from error
     return envs, settings.max_episode_steps or registered.max_episode_steps or 0
 
 

@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec, namespace
 from common.envs import catch as _registers_catch  # noqa: F401
 from common.envs import corridor as _registers_corridor  # noqa: F401
 from common.errors import UsageError
-from common.process.modules import import_named
+from common.imports import describe, import_module
 from common.settings.environment import EnvSettings
 
 _PACKAGES = {"MinAtar": "minatar"}  # known packages by the namespace of their ids
@@ -25,9 +25,8 @@ def find_registered(settings: EnvSettings) -> EnvSpec:
     Raises:
         UsageError: the id is unknown, or its module or package cannot be imported.
     """
-    asked = f"env.id = {settings.id!r}"
     if settings.module is not None:
-        import_named(asked, settings.module)
+        import_module(settings.module, "env.id")
     name = settings.id.rpartition(":")[2]
     space = name.rpartition("/")[0]
     for point in entry_points(group="gymnasium.envs"):  # gymnasium 1 leaves them to its users
@@ -35,7 +34,8 @@ def find_registered(settings: EnvSettings) -> EnvSpec:
             try:
                 _load(point)
             except Exception as error:
-                raise UsageError(f"{asked}: {point.value} fails: {type(error).__name__}: {error}") from error
+                text = f"env.id = {settings.id!r}: cannot load {point.value!r}: {describe(error)}"
+                raise UsageError(text) from error
     try:
         return gymnasium.spec(name)
     except gymnasium.error.Error:
