@@ -53,7 +53,7 @@ def check_chain(segments: list[Segment], spec: EnvSpec) -> None:
         last[segment.stream] = segment
 
 
-BREAKOUT = {"id": "breakout", "clip_rewards": True}
+BREAKOUT = {"id": "breakout", "stack": 4, "clip_rewards": True}
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ BREAKOUT = {"id": "breakout", "clip_rewards": True}
         (BREAKOUT | {"episodic_life": True, "max_episode_steps": 60}, 8, 200, 64),
         (BREAKOUT | {"episodic_life": True, "max_episode_steps": 29, "noop_max": 3}, 32, 100, 16),
         (BREAKOUT | {"stack": 1, "max_episode_steps": 20}, 2, 50, 16),
-        ({"id": "coop/Catch-v0"}, 1, 200, 16),
+        ({"id": "coop/Catch-v0", "stack": 4}, 1, 200, 16),
         ({"id": "coop/Catch-v0", "stack": 2}, 3, 100, 1),
         ({"id": "CartPole-v0"}, 1, 500, 50),
         ({"id": "CartPole-v0", "max_episode_steps": 4}, 8, 200, 3),

@@ -16,7 +16,7 @@ from replay.table.table import Table
 @cache
 def played(num_envs: int) -> tuple[EnvSpec, Seen]:
     """Games full of lost lives, truncations and new starts."""
-    config = EnvSettings(id="breakout", episodic_life=True, max_episode_steps=67, noop_max=3)
+    config = EnvSettings(id="breakout", stack=4, episodic_life=True, max_episode_steps=67, noop_max=3)
     return record(config, num_envs, {1: 600, 8: 200, 32: 100}[num_envs])
 
 
