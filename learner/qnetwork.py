@@ -10,12 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.networks.network import FlatNetwork, build_network, preprocess
+from common.errors import UsageError
+from common.networks.network import FlatNetwork, build_network, preprocess, sample_inputs
 from common.settings.config import RunConfig
 from common.types import Batch, EnvSpec
 from learner.edl.arrays import Array, assign
-from learner.edl.backprop import Tape
 from learner.edl.feedback import FeedbackRule
+from learner.edl.graph import Graph
+from learner.edl.passes import Tape, UnsupportedLayerError
 from learner.edl.trainable import Trainable
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
@@ -29,21 +31,35 @@ class QNetwork:
 
     Args:
         network: the parameters, also published and saved. half: a copy in bfloat16, or None.
-        rng: random numbers of the feedback.
+        spec: of the environment. rng: random numbers of the feedback.
+
+    Raises:
+        UsageError: a setting or the feedback has no meaning for the network; names the layer.
 
     Attributes:
         theta, gradient: float32 [P], of PyTorch or numpy, for the optimizer.
     """
 
     def __init__(
-        self, network: FlatNetwork, half: FlatNetwork | None, config: RunConfig, rng: np.random.Generator
+        self,
+        network: FlatNetwork,
+        half: FlatNetwork | None,
+        config: RunConfig,
+        spec: EnvSpec,
+        rng: np.random.Generator,
     ) -> None:
         polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
         in_numpy = polar_dtype is None and not config.learner.compile
         self.network = network
         self._half = half
-        self._trained = Trainable(network, in_numpy)
-        self._target = self._trained if half is None else Trainable(half, in_numpy)
+        example = None if config.feedback == "none" else sample_inputs(spec, 8).to(network.flat.device)
+        try:
+            self._trained = Trainable(network, in_numpy, example)
+        except UnsupportedLayerError as error:
+            raise UsageError(f"network.kind = {config.network.kind!r}: {error}") from error
+        if isinstance(self._trained.chain, Graph):
+            _check_plain(config)
+        self._target = self._trained if half is None else Trainable(half, in_numpy, None)
         self._source = self._target if config.feedback == "none" else self._trained
         rule = FeedbackRule(self._source.chain, config.feedback, config.seed, polar_dtype, rng)
         ready = torch.compile if config.learner.compile else _as_it_is
@@ -91,6 +107,21 @@ class QNetwork:
             self._half.load(self.network.flat)
 
 
+def _check_plain(config: RunConfig) -> None:
+    """Raise UsageError for settings that only the passes of plain stacks know."""
+    settings = (
+        ("network.dtype", config.network.dtype, "float32"),
+        ("edl.polar_dtype", config.edl.polar_dtype, "float32"),
+        ("learner.compile", config.learner.compile, False),
+    )
+    for name, value, allowed in settings:
+        if value != allowed:
+            stacks = "only stacks of Linear, Conv2d, ReLU and Flatten have others"
+            raise UsageError(
+                f"{name} = {value!r}: allowed: {allowed!r} with network.kind = {config.network.kind!r}; {stacks}"
+            )
+
+
 def make_network(
     config: RunConfig, spec: EnvSpec, number: int, device: torch.device, dtype: torch.dtype = torch.float32
 ) -> FlatNetwork:
@@ -105,7 +136,7 @@ def make_q_network(
     """Make network 0 or 1 with its initial parameters, for training."""
     in_half = config.network.dtype == "bfloat16"
     half = make_network(config, spec, number, device, torch.bfloat16) if in_half else None
-    return QNetwork(make_network(config, spec, number, device), half, config, rng)
+    return QNetwork(make_network(config, spec, number, device), half, config, spec, rng)
 
 
 def on_host(values: Array) -> NDArray[np.float32]:

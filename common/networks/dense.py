@@ -19,7 +19,7 @@ class Dense:
     names: prefix of the parameters' names of each layer. weights: <float>[out, in]. biases: <float>[out, 1].
     """
 
-    def __init__(self, module: nn.Sequential) -> None:
+    def __init__(self, module: nn.Module) -> None:
         """`module` must fit (see `fits`)."""
         layers = [(name, step) for name, step in module.named_children() if isinstance(step, nn.Linear)]
         self.names = [f"{name}." for name, _ in layers]
@@ -29,7 +29,7 @@ class Dense:
     @staticmethod
     def fits(module: nn.Module) -> bool:
         """Whether a network is Linear, ReLU, Linear, ..., Linear with biases, in float32 or float64 on the CPU."""
-        steps = list(module.children()) if isinstance(module, nn.Sequential) else []
+        steps = list(module.children()) if type(module) is nn.Sequential else []
         kinds = [type(step) for step in steps]
         return (
             len(steps) % 2 == 1

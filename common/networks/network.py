@@ -17,7 +17,9 @@ from torch import Tensor, nn
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
+from common.networks.custom import custom_network
 from common.networks.dense import Dense
+from common.settings.config import NETWORK_KINDS
 from common.types import EnvSpec
 
 ArrayT = TypeVar("ArrayT", Tensor, NDArray[Any])
@@ -28,16 +30,17 @@ _CONV_NETWORKS: dict[str, tuple[tuple[tuple[int, int, int], ...], int]] = {
     "nips2013": (((16, 8, 4), (32, 4, 2)), 256),  # Mnih et al. 2013
     "minatar": (((16, 3, 1),), 128),  # Young and Tian 2019
 }
-NETWORK_KINDS = ("mlp", *_CONV_NETWORKS)
 
 
-def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) -> nn.Sequential:
+def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) -> nn.Module:
     """A Q-network float32 [batch, *input] -> [batch, num_actions] with PyTorch's default initialisation.
 
-    kind: "mlp" (linear layers of the widths in `hidden`, ReLU between), or a convolutional network (`hidden` unused).
+    kind: "mlp" (linear layers of the widths in `hidden`, ReLU between), a convolutional network (`hidden` unused), or
+    "module:name", a function of `spec` that gives any module.
     The parameters depend only on `seed`; the global random state is unchanged.
 
-    Raises UsageError for an unknown kind, and for a convolutional kind if frames are not images or are too small.
+    Raises UsageError for an unknown kind, for a convolutional kind if frames are not images or are too small, and for
+    a module that is no Q-network of this environment.
     """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
@@ -45,6 +48,8 @@ def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) ->
             return _mlp(spec, hidden)
         if kind in _CONV_NETWORKS:
             return _conv(kind, spec)
+        if ":" in kind:
+            return custom_network(kind, spec, sample_inputs(spec, 4))
     raise UsageError(f"network kind: {kind!r} is not one of {', '.join(NETWORK_KINDS)}")
 
 
@@ -103,6 +108,14 @@ def preprocess(obs: ArrayT, spec: EnvSpec) -> ArrayT:
     return obs if obs.shape[1:] == spec.input_shape else obs.reshape(-1, *spec.input_shape)
 
 
+def sample_inputs(spec: EnvSpec, count: int) -> Tensor:
+    """Made-up inputs of a network, always the same: float32 [count, *input]."""
+    rng, shape = np.random.default_rng(0), (count, *spec.obs_shape)
+    top = {"uint8": 255, "bool": 1}.get(spec.frame_dtype)
+    drawn: NDArray[Any] = rng.standard_normal(shape) if top is None else rng.integers(top + 1, size=shape)
+    return preprocess(torch.from_numpy(drawn.astype(spec.frame_dtype)), spec)
+
+
 def layer_functions(layers: Iterable[nn.Module]) -> list[Callable[[Tensor], Tensor]]:
     """Each layer as a plain function, for forward passes without gradients; calling a module costs as much as a layer.
 
@@ -137,14 +150,14 @@ class FlatNetwork:
     layout: (name, shape) of each parameter in the order of the buffer.
     """
 
-    def __init__(self, module: nn.Sequential) -> None:
+    def __init__(self, module: nn.Module) -> None:
         parameters = list(module.named_parameters())
         self.module = module
         self.layout: list[tuple[str, tuple[int, ...]]] = [(name, tuple(p.shape)) for name, p in parameters]
         self.flat = torch.cat([p.detach().reshape(-1) for _, p in parameters])
         for (_, p), view in zip(parameters, self.views(self.flat).values(), strict=True):
             p.data = view
-        self._functions = layer_functions(module)
+        self._functions = layer_functions(module if type(module) is nn.Sequential else [module])
         self.dense = Dense(module) if Dense.fits(module) else None
 
     def __call__(self, x: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from pydantic import ConfigDict, Field
 from common.bounds import (
     MAX_AHEAD,
     MAX_BATCH,
+    MAX_ENV_ID,
     MAX_GAPS,
     MAX_LAYERS,
     MAX_N_STEP,
@@ -23,6 +24,7 @@ from common.errors import UsageError
 from common.settings.environment import EnvSettings
 from common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
 
+NETWORK_KINDS = ("mlp", "nature", "nips2013", "minatar")
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 Method = Literal["dqn", "edql", "g-coop", "coop"]
 METHODS: tuple[Method, ...] = get_args(Method)  # in the order of the paper's table
@@ -35,8 +37,8 @@ class NetworkSettings:
     """The Q-network."""
 
     __pydantic_config__ = _STRICT
-    kind: Literal["mlp", "nature", "nips2013", "minatar"] = "mlp"
-    """mlp: linear layers; nature: 3 convolutions + 2 linear; nips2013: 2 + 2; minatar: 1 + 2; ReLU between."""
+    kind: Annotated[str, Field(max_length=MAX_ENV_ID)] = "mlp"
+    """mlp, nature (3 convolutions + 2 linear), nips2013 (2 + 2), minatar (1 + 2), or your own module:function."""
     hidden: Annotated[tuple[Positive, ...], Field(max_length=MAX_LAYERS)] = (128, 128, 128)
     """Widths of the mlp's hidden layers."""
     dtype: Literal["float32", "bfloat16"] = "float32"

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
 from common.errors import UsageError
-from common.settings.config import RunConfig
+from common.settings.config import NETWORK_KINDS, RunConfig
 from common.settings.environment import EnvSettings
 
 
@@ -19,6 +19,9 @@ def check_rules(config: RunConfig) -> None:
 
 def _problems(config: RunConfig) -> Iterator[str]:
     replay, learner = config.replay, config.learner
+    if config.network.kind not in NETWORK_KINDS and ":" not in config.network.kind:
+        kinds = ", ".join(NETWORK_KINDS)
+        yield f"network.kind = {config.network.kind!r}: allowed: {kinds}, or module:function"
     for name, most in (("replay.capacity", replay.capacity), ("total_steps", config.total_steps)):
         if replay.learning_starts > most:
             yield f"replay.learning_starts = {replay.learning_starts}: must not exceed {name} = {most}"

@@ -3,42 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself uses
 from torch import Tensor, nn
 
 from common.networks.network import layer_functions
-from learner.edl.arrays import Array
+from learner.edl.passes import Passes, Tape, UnsupportedLayerError
 
 Parametrised = nn.Linear | nn.Conv2d
 
 
-class UnsupportedLayerError(ValueError):
-    """A network contains a layer other than Linear, Conv2d, ReLU and Flatten; the message names it."""
-
-
-@dataclass(slots=True)
-class Tape:
-    """The activations of one forward pass, for the backward passes.
-
-    output: [batch, actions]. inputs: the input of each step of the chain, [batch, *shape], images channels last.
-    """
-
-    output: Array
-    inputs: list[Array]
-
-    def head(self, batch: int) -> Tape:
-        """The tape of the first `batch` samples."""
-        return Tape(self.output[:batch], [x[:batch] for x in self.inputs])
-
-    def output_of(self, index: int) -> Array:
-        """The output of step `index`: [batch, *shape]; if a ReLU follows, only its shape and sign are valid."""
-        return self.inputs[index + 1] if index + 1 < len(self.inputs) else self.output
-
-
-class Chain:
+class Chain(Passes):
     """The steps of a network, checked once, and the products of backpropagation.
 
     names: prefix of the parameters' names of each step. parametrised: indices of the Linear and Conv2d steps.
@@ -161,7 +137,7 @@ def _transposed(conv: nn.Conv2d, rows: Tensor, weight: Tensor, h: Tensor) -> Ten
 
 def _leaves(module: nn.Module, prefix: str) -> Iterator[tuple[str, nn.Module]]:
     """Yield (prefix of parameter names, layer) in order, including those of nested Sequentials."""
-    if not isinstance(module, nn.Sequential):
+    if type(module) is not nn.Sequential:  # a subclass may have a forward of its own
         yield prefix, module
         return
     for name, child in module._modules.items():

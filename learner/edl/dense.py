@@ -9,10 +9,10 @@ import torch
 
 from common.networks.dense import Dense
 from learner.edl.arrays import Array
-from learner.edl.backprop import Tape
+from learner.edl.passes import Passes, Tape
 
 
-class DenseChain:
+class DenseChain(Passes):
     """The products of backpropagation, like `Chain`; a step is a Linear layer with its ReLU."""
 
     def __init__(self, network: Dense) -> None:

@@ -9,8 +9,8 @@ orthogonal polar factor P(i) = U V^T,
 
 Other code calls `edl_gradients` and `feedback_matrices`. A learner keeps one `FeedbackRule` per network:
 
-    rule = FeedbackRule(Chain(network), feedback="transform")
-    tape = rule.chain.forward(x)                # tape.output: [batch, actions]; no autograd anywhere
+    rule = FeedbackRule(make_passes(network, x), feedback="transform")
+    tape = rule.chain.forward(x)                # tape.output: [batch, actions]
     rule.backward(tape, error, s, out)          # overwrites out[name], e.g. FlatNetwork.gradients
 
 With s = 0, or feedback "none", backward is plain backpropagation and costs one gradient.
@@ -27,8 +27,8 @@ from torch import Tensor, nn
 
 from common.process.memory import keep_freed_memory
 from learner.edl.arrays import Array, convert_like
-from learner.edl.backprop import Chain, Tape
-from learner.edl.dense import DenseChain
+from learner.edl.layers import make_passes
+from learner.edl.passes import Passes, Tape
 from learner.edl.polar import polar, polar_of_product
 from learner.edl.transforms import Transforms
 
@@ -38,18 +38,18 @@ FEEDBACKS = ("none", "transform", "weight-gradient", "random")
 class FeedbackRule:
     """The backward pass of one network under one feedback.
 
-    chain: the network, in PyTorch or in numpy; all arrays are of the same library.
+    chain: the passes of the network, in PyTorch or in numpy; all arrays are of the same library.
     feedback: "none" (backpropagation), "transform" (the equations above), "weight-gradient" (backpropagation, then
         U (S + s I) V^T of each weight gradient; biases plain) or "random" (fixed B(i), direct feedback alignment).
     seed: of the fixed matrices of "random".
     rng: draws the completion of rank-deficient gradients for "weight-gradient" (default: a generator from `seed`).
     polar_dtype: dtype of the passes that only the polar part needs; T(i)^T e always has the network's. None: the
-        network's. Only for a `Chain`.
+        network's. Only for plain stacks in PyTorch.
     """
 
     def __init__(
         self,
-        chain: Chain | DenseChain,
+        chain: Passes,
         feedback: str = "transform",
         seed: int = 0,
         polar_dtype: torch.dtype | None = None,
@@ -82,6 +82,7 @@ class FeedbackRule:
                 if self.feedback == "weight-gradient" and s != 0:
                     gradient = out[self.chain.names[index] + "weight"]
                     gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index], self._rng)
+        self.chain.write_rest(tape, error, out)
 
     def _transform(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
         """Compute sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e and the gradients of every layer."""
@@ -95,9 +96,9 @@ class FeedbackRule:
                 self.chain.write(tape, index, delta[:, 0] + polar_parts[index], out)
 
     def _aligned(self, tape: Tape, index: int, error: Array) -> Array:
-        """B(i)^T e with the fixed B(i) of layer `index`; that of the last layer is the identity, like T(d)."""
+        """B(i)^T e with the fixed B(i) of layer `index`; that of a last layer is the identity, like T(d)."""
         shape = tape.output_of(index).shape
-        if index == self.chain.parametrised[-1]:
+        if index == self.chain.parametrised[-1] and math.prod(shape) == math.prod(error.shape):
             return error.reshape(shape)
         if index not in self._fixed:
             size = math.prod(shape[1:])
@@ -111,7 +112,7 @@ class FeedbackRule:
 def _polar_of_gradient(gradient: Array, delta: Array, h: Array, rng: np.random.Generator) -> Array:
     """U V^T of a weight gradient [m, ...]; for a Linear layer it is delta^T h, rank-deficient in a small batch."""
     matrix = torch.as_tensor(gradient).flatten(1)
-    if delta.ndim == 2 and len(delta) < min(matrix.shape):
+    if h.ndim == 2 and len(delta) < min(matrix.shape):
         factor = polar_of_product(torch.as_tensor(delta), torch.as_tensor(h), rng)
     else:
         factor = polar(matrix, rng)
@@ -131,10 +132,10 @@ def edl_gradients(
     """One gradient per named parameter of `network`, in the parameter's shape and dtype.
 
     obs: float [batch, *input]. output_error: [batch, actions], e, already divided by the batch size. s: the
-    exploration rate. feedback, seed, polar_dtype: see FeedbackRule. Raises UnsupportedLayerError for a network that is
-    not a sequence of Linear, Conv2d, ReLU and Flatten.
+    exploration rate. feedback, seed, polar_dtype: see FeedbackRule. Raises UnsupportedLayerError, which names the
+    layer, for a network on which the feedback has no meaning.
     """
-    chain = Chain(network)
+    chain = make_passes(network, None if feedback == "none" else obs)
     out = {name: torch.empty_like(p) for name, p in network.named_parameters()}
     with torch.no_grad():
         FeedbackRule(chain, feedback, seed, polar_dtype).backward(chain.forward(obs), output_error, s, out)
@@ -146,7 +147,7 @@ def feedback_matrices(network: nn.Module, obs: Tensor, s: float) -> dict[str, Te
 
     n_i counts layer i's pre-activations, in the order [channels, height, width] for a convolution.
     """
-    chain = Chain(network)
+    chain = make_passes(network, obs)
     with torch.no_grad():
         found = Transforms(chain, chain.forward(obs)).matrices(s)
     return {chain.names[index].rstrip("."): b for index, b in reversed(found)}

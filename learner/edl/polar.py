@@ -150,14 +150,14 @@ def _paired(m: int, n: int, rank: int, rng: np.random.Generator) -> Tensor:
     return torch.from_numpy(paired)
 
 
-def polar_by_svd(matrices: Tensor) -> Tensor:
+def polar_by_svd(matrices: Tensor, rank: int | None = None) -> Tensor:
     """U V^T of each matrix [batch, m, n], computed in float64; nan if a matrix is not finite.
 
-    All min(m, n) singular values of the result are 1: LAPACK's U and V complete a rank-deficient matrix with an
-    orthonormal basis of the null directions, which depends only on the matrix.
+    rank: number of singular values to keep, the largest; min(m, n) if None. They are 1 in the result: LAPACK's U and V
+    complete a matrix of a lower rank with an orthonormal basis of null directions, which depends only on the matrix.
     """
     m = matrices.double()
     broken = None if m.sum().isfinite() else ~m.isfinite().flatten(1).all(1)[:, None, None]
     u, _, vh = torch.linalg.svd(m if broken is None else m.masked_fill(broken, 0), full_matrices=False)
-    factor: Tensor = (u @ vh).to(matrices.dtype)
+    factor: Tensor = (u[..., :rank] @ vh[..., :rank, :]).to(matrices.dtype)
     return factor if broken is None else factor.masked_fill_(broken, torch.nan)

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from learner.edl.arrays import Array, convert_like, namespace
-from learner.edl.backprop import Chain, Tape
-from learner.edl.dense import DenseChain
+from learner.edl.passes import Passes, Range, Tape
 from learner.edl.polar import polar_by_svd, whitened
 
 _SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
@@ -22,9 +21,11 @@ class Transforms:
     Q instead of the identity, so this object holds Q T(i), which has T(i)'s singular values and V. The actions' values
     share most of their gradient; Q separates this part from the differences, which keeps the Gram matrices accurate in
     the network's own dtype. T of a final Linear layer is the identity and is not held.
+
+    The polar factor of a T that lacks rank by construction (see `Range`) is the thin one, which stays in T's range.
     """
 
-    def __init__(self, chain: Chain | DenseChain, tape: Tape, dtype: torch.dtype | None = None) -> None:
+    def __init__(self, chain: Passes, tape: Tape, dtype: torch.dtype | None = None) -> None:
         """dtype: of the computation of T(i), the network's if None; the algebra on them uses at least float32."""
         self._chain = chain
         self._batch, self._actions = tape.output.shape
@@ -38,6 +39,7 @@ class Transforms:
         for index, t in walk:
             self._layers.append((index, t.shape[2:]))
             self._ts.append(_flat(t) if dtype is None else _flat(t).to(tape.output.dtype))
+        self._ranges = [chain.range_of(index) for index, _ in self._layers]
 
     def apply_feedback(self, error: Array, s: float, polar_only: bool = False) -> Iterator[tuple[int, Array]]:
         """Yield (step, B(i)^T e) for each layer, last first: error [batch, A] -> [batch, *shape].
@@ -55,7 +57,7 @@ class Transforms:
             sigma = self._chain.combine(weights[i], t)
             if doubtful is not None and doubtful[i].any():
                 where = doubtful[i]
-                sigma[where] += s * (e[where][:, None] @ self._by_svd(t, where))[:, 0]
+                sigma[where] += s * (e[where][:, None] @ self._by_svd(i, where))[:, 0]
             yield index, _shaped(sigma, shape)
 
     def matrices(self, s: float) -> list[tuple[int, Array]]:
@@ -72,7 +74,7 @@ class Transforms:
             b = t + s * (roots[i] @ t)
             if doubtful is not None:
                 where = doubtful[i, :, 0]
-                b[where] += s * self._by_svd(t, where)
+                b[where] += s * self._by_svd(i, where)
             b = self._basis.mT @ b
             found.append((index, _shaped(b.reshape(-1, b.shape[-1]), shape).reshape(b.shape)))
         return found
@@ -80,26 +82,48 @@ class Transforms:
     def _grams(self) -> Array:
         """G(i) = T(i) T(i)^T of every layer held: [layers, batch, A, A]."""
         xp, shape = namespace(self._basis), (self._batch, self._actions, self._actions)
-        grams = [self._chain.gram(t) for t in self._ts]
+        grams = [self._gram(t, reach) for t, reach in zip(self._ts, self._ranges, strict=True)]
         whole = [gram if len(gram) == self._batch else xp.broadcast_to(gram, shape) for gram in grams]
         return xp.concatenate(whole).reshape(-1, *shape)
 
-    def _by_svd(self, t: Array, where: Array) -> Array:
-        """Polar factors of those samples of T [batch or 1, A, n] for which `where` is true: [k, A, n]."""
+    def _gram(self, t: Array, reach: Range | None) -> Array:
+        gram = self._chain.gram(t)
+        if reach is None:
+            return gram
+        # The root of a sum of two matrices on orthogonal subspaces acts on T like that of G alone.
+        size = gram.diagonal(dim1=1, dim2=2).mean(1)
+        return gram + size[:, None, None] * (self._basis @ reach.outside @ self._basis.mT)
+
+    def _by_svd(self, i: int, where: Array) -> Array:
+        """Polar factors of those samples of the i-th T [batch or 1, A, n] for which `where` is true: [k, A, n]."""
+        t, reach = self._ts[i], self._ranges[i]
         chosen = namespace(t).broadcast_to(t, (self._batch, *t.shape[1:]))[where]
-        return convert_like(polar_by_svd(torch.as_tensor(chosen)), t)
+        if reach is None:
+            return convert_like(polar_by_svd(torch.as_tensor(chosen)), t)
+        basis = self._basis @ reach.basis
+        return basis @ polar_by_svd(basis.mT @ chosen, reach.rank)
 
 
 def _basis(output_weight: Array | None, output: Array) -> Array:
-    """An orthogonal Q [A, A] that makes the rows of Q W nearly orthogonal, for the output weight W [A, n]."""
+    """An orthogonal Q [A, A] that makes the rows of Q W nearly orthogonal, for the output weight W [A, n].
+
+    Without W, the first row of Q takes the mean of the actions' values.
+    """
     actions = output.shape[1]
     if actions == 2:
         return convert_like(_SUM_AND_DIFFERENCE, output)
     if output_weight is None:
-        return convert_like(torch.eye(actions), output)
+        return convert_like(_reflection(actions), output)
     w = torch.as_tensor(output_weight).double()
     vectors: Tensor = torch.linalg.eigh((w @ w.mT).nan_to_num_()).eigenvectors
     return convert_like(vectors.mT, output)
+
+
+def _reflection(size: int) -> Tensor:
+    """float64 [size, size]: the Householder reflection that swaps the first axis and the diagonal of all axes."""
+    normal = torch.full((size,), size**-0.5, dtype=torch.float64)
+    normal[0] -= 1
+    return torch.eye(size, dtype=torch.float64) - 2 * torch.outer(normal, normal) / normal.dot(normal).clamp_min(1e-300)
 
 
 def _flat(t: Array) -> Array:

@@ -1,0 +1,98 @@
+"""What a feedback rule asks of a network: one forward pass, recorded, and the products of backpropagation."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+
+from learner.edl.arrays import Array
+
+
+class UnsupportedLayerError(ValueError):
+    """A layer has no meaning in these passes; the message names it."""
+
+
+@dataclass(slots=True)
+class Tape:
+    """The activations of one forward pass, for the backward passes.
+
+    output: [batch, actions]. inputs: the input of each step, [batch, *shape], images channels last.
+    """
+
+    output: Array
+    inputs: list[Array]
+
+    def head(self, batch: int) -> Tape:
+        """The tape of the first `batch` samples."""
+        return Tape(self.output[:batch], [x[:batch] for x in self.inputs])
+
+    def output_of(self, index: int) -> Array:
+        """The output of step `index`: [batch, *shape]; if a ReLU follows, only its shape and sign are valid."""
+        return self.inputs[index + 1] if index + 1 < len(self.inputs) else self.output
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """The actions' directions that one layer reaches, where its T(i) [A, n] lacks rank for every input and weight.
+
+    basis: [A, k], orthonormal columns, whose span holds every T(i)'s. outside: [A, A], the projection on its
+    complement. rank: the largest rank of T(i), at most k.
+    """
+
+    basis: torch.Tensor
+    outside: torch.Tensor
+    rank: int
+
+
+class Passes(ABC):
+    """The forward and backward passes of one network, in arrays of one library; it consists of steps, in order.
+
+    names: prefix of the parameters' names of each step. parametrised: indices of the steps that feedback trains.
+    """
+
+    names: list[str]
+    parametrised: list[int]
+
+    @property
+    @abstractmethod
+    def output_weight(self) -> Array | None:
+        """The weight [actions, n] of a Linear layer whose output is the network's; None if there is none."""
+
+    @abstractmethod
+    def forward(self, x: Array) -> Tape:
+        """Run the network on x, <float>[batch, *input]."""
+
+    @abstractmethod
+    def walk(self, tape: Tape, cotangent: Array, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Array]]:
+        """Propagate cotangents of the output to every pre-activation: (step, [b, k, *output of step]), last first.
+
+        cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
+        share. dtype: of the computation, the network's if None.
+        """
+
+    @abstractmethod
+    def write(self, tape: Tape, index: int, delta: Array, out: Mapping[str, Array]) -> None:
+        """Write the gradients of step `index`'s parameters, given delta [batch, *output] at its pre-activation."""
+
+    def write_rest(self, tape: Tape, error: Array, out: Mapping[str, Array]) -> None:  # noqa: B027
+        """Write the ordinary gradients of the parameters outside the steps; a chain has none.
+
+        error: [batch, actions], at the output.
+        """
+
+    def range_of(self, index: int) -> Range | None:
+        """The range of T of step `index`; None if some weights and inputs give it full rank."""
+        return None
+
+    @staticmethod
+    @abstractmethod
+    def gram(t: Array) -> Array:
+        """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
+
+    @staticmethod
+    @abstractmethod
+    def combine(weights: Array, t: Array) -> Array:
+        """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""

@@ -1,0 +1,139 @@
+"""Networks of a user's own: built and refused by name, acting, training by every method, saved and taken up again."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from actors.policy import Policy
+from common.errors import UsageError
+from common.networks.network import FlatNetwork, build_network
+from common.settings.config import EdlSettings, LearnerSettings, NetworkSettings, RunConfig
+from common.settings.sources import base_config
+from common.settings.tables import validated
+from common.types import EnvSpec
+from experiments.evaluation import evaluate
+from experiments.lockstep import Lockstep
+from learner.edl.graph import Graph
+from learner.qnetwork import make_q_network
+from learner.records.run_directory import RunDirectory
+
+SPEC = EnvSpec("made-up", (4,), "float32", 1, 3)
+
+
+def _build(name: str, seed: int = 0) -> torch.nn.Module:
+    return build_network(f"custom_networks:{name}", SPEC, (), seed)
+
+
+@pytest.mark.parametrize("name", ["duel", "residual", "recurrent", "lazy"])
+def test_a_network_of_ones_own_is_flat_and_acts(name: str) -> None:
+    state = torch.get_rng_state()
+    same, other = FlatNetwork(_build(name)), FlatNetwork(_build(name, 1))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.equal(same.flat, FlatNetwork(_build(name)).flat)
+    assert not torch.equal(same.flat, other.flat)
+    assert same.layout_digest() == other.layout_digest()
+    obs = np.random.default_rng(0).standard_normal((9, 4)).astype(np.float32)
+    other.load(same.snapshot())
+    actions = Policy((same, other), SPEC, np.random.default_rng(0)).act(obs, 0.0)
+    values = _build(name)(torch.from_numpy(obs)).detach()
+    np.testing.assert_array_equal(actions, values.argmax(1).numpy())
+    assert torch.equal(other.module(torch.from_numpy(obs)), values)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("missing", "module 'custom_networks' has no 'missing'"),
+        ("failing", "RuntimeError: no such game"),
+        ("number", "gives a int; it must give a torch.nn.Module"),
+        ("scalar", "its output is float32 [4, 1] for inputs [4, 4]; it must be float32 [4, 3]"),
+        ("normalised", "layer '1' is a BatchNorm1d, in which the samples of a batch meet"),
+        ("dropped", "layer '1' is a Dropout; random layers are not supported"),
+        ("buffered", "layer '' (Duel) has a buffer, 'mean'; only parameters are published and saved"),
+        ("centred", "its values of one observation depend on the others in the batch"),
+        ("frozen", "parameter '0.weight': must be float32 and require a gradient"),
+        ("noisy", "its values differ between two calls; random layers are not supported"),
+        ("huge", "it has 268,451,855 parameters; allowed: 1 to 66,846,720, what a message carries"),
+    ],
+)
+def test_what_is_no_network_is_refused_in_one_line(name: str, text: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        _build(name)
+    assert str(refused.value) == f"network.kind = 'custom_networks:{name}': {text}"
+
+
+def test_an_unknown_kind_is_refused_with_those_that_exist() -> None:
+    with pytest.raises(UsageError, match=r"network.kind = 'nature3': allowed: mlp, .*minatar, or module:function$"):
+        validated(RunConfig(network=NetworkSettings(kind="nature3")))
+
+
+def _q_network(config: RunConfig) -> object:
+    return make_q_network(config, SPEC, 0, torch.device("cpu"), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"learner": LearnerSettings(compile=True)}, "learner.compile = True: allowed: False with "),
+        ({"edl": EdlSettings(polar_dtype="bfloat16")}, "edl.polar_dtype = 'bfloat16': allowed: 'float32' with "),
+        ({"network": NetworkSettings("custom_networks:duel", dtype="bfloat16")},
+         "network.dtype = 'bfloat16': allowed: 'float32' with "),
+        ({"network": NetworkSettings("custom_networks:twice")},
+         "network.kind = 'custom_networks:twice': layer 'inner' (Linear) is used twice in a forward pass"),
+    ],
+)  # fmt: skip
+def test_what_has_no_meaning_for_a_network_is_refused(changes: dict[str, object], text: str) -> None:
+    config = replace(RunConfig(network=NetworkSettings("custom_networks:duel")), **changes)
+    with pytest.raises(UsageError) as refused:
+        _q_network(config)
+    assert str(refused.value).startswith(text)
+
+
+def test_gradient_methods_train_a_layer_that_is_used_twice() -> None:
+    _q_network(RunConfig(method="dqn", network=NetworkSettings("custom_networks:twice")))
+
+
+def _lockstep(method: str, name: str) -> Lockstep:
+    flags = ["--method", method]
+    config = replace(base_config(flags), network=NetworkSettings(f"custom_networks:{name}"))
+    return Lockstep(replace(config, replay=replace(config.replay, learning_starts=50), total_steps=300))
+
+
+def _play(run: Lockstep, directory: RunDirectory, steps: int) -> None:
+    for _ in range(steps):
+        for effects in run.play():
+            directory.record(effects.episodes, effects.metrics)
+
+
+@pytest.mark.parametrize(
+    ("method", "name"), [("dqn", "recurrent"), ("edql", "residual"), ("g-coop", "twice"), ("coop", "duel")]
+)
+def test_every_method_trains_it_the_same_way_for_a_seed_and_after_a_resume(
+    method: str, name: str, tmp_path: Path
+) -> None:
+    whole = _lockstep(method, name)
+    before = [network.flat.clone() for network in whole.agent.networks]
+    with RunDirectory(tmp_path / "whole", whole.config) as directory:
+        _play(whole, directory, 90)
+    whole.env.close()
+    torn = _lockstep(method, name)
+    with RunDirectory(tmp_path / "torn", torn.config) as directory:
+        _play(torn, directory, 70)
+        torn.save(directory)
+    torn.env.close()
+    resumed = _lockstep(method, name)
+    sizes = resumed.restore(tmp_path / "torn" / "checkpoints" / "20")
+    with RunDirectory(tmp_path / "torn", resumed.config, sizes) as directory:
+        _play(resumed, directory, 20)
+        resumed.save(directory)
+    resumed.env.close()
+    assert isinstance(whole.agent._networks[0]._trained.chain, Graph)
+    for network, same, initial in zip(whole.agent.networks, resumed.agent.networks, before, strict=True):
+        assert torch.equal(network.flat, same.flat)
+        assert torch.isfinite(network.flat).all()
+        changed = {part for part, view in network.views(network.flat - initial).items() if view.any()}
+        assert changed == {part for part, _ in network.layout}
+    assert len(evaluate(tmp_path / "torn", 2, 0).returns) == 2
