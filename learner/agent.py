@@ -1,12 +1,13 @@
 """The learner of Algorithm 1: two networks, one of which acts and is trained, and the swap of their roles.
 
-The four methods differ only in their config:
+The methods (`common.settings.methods`) differ only in these:
 
-    method   second network   target             feedback
-    dqn      copy of first    copied every C     none
-    edql     copy of first    copied every C     transform | weight-gradient | random
-    g-coop   independent      the other network  none
-    coop     independent      the other network  transform | weight-gradient | random
+    method   second network   target             feedback                              extra cost
+    dqn      copy of first    copied every C     none                                  none
+    edql     copy of first    copied every C     transform | weight-gradient | random  none
+    g-coop   independent      the other network  none                                  none
+    coop     independent      the other network  transform | weight-gradient | random  none
+    medqn    copy of first    copied every C     none                                  Q away from the target network's
 """
 
 from __future__ import annotations
@@ -24,19 +25,23 @@ from torch import Tensor
 from common.errors import UsageError
 from common.networks.network import FlatNetwork, preprocess
 from common.process.randomness import generator_state, set_generator_state
+from common.registry import loaded
 from common.settings import schedules
 from common.settings.config import RunConfig
+from common.settings.methods import METHODS
 from common.types import Array, Batch, EnvSpec
-from learner.losses import LOSSES, output_error, td_errors
+from learner.edl.arrays import Array as Inputs
+from learner.losses import LOSSES, Values, output_error, td_errors
+from learner.methods.rule import Rule
 from learner.optimizers import make_optimizer
-from learner.qnetwork import make_q_network, on_host
+from learner.qnetwork import QNetwork, make_q_network, on_host
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
     """The measurements of one update.
 
-    td_errors: float32 [batch], e of the taken actions before clipping and weighting.
+    td_errors: float32 [batch], e of the taken actions before clipping and weighting, and before the update.
     s: the value of s in this update. swapped: the roles changed after it.
     """
 
@@ -55,11 +60,11 @@ class Agent:
         acting: 0 or 1, index of the network that acts and is trained.
         updates: number of updates done.
         networks: the parameters of both networks. versions: `updates` at each network's last change.
-        loss: the loss of a TD error.
+        loss: the loss of a TD error. rule: what the method changes in the update.
     """
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
-        """Raise UsageError for a missing device, or weight decays that do not match the layers."""
+        """Raise UsageError for a missing device, a method that can't be loaded, or a weight decay for other layers."""
         self.config = config
         self.spec = spec
         self.device = _device(config.learner.device)
@@ -71,6 +76,8 @@ class Agent:
         self._networks = [make_q_network(config, spec, number, self.device, self._noise) for number in (0, 1)]
         trained = self._networks if config.two_networks else self._networks[:1]
         self.optimizers = [make_optimizer(config.learner, one.theta, one.gradient) for one in trained]
+        rule = loaded(METHODS.get(config.method).rule, f"method = {config.method!r}")
+        self.rule: Rule = rule(config, self._noise)
         self._weight_decay = _decay_vector(config.learner.weight_decay, self.networks[0].layout)
 
     @property
@@ -80,24 +87,29 @@ class Agent:
 
     def update(self, batch: Batch) -> Update:
         """One step of Algorithm 1: train the acting network towards the other one's targets, then count the step."""
-        settings, size = self.config.learner, len(batch)
         online, target = self._networks[self.acting], self._networks[1 - self.acting]
         s = self._draw_s()
         # The trainer finds TD errors that are not finite; numpy, like PyTorch, does not warn of them here.
         with torch.inference_mode(), np.errstate(all="ignore"):
             inputs = online.inputs(batch, self.spec)
-            # With `double` the acting network chooses the next actions, so one pass covers obs and next_obs.
-            tape = online.forward(inputs if settings.double else inputs[:size])
-            values, next_values = on_host(tape.output), target.values(inputs[size:])
-            best = (values[size:] if settings.double else next_values).argmax(1)
-            errors = td_errors(batch, values, next_values, best, settings.gamma)
-            slopes = output_error(batch, self.loss.slope(errors), next_values)
-            online.backward(tape.head(size), slopes, s)
-            if self._weight_decay is not None:
-                online.decay(self._weight_decay)
-            self.optimizers[self.acting].step(self._learning_rate())
-            online.changed()
-        return Update(errors, s, swapped=self._count())
+            first, *_ = [self._step(online, target, batch, inputs, s) for _ in range(self.rule.passes)]
+        return Update(first, s, swapped=self._count())
+
+    def _step(self, online: QNetwork, target: QNetwork, batch: Batch, inputs: Inputs, s: float) -> Values:
+        """Make one step of the optimizer; returns the TD errors before it, float32 [batch]."""
+        settings, size = self.config.learner, len(batch)
+        # With `double` the acting network chooses the next actions, so one pass covers obs and next_obs.
+        tape = online.forward(inputs if settings.double else inputs[:size])
+        values, next_values = on_host(tape.output), target.values(inputs[size:])
+        bootstrap = self.rule.bootstrap(next_values, values[size:] if settings.double else next_values)
+        errors = td_errors(batch, values, bootstrap, settings.gamma)
+        online.backward(tape.head(size), output_error(batch, self.loss.slope(errors), next_values), s)
+        self.rule.add_cost(online, target, inputs, self.updates)
+        if self._weight_decay is not None:
+            online.decay(self._weight_decay)
+        self.optimizers[self.acting].step(self._learning_rate())
+        online.changed()
+        return errors
 
     def swap(self) -> None:
         """Change the acting role; for the one-network methods, copy the network to its target."""
@@ -130,6 +142,7 @@ class Agent:
             "updates": self.updates,
             "versions": list(self.versions),
             "noise": generator_state(self._noise),
+            "rule": self.rule.state(),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -140,6 +153,7 @@ class Agent:
             optimizer.load_state(saved)
         self.acting, self.updates, self.versions = state["acting"], state["updates"], list(state["versions"])
         set_generator_state(self._noise, state["noise"])
+        self.rule.load_state(state.get("rule", {}))  # older states lack it
 
     def _draw_s(self) -> float:
         s = self.exploration_rate()

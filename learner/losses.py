@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,19 +62,15 @@ class Huber:
 LOSSES: dict[str, Loss] = {"squared": SquaredError(), "mse": MeanSquaredError(), "huber": Huber()}
 
 
-def td_errors(
-    batch: Batch, values: Values, next_values: Values, best: NDArray[np.integer[Any]], gamma: float
-) -> Values:
-    """e[a] = y[a] - (r + gamma^k (1 - terminated) Q_target(x', best)) of the actions taken, float32 [batch].
+def td_errors(batch: Batch, values: Values, bootstrap: Values, gamma: float) -> Values:
+    """e[a] = y[a] - (r + gamma^k (1 - terminated) V(x')) of the actions taken, float32 [batch].
 
     k: the steps that a transition spans, 1 except for n-step returns.
 
-    values: y = Q(x), float32 [batch, actions]. next_values: Q_target(x'), float32 [batch, actions]. best: int [batch],
-    the next actions at which the targets are evaluated.
+    values: y = Q(x), float32 [batch, actions]. bootstrap: V(x'), float32 [batch].
     """
-    rows = np.arange(len(batch))
     discounts = np.float32(gamma) ** batch.span * ~batch.terminated
-    errors: Values = values[rows, batch.actions] - (batch.rewards + discounts * next_values[rows, best])
+    errors: Values = values[np.arange(len(batch)), batch.actions] - (batch.rewards + discounts * bootstrap)
     return errors
 
 

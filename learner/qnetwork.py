@@ -92,6 +92,12 @@ class QNetwork:
         if self._source is not self._trained:
             assign(self.gradient, self._source.gradient)
 
+    def add_gradient(self, tape: Tape, output_error: NDArray[np.float32]) -> None:
+        """Add the gradient of another cost to `gradient`; s is 0 in it. Arguments as `backward`'s."""
+        before = self.gradient * 1  # a copy, in either library
+        self.backward(tape, output_error, 0.0)
+        self.gradient += before
+
     def decay(self, rates: Array) -> None:
         """Add rates * theta, rates float32 [P], to the gradient."""
         self.gradient += self._trained.cast(rates) * self.theta

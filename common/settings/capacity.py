@@ -11,6 +11,7 @@ import numpy as np
 from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
 from common.settings.config import RunConfig
+from common.settings.policies import EVICTIONS
 from common.types import EnvSpec
 
 # actions, rewards, terminated, span, param_version, ids, reuse; three counters of the frame's slot.
@@ -31,10 +32,10 @@ def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
     """Raise UsageError for a table that does not fit into this machine's memory.
 
-    Eviction policies other than fifo may keep stack + 1 frames per transition.
+    Eviction policies that do not evict in order may keep stack + 1 frames per transition.
     """
     capacity = config.replay.capacity
-    copies = 1 if config.replay.eviction == "fifo" else spec.stack + 1
+    copies = 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
     needed = estimated_bytes(spec, min(capacity, config.total_steps)) * copies
     present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > present:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import tyro
 from pydantic import ConfigDict, Field
@@ -23,11 +23,12 @@ from common.bounds import (
 from common.errors import UsageError
 from common.settings.environment import EnvSettings
 from common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
+from common.settings.methods import METHODS
+from common.settings.names import EvictionName, MethodName, SamplingName
+from common.settings.policies import EVICTIONS, SAMPLERS
 
 NETWORK_KINDS = ("mlp", "nature", "nips2013", "minatar")
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
-Method = Literal["dqn", "edql", "g-coop", "coop"]
-METHODS: tuple[Method, ...] = get_args(Method)  # in the order of the paper's table
 
 _STRICT = ConfigDict(extra="forbid")
 
@@ -138,9 +139,9 @@ class ReplaySettings:
     """Environment steps by which acting may be ahead of learning, or behind it."""
     n_step: Annotated[int, Field(gt=0, le=MAX_N_STEP)] = 1
     """Rewards that a transition sums before it bootstraps (1: the paper); fewer at the end of an episode."""
-    eviction: Literal["fifo", "reservoir", "prioritized"] = "fifo"
+    eviction: EvictionName = "fifo"
     """Policy by which a full table evicts transitions; prioritized evicts the lowest priority."""
-    sampling: Literal["uniform", "prioritized"] = "uniform"
+    sampling: SamplingName = "uniform"
     """Policy by which batches are drawn."""
     replacement: bool = True
     """Draw batches with replacement; without it, a batch holds no transition twice (uniform sampling only)."""
@@ -156,7 +157,7 @@ class ReplaySettings:
     @property
     def prioritized(self) -> bool:
         """Whether the table uses TD errors as priorities."""
-        return "prioritized" in (self.eviction, self.sampling)
+        return EVICTIONS.get(self.eviction).priorities or SAMPLERS.get(self.sampling).priorities
 
 
 @dataclass(frozen=True)
@@ -187,8 +188,8 @@ class RunConfig:
     __pydantic_config__ = _STRICT
     run: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")] = "coop"
     """Name of the run: roles with the same name find each other."""
-    method: Method = "coop"
-    """Training method: gradient (dqn, g-coop) or error-driven (edql, coop); with two networks: g-coop, coop."""
+    method: MethodName = "coop"
+    """Training method: gradient (dqn, g-coop, medqn) or error-driven (edql, coop); with two networks: g-coop, coop."""
     seed: Count = 0
     """Seed of all random numbers."""
     total_steps: Steps = 50_000
@@ -207,7 +208,9 @@ class RunConfig:
     edl: EdlSettings = field(default_factory=EdlSettings)
     replay: ReplaySettings = field(default_factory=ReplaySettings)
     actor: ActorSettings = field(default_factory=ActorSettings)
-    methods: Annotated[dict[Method, dict[str, Any]], tyro.conf.Fixed, tyro.conf.Suppress] = field(
+    own: Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress] = None
+    """The method's own settings, an instance of `Method.settings`; files and flags have them under `Method.table`."""
+    methods: Annotated[dict[str, dict[str, Any]], tyro.conf.Fixed, tyro.conf.Suppress] = field(
         default_factory=dict, compare=False
     )
     """Settings that the preset or file changes for other methods, kept for running them with this config."""
@@ -220,7 +223,7 @@ class RunConfig:
     @property
     def two_networks(self) -> bool:
         """True for the cooperative methods; False if the second network is a copy of the first."""
-        return self.method in ("g-coop", "coop")
+        return METHODS.get(self.method).two_networks
 
     @property
     def swap_period(self) -> int:
@@ -231,7 +234,16 @@ class RunConfig:
     @property
     def feedback(self) -> str:
         """The feedback of this method: "none" for the gradient methods."""
-        return self.edl.feedback if self.method in ("edql", "coop") else "none"
+        return self.edl.feedback if METHODS.get(self.method).error_driven else "none"
+
+
+def value_of(config: RunConfig, name: str) -> Any:  # noqa: ANN401 (a value of any field)
+    """The value of a setting by its dotted name; None for one of another method."""
+    section, _, field_name = name.partition(".")
+    if section == METHODS.get(config.method).table:
+        return getattr(config.own, field_name, None)
+    value = getattr(config, section, None)
+    return getattr(value, field_name) if field_name and value is not None else value
 
 
 def check_distributed(config: RunConfig) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 import sys
 import time
-from dataclasses import dataclass, fields
+from contextlib import suppress
+from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from common.errors import RunError, UsageError
 from common.process import cli
@@ -15,6 +16,7 @@ from common.process.notices import note_renamed, warn
 from common.process.run_ids import has_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.effects import without_effect
+from common.settings.methods import METHODS, table_of
 from common.settings.renamed import current_flags
 from common.settings.resuming import check_resumed
 from common.settings.sources import base_config
@@ -58,7 +60,7 @@ class RunOptions(RunConfig):
 
     def run_config(self) -> RunConfig:
         """The checked config of the run; raises UsageError."""
-        return validated(RunConfig(**{field.name: getattr(self, field.name) for field in fields(RunConfig)}))
+        return validated(RunConfig(**{each.name: getattr(self, each.name) for each in fields(RunConfig)}))
 
     def directory(self) -> Path:
         """The run directory.
@@ -113,11 +115,26 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     args = sys.argv[1:]
     base = base_config(args)
     args = current_flags(args, base.learner.optimizer)
-    default = kind(**{field.name: getattr(base, field.name) for field in fields(RunConfig)})
-    options = cli.parse(kind, program, description, default, args)
+    own = [(table, settings, field(default_factory=settings)) for table, settings in _own_tables(kind).items()]
+    extended = make_dataclass(kind.__name__, own, bases=(kind,), frozen=True)
+    given_own = {} if base.own is None else {table_of(base.method): base.own}
+    default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **given_own)
+    parsed = cli.parse(extended, program, description, default, args)
+    options: OptionsT = replace(parsed, own=getattr(parsed, table_of(parsed.method), None))
     given = cli.given_flags(args)
     if "learner.swap_every" in given and not options.two_networks and options.learner.target_update_every is None:
         note_renamed({"--learner.swap-every": f"--learner.target-update-every for {options.method}"})
     for line in without_effect(options, given, lockstep=lockstep):
         warn(line)
     return options
+
+
+def _own_tables(kind: type[RunOptions]) -> dict[str, type[Any]]:
+    """The classes of methods' own settings by table; a method that can't be imported is refused only if chosen."""
+    found = {}
+    for name in METHODS.names():
+        with suppress(UsageError):
+            method = METHODS.get(name)
+            if method.settings is not None and not hasattr(kind, method.table):
+                found[method.table] = method.settings
+    return found

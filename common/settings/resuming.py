@@ -7,7 +7,7 @@ from typing import Any
 
 from common.errors import RunError, UsageError
 from common.settings.config import RunConfig
-from common.settings.methods import leaves
+from common.settings.overrides import leaves
 from common.settings.tables import to_tables
 
 _FREE = ("checkpoint_every", "target_return")

@@ -9,6 +9,7 @@ from common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
 from common.errors import UsageError
 from common.settings.config import NETWORK_KINDS, RunConfig
 from common.settings.environment import EnvSettings
+from common.settings.policies import SAMPLERS
 
 
 def check_rules(config: RunConfig) -> None:
@@ -42,8 +43,9 @@ def _problems(config: RunConfig) -> Iterator[str]:
         for name in ("kwargs", "resize", "grayscale"):
             if (value := getattr(config.env, name)) != getattr(plain, name):
                 yield f"env.{name} = {value!r}: not for {config.env.id!r}; ALE's games show 84x84 grayscale pictures"
-    if not replay.replacement and replay.sampling != "uniform":
-        yield f"replay.sampling = {replay.sampling!r}: allowed: 'uniform' with replay.replacement = False"
+    if not replay.replacement and not SAMPLERS.get(replay.sampling).without_replacement:
+        able = ", ".join(repr(name) for name in SAMPLERS.names() if SAMPLERS.get(name).without_replacement)
+        yield f"replay.sampling = {replay.sampling!r}: allowed: {able} with replay.replacement = False"
     if replay.journal_keep and not replay.journal:
         yield "replay.journal_keep = True: needs replay.journal = True"
     if replay.prioritized and learner.batch_size * learner.prefetch > MAX_PRIORITIES:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,13 @@ import tomli_w
 
 from common.errors import UsageError
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
-from common.settings.methods import merged, of_method
+from common.settings.methods import METHODS
+from common.settings.overrides import merged, of_method
 from common.settings.renamed import current, with_stack
 from common.settings.rules import check_rules
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
+_FIELDS = [field.name for field in fields(RunConfig) if field.name != "own"]
 
 
 def preset_names() -> list[str]:
@@ -85,22 +87,46 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
     Raises:
         UsageError: as `resolve`.
     """
+    tables = to_tables(tables) if isinstance(tables, RunConfig) else dict(tables)
+    if "own" in tables:
+        raise UsageError(f"own = {tables['own']!r}: no such field; allowed: {', '.join(_FIELDS)}")
+    own = _own_settings(tables)
     try:
-        config = _ADAPTER.validate_python(asdict(tables) if isinstance(tables, RunConfig) else tables)
+        config: RunConfig = replace(_ADAPTER.validate_python(tables), own=own)
     except pydantic.ValidationError as error:
         raise UsageError(first_problem(error, RunConfig())) from error
     check_rules(config)
     return config
 
 
+def _own_settings(tables: dict[str, Any]) -> Any:  # noqa: ANN401 (an instance of `Method.settings`)
+    """Take a method's own settings out of its tables; None if it has none."""
+    name = tables.get("method", RunConfig.method)
+    method = METHODS.get(name) if name in METHODS.names() else None  # an unknown one is refused with the other fields
+    if method is None or method.settings is None:
+        return None
+    if method.table in _FIELDS:
+        raise UsageError(f"method = {name!r}: its settings can't be called {method.table!r}, as others are")
+    given, allowed = tables.pop(method.table, {}), [field.name for field in fields(method.settings)]
+    if isinstance(given, Mapping) and (unknown := given.keys() - set(allowed)):
+        name = f"{method.table}.{min(unknown)}"
+        raise UsageError(f"{name} = {given[min(unknown)]!r}: no such field; allowed: {', '.join(allowed)}")
+    try:
+        return pydantic.TypeAdapter(method.settings).validate_python(given)
+    except pydantic.ValidationError as error:
+        raise UsageError(first_problem(error, method.settings(), f"{method.table}.")) from error
+
+
 def to_toml(config: RunConfig) -> str:
     """The resolved config as TOML, which `--config` reads."""
-    return tomli_w.dumps(_without_none(asdict(config)))
+    return tomli_w.dumps(to_tables(config))
 
 
 def to_tables(config: RunConfig) -> dict[str, Any]:
     """The resolved config as plain nested tables, for the wire."""
-    return _without_none(asdict(config))
+    tables = asdict(config)
+    own = tables.pop("own")
+    return _without_none(tables if own is None else {**tables, METHODS.get(config.method).table: own})
 
 
 def identity(config: RunConfig) -> dict[str, Any]:
@@ -132,13 +158,17 @@ def _without_none(tables: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def first_problem(error: pydantic.ValidationError, example: Any) -> str:  # noqa: ANN401 (any nested dataclasses)
+def first_problem(
+    error: pydantic.ValidationError,
+    example: Any,  # noqa: ANN401 (any nested dataclasses)
+    prefix: str = "",
+) -> str:
     """The first error that pydantic found, in one line: the field, the value and what is allowed.
 
-    example: an instance of the class that was being built, for the names of its fields.
+    example: an instance of the class that was being built, for the names of its fields. prefix: of these names.
     """
     first, *rest = error.errors(include_url=False)
-    name = ".".join(str(part) for part in first["loc"])
+    name = (prefix + ".".join(str(part) for part in first["loc"])).removesuffix(".")
     if first["type"] == "unexpected_keyword_argument":
         allowed = ", ".join(_siblings(first["loc"], example))
         text = f"{name} = {first['input']!r}: no such field; allowed: {allowed}"
@@ -151,4 +181,4 @@ def _siblings(path: tuple[int | str, ...], example: Any) -> list[str]:  # noqa: 
     """The fields allowed in place of the last name of `path`."""
     for name in path[:-1]:
         example = getattr(example, str(name))
-    return [field.name for field in fields(example)]
+    return [field.name for field in fields(example) if field.name != "own"]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from common.settings.config import value_of
 from experiments.report.learning import (
     area,
     by_seed,
@@ -19,7 +20,7 @@ from experiments.report.learning import (
 )
 from experiments.report.measures import first_enough, score
 from experiments.report.slices import CAPACITY, along, label, other_settings, pairs, seeds_of
-from experiments.report.study import Run, Setting, Study, field_of
+from experiments.report.study import Run, Setting, Study
 from experiments.report.table import ResultTable, Value, plain
 
 MEASURES = {"return of the last 100": score, "area": area}
@@ -196,7 +197,7 @@ def _words(study: Study, others: Setting | None) -> str:
 
 
 def _sizes_note(study: Study) -> str:
-    sizes = sorted({int(field_of(run.config, CAPACITY)) for run in study.runs})
+    sizes = sorted({int(value_of(run.config, CAPACITY)) for run in study.runs})
     half = math.ceil(len(sizes) / 2)
     small, large = (", ".join(map(str, part)) for part in (sizes[:half], sizes[half:]))
     seeds = "Means over the seeds that have all of them, 95 % bootstrap intervals over seeds."

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from common.returns import running_mean
+from common.settings.methods import METHODS
 from experiments.report.measures import (
     Interval,
     by_episodes,
@@ -24,7 +25,6 @@ from experiments.report.slices import CAPACITY, along, counts, label, matrices, 
 from experiments.report.study import Floats, Run, Setting, Study
 
 RATE = "edl.rate"
-EDL_METHODS = ("edql", "coop")
 MOST_PANELS = 9
 RETURN = "return, mean of the last 100 episodes"
 BANDS = " Interquartile mean over runs, band: 95 % bootstrap interval (none for a single run)."
@@ -76,7 +76,7 @@ def exploration(study: Study) -> Figure:
     if place is not None:
         settings = [setting for setting in study.settings if _agree(setting, study.reference, place)]
     panels, used = [], []
-    for method in (name for name in study.methods if name in EDL_METHODS):
+    for method in (name for name in study.methods if METHODS.get(name).error_driven):
         groups = [(method if place is None else f"s = {s[place]}", study.of(method, s)) for s in settings]
         groups = [(text, runs) for text, runs in groups if runs]
         used += [run for _, runs in groups for run in runs]

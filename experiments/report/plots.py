@@ -12,12 +12,12 @@ import matplotlib as mpl
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
+from common.settings.methods import METHODS
 from experiments.report.measures import Interval
 from experiments.report.study import Floats
 from experiments.report.table import ResultTable, Value
 
-# The palette of Okabe and Ito, which colour-blind readers can distinguish.
-COLOURS = {"dqn": "#E69F00", "edql": "#009E73", "g-coop": "#56B4E9", "coop": "#D55E00"}
+# For lines that are no methods, and for methods without a colour of their own.
 OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
 COLUMNS = 3  # of panels
 DECADE = 10
@@ -84,7 +84,7 @@ def draw(figure: Figure, path: Path) -> None:
     rows = math.ceil(len(figure.panels) / columns)
     size = (max(6.4, 4.4 * columns), 3.4 * rows + 0.9)
     canvas, grid = plt.subplots(rows, columns, squeeze=False, figsize=size, layout="constrained", sharey=figure.same_y)
-    colours: dict[str, str] = dict(COLOURS)
+    colours: dict[str, str] = {}
     for axes, panel in zip(grid.flat, figure.panels, strict=False):
         _draw_panel(axes, panel, colours)
     for axes in grid.flat[len(figure.panels) :]:
@@ -98,7 +98,7 @@ def draw(figure: Figure, path: Path) -> None:
 
 def _draw_panel(axes: Axes, panel: Panel, colours: dict[str, str]) -> None:
     for line in panel.lines:
-        colour = colours.setdefault(line.label, OTHERS[(len(colours) - len(COLOURS)) % len(OTHERS)])
+        colour = colours.setdefault(line.label, _colour(line.label, list(colours.values())))
         value, low, high = line.y
         if panel.marks:
             below, above = (value - low).clip(0), (high - value).clip(0)
@@ -120,6 +120,12 @@ def _draw_panel(axes: Axes, panel: Panel, colours: dict[str, str]) -> None:
         axes.set_xlim(-0.5, len(panel.ticks) - 0.5)
     elif panel.lines:
         axes.legend(fontsize="small")
+
+
+def _colour(label: str, taken: Sequence[str]) -> str:
+    """The method's own colour, or the next one of the others."""
+    own = METHODS.get(label).colour if label in METHODS.names() else None
+    return own or OTHERS[sum(colour in OTHERS for colour in taken) % len(OTHERS)]
 
 
 def _spread_x(axes: Axes, panel: Panel) -> None:

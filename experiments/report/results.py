@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.settings.config import METHODS
 from experiments.report.comparisons import comparison_tables
 from experiments.report.measures import (
     DIAGNOSTICS,
@@ -18,7 +17,7 @@ from experiments.report.measures import (
     score,
     spread,
 )
-from experiments.report.paper import table_1
+from experiments.report.paper import PAPER_METHODS, table_1
 from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
 from experiments.report.study import Floats, Run, Study
 from experiments.report.table import ResultTable, Value, plain
@@ -44,7 +43,7 @@ def paper_table(study: Study) -> ResultTable:
         setting = tuple(
             env if axis == "env.id" else value for axis, value in zip(study.axes, study.reference, strict=True)
         )
-        for method in METHODS:
+        for method in dict.fromkeys([*PAPER_METHODS, *study.methods]):
             runs = study.of(method, setting)
             paper = column.get(method, (None, None))
             rows.append([env, method, *paper, *_over_runs(runs), *_lengths(runs)])

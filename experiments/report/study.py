@@ -15,7 +15,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
-from common.settings.config import METHODS, RunConfig
+from common.settings.config import RunConfig, value_of
+from common.settings.methods import METHODS
 from common.settings.tables import identity, load_tables, resolve
 from experiments.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
 from experiments.report.sources import Source, open_source
@@ -69,8 +70,8 @@ class Study:
 
     @property
     def methods(self) -> list[str]:
-        """The methods with a finished run, in the order of the paper's table."""
-        return [method for method in METHODS if any(run.config.method == method for run in self.runs)]
+        """The methods with a finished run, in the order of the registry: that of the paper's table first."""
+        return [method for method in METHODS.names() if any(run.config.method == method for run in self.runs)]
 
     @property
     def environments(self) -> list[str]:
@@ -93,7 +94,7 @@ class Study:
 
     def setting_of(self, config: RunConfig) -> Setting:
         """A config's value on each axis."""
-        return tuple(field_of(config, axis) for axis in self.axes)
+        return tuple(value_of(config, axis) for axis in self.axes)
 
     @cached_property
     def settings(self) -> list[Setting]:
@@ -150,16 +151,8 @@ def load_study(path: Path) -> Study:
         raise RunError(f"{path}: none of its {len(names)} runs is finished{also}")
     axes = _axes([*(run.config for run in runs), *diverged.values()])
     preset = resolve(load_tables(grid.file.preset if grid else PRESET, None))
-    reference = tuple(_nearest(field_of(preset, axis), {field_of(run.config, axis) for run in runs}) for axis in axes)
+    reference = tuple(_nearest(value_of(preset, axis), {value_of(run.config, axis) for run in runs}) for axis in axes)
     return Study(grid.file.title if grid else "", tuple(runs), missing, diverged, axes, reference)
-
-
-def field_of(config: RunConfig, axis: str) -> Any:  # noqa: ANN401 (a value of any field)
-    """The value of a field by its dotted name."""
-    value: Any = config
-    for name in axis.split("."):
-        value = getattr(value, name)
-    return value
 
 
 def _state(source: Source, run: str) -> str:

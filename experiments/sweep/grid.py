@@ -17,10 +17,11 @@ from pydantic import ConfigDict, Field
 
 from common.envs.make import env_spec
 from common.errors import UsageError
-from common.settings.config import Method, RunConfig, check_distributed
+from common.settings.config import RunConfig, check_distributed
 from common.settings.environment import EnvSettings
 from common.settings.fields import Count, Positive
-from common.settings.methods import leaves, merged, nested
+from common.settings.names import MethodName
+from common.settings.overrides import leaves, merged, nested, of_method
 from common.settings.renamed import current
 from common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
 
@@ -32,7 +33,7 @@ class GridFile:
     """The contents of a grid's file."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
-    methods: Annotated[tuple[Method, ...], Field(min_length=1)] = ("coop",)
+    methods: Annotated[tuple[MethodName, ...], Field(min_length=1)] = ("coop",)
     seeds: Annotated[tuple[Count, ...], Field(min_length=1)] = (0,)
     title: str = ""
     """The grid's question, in one line."""
@@ -122,7 +123,7 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
     preset = load_tables(file.preset, None)
 
     @cache
-    def base(method: Method, total_steps: int | None) -> dict[str, Any]:
+    def base(method: str, total_steps: int | None) -> dict[str, Any]:
         return to_tables(resolve(preset if total_steps is None else shortened(preset, total_steps), method))
 
     cells = []
@@ -134,7 +135,7 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
         for path, value in zip(axes, values, strict=True):
             tables = merged(tables, current(nested(path, value), tables["learner"]["optimizer"]))
         parts = [f"{name}={_word(value)}" for name, value in zip(names, values, strict=True)]
-        config = validated({**tables, "method": method, "seed": seed})
+        config = validated({**of_method(tables, method), "seed": seed})
         cells.append(Cell("-".join([method, *parts, f"seed={seed}"]), config))
     for cell in cells:
         check_distributed(cell.config) if file.mode == "distributed" else _check_lockstep(cell.config)

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from common.errors import UsageError
 from common.process.randomness import generator_state, set_generator_state
+from common.settings.policies import EVICTIONS, SAMPLERS
 from common.types import Array, Batch, EnvSpec, Segment
 from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
 from replay.table.frames import FrameStore, PinnedFrames, Slots
-from replay.table.selection import make_eviction, make_sampling
+from replay.table.policies import TableView, make_policies
 from replay.table.streams import StreamTails
 
 __all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
-
 COLUMNS = ("actions", "rewards", "terminated", "span", "param_version", "ids", "reuse", "priorities")
 
 
@@ -81,14 +81,14 @@ class Table:
         self._param_version = np.zeros(capacity, np.int64)
         self._ids = np.zeros(capacity, np.int64)
         self._reuse = np.zeros(capacity, np.int32)
-        self._prioritized = "prioritized" in (eviction, sampling)
+        evicts, draws = EVICTIONS.get(eviction), SAMPLERS.get(sampling)
+        self._prioritized = evicts.priorities or draws.priorities
         self._priorities = np.zeros(capacity if self._prioritized else 0)
         self._max_priority = 1.0
-        self._row_of: dict[int, int] | None = {} if self._prioritized and eviction != "fifo" else None
-        self._eviction = make_eviction(eviction, rng, self._ids, self._priorities)
-        self._sampling = make_sampling(
-            sampling, rng, capacity, priority_exponent, importance_exponent, replacement=replacement
-        )
+        self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
+        seen = self._ids, self._reuse, self._rewards, self._terminated, self._priorities
+        view = TableView(rng, *seen, priority_exponent, importance_exponent, replacement)
+        self._eviction, self._sampling = make_policies(evicts, draws, view)
         self._tails = StreamTails(self._frames, spec.stack)
         self._sampled = 0
         self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)

@@ -1,0 +1,94 @@
+"""Parts that are chosen by name, to which other packages may add their own by entry points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, Protocol, TypeVar
+
+from common.errors import UsageError
+from common.imports import import_object
+
+
+class Named(Protocol):
+    """An entry of a registry."""
+
+    @property
+    def name(self) -> str:
+        """The name by which settings choose it."""
+
+
+EntryT = TypeVar("EntryT", bound=Named)
+
+
+class Registry(Generic[EntryT]):
+    """Entries by name: those given, those registered, and those of installed packages.
+
+    Nothing is imported before its name is asked for.
+
+    Args:
+        setting: that chooses among the entries, for messages ("method").
+        group: of the entry points; each must name an object of `kind` whose name is the entry point's.
+        entries: by name; "module:object" stands for an entry that is imported when needed.
+    """
+
+    def __init__(self, setting: str, group: str, kind: type[EntryT], entries: Mapping[str, EntryT | str]) -> None:
+        self.setting = setting
+        self.group = group
+        self._kind = kind
+        self._entries: dict[str, EntryT | str | EntryPoint] = {**entries}
+
+    def names(self) -> tuple[str, ...]:
+        """All names: those of this package first."""
+        return tuple(self._all)
+
+    def get(self, name: str) -> EntryT:
+        """The entry of a name.
+
+        Raises:
+            UsageError: there is none, or it cannot be imported; one line says so.
+        """
+        found = self._all.get(name)
+        if found is None:
+            raise UsageError(f"{self.setting} = {name!r}: {self.unknown(name)}")
+        if isinstance(found, str | EntryPoint):
+            reference = found if isinstance(found, str) else found.value
+            found = self._all[name] = self._checked(name, loaded(reference, f"{self.setting} {name!r}"), reference)
+        return found
+
+    def unknown(self, name: str) -> str:
+        """Why a name is refused, with a suggestion and the names allowed."""
+        near = get_close_matches(name, self.names(), n=1)
+        return f"unknown{f'; perhaps {near[0]}' if near else ''}; allowed: {', '.join(self.names())}"
+
+    def register(self, entry: EntryT) -> None:
+        """Add an entry in this process; an entry point adds it in all of them. Raises UsageError for a name in use."""
+        if entry.name in self._all:
+            raise UsageError(f"{self.setting} = {entry.name!r}: there is one of that name already")
+        self._all[entry.name] = self._checked(entry.name, entry, "it")
+
+    @cached_property
+    def _all(self) -> dict[str, EntryT | str | EntryPoint]:
+        found = dict(self._entries)
+        for point in sorted(entry_points(group=self.group), key=lambda point: point.name):
+            if found.setdefault(point.name, point) != point:
+                raise UsageError(f"{self.setting} = {point.name!r}: {point.value} has a name that is in use")
+        return found
+
+    def _checked(self, name: str, entry: Any, source: str) -> EntryT:  # noqa: ANN401 (whatever a package gives)
+        if not isinstance(entry, self._kind):
+            raise UsageError(f"{self.setting} {name!r}: {source} is no {self._kind.__name__}")
+        if entry.name != name:
+            raise UsageError(f"{self.setting} {name!r}: {source} has another name, {entry.name!r}")
+        return entry
+
+
+def loaded(part: Any, field: str) -> Any:  # noqa: ANN401 (whatever a package gives)
+    """The object that "module:object" names; anything but a text is the object itself.
+
+    Raises:
+        UsageError: it cannot be imported; names the `field`.
+    """
+    return import_object(part, field) if isinstance(part, str) else part

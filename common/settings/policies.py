@@ -1,0 +1,70 @@
+"""The policies of a replay table by name; their code is imported by the table that uses them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from common.registry import Registry
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy of a replay table.
+
+    name: as the setting has it. summary: what it does, in a few words.
+    make: its class, a function of a `replay.table.policies.TableView`, or "module:Class" to import it in the replay
+        service only.
+    priorities: it uses the priorities of transitions, which the learner then sends.
+    """
+
+    name: str
+    summary: str
+    make: str | Callable[..., Any]
+    priorities: bool = False
+
+
+@dataclass(frozen=True)
+class EvictionPolicy(Policy):
+    """Chooses the transitions that a full table evicts.
+
+    in_order: transition i is always stored in row i modulo the capacity.
+    """
+
+    in_order: bool = False
+
+
+@dataclass(frozen=True)
+class SamplingPolicy(Policy):
+    """Draws batches.
+
+    without_replacement: it can draw a batch that holds no transition twice.
+    """
+
+    without_replacement: bool = False
+
+
+EVICTIONS = Registry(
+    "replay.eviction",
+    "coop.evictions",
+    EvictionPolicy,
+    {
+        "fifo": EvictionPolicy("fifo", "the oldest", "replay.table.selection:Fifo", in_order=True),
+        "reservoir": EvictionPolicy("reservoir", "a random one", "replay.table.selection:Reservoir"),
+        "prioritized": EvictionPolicy(
+            "prioritized", "the one of the lowest priority", "replay.table.selection:LowestPriority", priorities=True
+        ),
+    },
+)
+SAMPLERS = Registry(
+    "replay.sampling",
+    "coop.samplers",
+    SamplingPolicy,
+    {
+        "uniform": SamplingPolicy("uniform", "all alike", "replay.table.selection:Uniform", without_replacement=True),
+        "prioritized": SamplingPolicy(
+            "prioritized", "by priority", "replay.table.selection:Proportional", priorities=True
+        ),
+    },
+)

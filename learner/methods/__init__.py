@@ -1,0 +1,1 @@
+"""What methods change in the learner's update."""

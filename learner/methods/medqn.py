@@ -1,0 +1,62 @@
+"""MeDQN of Lan, Pan, Luo and Mahmood (arXiv 2205.10868), with real states and with uniform ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from common.settings.config import RunConfig
+from common.settings.medqn import MedqnSettings
+from learner.edl.arrays import Array, convert_like, namespace
+from learner.methods.rule import Rule
+from learner.qnetwork import QNetwork, on_host
+
+Bounds = NDArray[np.float32]
+
+
+class Consolidation(Rule):
+    """Keeps the network near its target network: cost lambda * mean over states of sum_a (Q(s, a) - Q_target(s, a))^2.
+
+    Attributes:
+        low, high: float32 [*input], the smallest and the largest input seen in each dimension; empty at first.
+    """
+
+    def __init__(self, config: RunConfig, rng: np.random.Generator) -> None:
+        super().__init__(config, rng)
+        assert isinstance(config.own, MedqnSettings)
+        self.settings = config.own
+        self.passes = self.settings.epochs
+        self.low: Bounds = np.empty(0, np.float32)
+        self.high: Bounds = np.empty(0, np.float32)
+
+    def strength(self, update: int) -> float:
+        """The value of lambda in an update, counted from 0."""
+        start, end = self.settings.lambda_start, self.settings.lambda_end
+        return start + (end - start) * min(1.0, update / self.config.planned_updates)
+
+    def add_cost(self, online: QNetwork, target: QNetwork, inputs: Array, update: int) -> None:
+        """See `Rule`."""
+        obs = inputs[: len(inputs) // 2]
+        states = obs if self.settings.states == "real" else self._draw(inputs, len(obs))
+        tape = online.forward(states)
+        gap = on_host(tape.output) - target.values(states)
+        online.add_gradient(tape, np.float32(2 * self.strength(update) / len(states)) * gap)
+
+    def _draw(self, inputs: Array, count: int) -> Array:
+        """Widen the bounds by inputs [n, *input], and draw `count` states between them."""
+        library = namespace(inputs)
+        low, high = on_host(library.amin(inputs, 0)), on_host(library.amax(inputs, 0))
+        self.low, self.high = (np.minimum(self.low, low), np.maximum(self.high, high)) if self.low.size else (low, high)
+        share = self.rng.random((count, *self.low.shape), np.float32)
+        return convert_like(self.low + share * (self.high - self.low), inputs)
+
+    def state(self) -> dict[str, Any]:
+        """See `Rule`."""
+        return {"low": torch.tensor(self.low), "high": torch.tensor(self.high)}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """See `Rule`."""
+        self.low, self.high = state["low"].numpy(), state["high"].numpy()
