@@ -71,11 +71,8 @@ class Registry(Generic[EntryT]):
 
     @cached_property
     def _all(self) -> dict[str, EntryT | str | EntryPoint]:
-        found = dict(self._entries)
-        for point in sorted(entry_points(group=self.group), key=lambda point: point.name):
-            if found.setdefault(point.name, point) != point:
-                raise UsageError(f"{self.setting} = {point.name!r}: {point.value} has a name that is in use")
-        return found
+        points = sorted(entry_points(group=self.group), key=lambda point: point.name)
+        return {**self._entries, **{point.name: point for point in points if point.name not in self._entries}}
 
     def _checked(self, name: str, entry: Any, source: str) -> EntryT:  # noqa: ANN401 (whatever a package gives)
         if not isinstance(entry, self._kind):

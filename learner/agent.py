@@ -76,7 +76,7 @@ class Agent:
         self._networks = [make_q_network(config, spec, number, self.device, self._noise) for number in (0, 1)]
         trained = self._networks if config.two_networks else self._networks[:1]
         self.optimizers = [make_optimizer(config.learner, one.theta, one.gradient) for one in trained]
-        rule = loaded(METHODS.get(config.method).rule, f"method = {config.method!r}")
+        rule = loaded(METHODS.get(config.method).rule, f"method {config.method!r}")
         self.rule: Rule = rule(config, self._noise)
         self._weight_decay = _decay_vector(config.learner.weight_decay, self.networks[0].layout)
 

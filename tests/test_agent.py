@@ -9,7 +9,7 @@ import torch
 from samples import make_segment
 
 from common.errors import UsageError
-from common.settings.config import EdlSettings, LearnerSettings, Method, NetworkSettings, RunConfig
+from common.settings.config import EdlSettings, LearnerSettings, NetworkSettings, RunConfig
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
 from replay.table.table import Table
@@ -17,12 +17,12 @@ from replay.table.table import Table
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 
 
-def _config(method: Method, **learner: object) -> RunConfig:
+def _config(method: str, **learner: object) -> RunConfig:
     settings = LearnerSettings(**{"swap_every": 10, "learning_rate": 1e-3, **learner})  # type: ignore[arg-type]
     return RunConfig(method=method, learner=settings, network=NetworkSettings(hidden=(8, 8)))
 
 
-def _batches(count: int) -> list[Batch]:
+def batches(count: int) -> list[Batch]:
     rng = np.random.default_rng(0)
     table = Table(SPEC, 500, rng=rng)
     for sequence in range(10):
@@ -35,10 +35,10 @@ def _batches(count: int) -> list[Batch]:
 
 
 @pytest.mark.parametrize("method", ["g-coop", "coop"])
-def test_roles_swap_every_c_updates(method: Method) -> None:
+def test_roles_swap_every_c_updates(method: str) -> None:
     agent = Agent(_config(method), SPEC)
     assert not torch.equal(agent.networks[0].flat, agent.networks[1].flat)
-    for number, batch in enumerate(_batches(35)):
+    for number, batch in enumerate(batches(35)):
         before = [network.snapshot() for network in agent.networks]
         acting = number // 10 % 2
         assert agent.acting == acting
@@ -50,10 +50,10 @@ def test_roles_swap_every_c_updates(method: Method) -> None:
 
 
 @pytest.mark.parametrize("method", ["dqn", "edql"])
-def test_the_target_is_a_copy_every_c_updates(method: Method) -> None:
+def test_the_target_is_a_copy_every_c_updates(method: str) -> None:
     agent = Agent(_config(method), SPEC)
     copy = agent.networks[0].snapshot()
-    for number, batch in enumerate(_batches(25), start=1):
+    for number, batch in enumerate(batches(25), start=1):
         np.testing.assert_array_equal(agent.networks[1].snapshot(), copy)
         agent.update(batch)
         assert agent.acting == 0
@@ -66,13 +66,13 @@ def test_coop_without_s_is_g_coop() -> None:
     config = _config("coop")
     coop = Agent(replace(config, edl=EdlSettings(rate=0.0)), SPEC)
     g_coop = Agent(replace(config, method="g-coop"), SPEC)
-    for batch in _batches(200):
+    for batch in batches(200):
         coop.update(batch)
         g_coop.update(batch)
     for one, other in zip(coop.networks, g_coop.networks, strict=True):
         torch.testing.assert_close(one.flat, other.flat, rtol=1e-5, atol=1e-6)
     edl = Agent(config, SPEC)
-    edl.update(_batches(1)[0])
+    edl.update(batches(1)[0])
     assert edl.exploration_rate() > 0
 
 
@@ -81,7 +81,7 @@ def test_coop_without_s_is_g_coop() -> None:
 def test_an_update_by_autograd(double: bool, loss: str) -> None:
     """One step of SGD on 1/2 e^2 (or Huber's) with the targets written out."""
     agent = Agent(_config("g-coop", optimizer="sgd", double=double, loss=loss, gamma=0.9), SPEC)
-    batch = _batches(1)[0]
+    batch = batches(1)[0]
     batch = replace(batch, rewards=batch.rewards * 3, weights=np.linspace(0.5, 1.5, 32, dtype=np.float32))
     online, target = agent.networks
     obs, next_obs = (torch.tensor(batch.frames[i[:, 0]]) for i in (batch.obs_index, batch.next_index))
@@ -109,7 +109,7 @@ def test_weight_decay_by_layer() -> None:
     plain = Agent(_config("dqn", optimizer="sgd"), SPEC)
     decayed = Agent(_config("dqn", optimizer="sgd", weight_decay=(0.0, 0.5, 0.0)), SPEC)
     before = {name: p.detach().clone() for name, p in plain.networks[0].module.named_parameters()}
-    batch = _batches(1)[0]
+    batch = batches(1)[0]
     plain.update(batch)
     decayed.update(batch)
     other = dict(decayed.networks[0].module.named_parameters())
@@ -124,24 +124,24 @@ def test_weight_decay_by_layer() -> None:
 def test_mnihs_rmsprop_stays_finite_where_the_two_constants_differ(gradient_alpha: float) -> None:
     settings = {"optimizer": "rmsprop-mnih", "gradient_alpha": gradient_alpha, "eps": 0.01, "learning_rate": 3e-5}
     agent = Agent(_config("dqn", **settings), SPEC)
-    for batch in _batches(20):
+    for batch in batches(20):
         assert np.isfinite(agent.update(batch).td_errors).all()
 
 
 def test_s_is_drawn_from_a_normal_distribution_of_the_falling_rate() -> None:
     agent = Agent(replace(_config("coop"), edl=EdlSettings(rate=0.2, decay=0.5, decay_every=100, noise="normal")), SPEC)
-    drawn = np.array([agent.update(batch).s / (0.2 * 0.5 ** (k / 100)) for k, batch in enumerate(_batches(300))])
+    drawn = np.array([agent.update(batch).s / (0.2 * 0.5 ** (k / 100)) for k, batch in enumerate(batches(300))])
     assert abs(drawn.mean()) < 0.2  # three standard deviations of the mean of 300
     assert 0.85 < drawn.std() < 1.15
     assert 100 < (drawn < 0).sum() < 200
     constant = Agent(replace(_config("coop"), edl=EdlSettings(rate=0.2)), SPEC)
-    assert constant.update(_batches(1)[0]).s == 0.2
+    assert constant.update(batches(1)[0]).s == 0.2
 
 
 def test_the_learning_rate_falls_over_the_run() -> None:
     config = _config("g-coop", optimizer="sgd", learning_rate=1e-3, learning_rate_final=0.01, swap_every=1000)
     config = replace(config, total_steps=140, replay=replace(config.replay, learning_starts=100, capacity=100))
-    agent, batch = Agent(config, SPEC), _batches(1)[0]
+    agent, batch = Agent(config, SPEC), batches(1)[0]
     assert config.planned_updates == 40
     for update in range(41):
         before = agent.networks[0].snapshot()
@@ -153,12 +153,12 @@ def test_the_learning_rate_falls_over_the_run() -> None:
 
 def test_a_restored_agent_goes_on_to_the_bit() -> None:
     config = replace(_config("coop"), edl=EdlSettings(noise="normal"))
-    batches = _batches(40)
+    seen = batches(40)
     first, second = Agent(config, SPEC), Agent(replace(config, seed=0), SPEC)
-    for batch in batches[:17]:
+    for batch in seen[:17]:
         first.update(batch)
     second.load_state(first.state())
-    for batch in batches[17:]:
+    for batch in seen[17:]:
         first.update(batch)
         second.update(batch)
     for one, other in zip(first.networks, second.networks, strict=True):
@@ -172,12 +172,12 @@ def test_a_device_that_is_not_there() -> None:
 
 
 @pytest.mark.parametrize("method", ["dqn", "g-coop", "edql", "coop"])
-def test_bfloat16_trains_nearly_as_float32_does(method: Method) -> None:
+def test_bfloat16_trains_nearly_as_float32_does(method: str) -> None:
     config = _config(method)
     low = replace(config, network=replace(config.network, dtype="bfloat16"))
     exact, half = Agent(config, SPEC), Agent(low, SPEC)
     start = [network.snapshot() for network in exact.networks]
-    for number, batch in enumerate(_batches(25)):
+    for number, batch in enumerate(batches(25)):
         expected, found = exact.update(batch).td_errors, half.update(batch).td_errors
         assert number == 0 or not np.array_equal(found, expected), "another precision shows"
         np.testing.assert_allclose(found, expected, atol=0.1)
@@ -188,16 +188,16 @@ def test_bfloat16_trains_nearly_as_float32_does(method: Method) -> None:
         assert went @ goes > 0.95 * np.linalg.norm(went) * np.linalg.norm(goes)
     resumed = Agent(low, SPEC)
     resumed.load_state(half.state())
-    for batch in _batches(3):
+    for batch in batches(3):
         np.testing.assert_array_equal(resumed.update(batch).td_errors, half.update(batch).td_errors)
 
 
 @pytest.mark.parametrize("method", ["dqn", "coop"])
-def test_a_run_that_diverges_goes_on_quietly(method: Method) -> None:
+def test_a_run_that_diverges_goes_on_quietly(method: str) -> None:
     agent = Agent(_config(method), SPEC)
     for network in agent.networks:
         network.load(1e20 * network.snapshot())
-    for batch in _batches(3):  # pytest makes an error of every warning
+    for batch in batches(3):  # pytest makes an error of every warning
         result = agent.update(batch)
     assert not np.isfinite(result.td_errors).all()
 
@@ -205,11 +205,11 @@ def test_a_run_that_diverges_goes_on_quietly(method: Method) -> None:
 @pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="needs a C++ compiler")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("method", ["dqn", "coop"])
-def test_compiled_updates_are_the_same_updates(method: Method) -> None:
+def test_compiled_updates_are_the_same_updates(method: str) -> None:
     # So wide that no sample's Jacobian lacks rank: where one does, the completion is arbitrary and rounding decides it.
     wide = NetworkSettings(hidden=(32, 32))
     plain, compiled = (Agent(replace(_config(method, compile=on), network=wide), SPEC) for on in (False, True))
-    for batch in _batches(5):
+    for batch in batches(5):
         np.testing.assert_allclose(compiled.update(batch).td_errors, plain.update(batch).td_errors, atol=1e-4)
     for one, other in zip(plain.networks, compiled.networks, strict=True):
         torch.testing.assert_close(one.flat, other.flat, rtol=1e-4, atol=1e-5)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from common.envs.corridor import CELLS, LEFT, RIGHT, optimal_values
 from common.settings import schedules
-from common.settings.config import Method, RunConfig
+from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve
 from experiments.lockstep import Lockstep
 from learner.agent import Agent
@@ -63,7 +63,7 @@ def values(agent: Agent) -> list[NDArray[np.float32]]:
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
-def test_optimal_values_are_found_in_lockstep(method: Method, seed: int, config: RunConfig) -> None:
+def test_optimal_values_are_found_in_lockstep(method: str, seed: int, config: RunConfig) -> None:
     run = Lockstep(replace(config, method=method, seed=seed))
     while not run.trainer.outcome():
         for _ in run.play():

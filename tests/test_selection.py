@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from replay.table.selection import Fifo, LowestPriority, Proportional, Reservoir, Rows, SumTree, Uniform
+from replay.table.policies import Floats, Rows, TableView
+from replay.table.selection import Fifo, LowestPriority, Proportional, Reservoir, SumTree, Uniform
+
+
+def view(capacity: int, rng: np.random.Generator | None = None, priorities: Floats | None = None) -> TableView:
+    zeros = np.zeros(capacity, np.int64)
+    columns = np.arange(capacity), zeros.astype(np.int32), zeros.astype(np.float32), zeros.astype(np.bool_)
+    return TableView(rng or np.random.default_rng(0), *columns, np.zeros(0) if priorities is None else priorities)
 
 
 def fill(place: Callable[[int, int], tuple[Rows, slice | Rows]], capacity: int, lengths: list[int]) -> list[int]:
@@ -34,7 +42,7 @@ def fill(place: Callable[[int, int], tuple[Rows, slice | Rows]], capacity: int, 
     ],
 )
 def test_fifo_keeps_the_newest(lengths: list[int], ids: list[int]) -> None:
-    assert fill(Fifo(4).place, 4, lengths) == ids
+    assert fill(Fifo(view(4)).place, 4, lengths) == ids
 
 
 @pytest.mark.parametrize("lengths", [[40], [1] * 40, [3, 10, 27], [25, 15]])
@@ -43,13 +51,13 @@ def test_reservoir_keeps_everything_with_equal_probability(lengths: list[int]) -
     rng = np.random.default_rng(0)
     held = np.zeros(40)
     for _ in range(4000):
-        held[fill(Reservoir(10, rng).place, 10, lengths)] += 1
+        held[fill(Reservoir(view(10, rng)).place, 10, lengths)] += 1
     np.testing.assert_allclose(held / 4000, 0.25, atol=0.03)
 
 
 def test_lowest_priority_goes_first_and_among_equals_the_oldest() -> None:
-    ids, priorities = np.arange(5), np.array([3.0, 1.0, 2.0, 1.0, 5.0])
-    policy = LowestPriority(ids, priorities)
+    priorities = np.array([3.0, 1.0, 2.0, 1.0, 5.0])
+    policy = LowestPriority(view(5, priorities=priorities))
     policy.prioritise(np.arange(5))
     priorities[1] = 4.0  # raised: its old entry no longer counts
     policy.prioritise(np.array([1]))
@@ -59,8 +67,8 @@ def test_lowest_priority_goes_first_and_among_equals_the_oldest() -> None:
 
 
 def test_lowest_priority_heap_stays_small() -> None:
-    ids, priorities = np.arange(5), np.ones(5)
-    policy = LowestPriority(ids, priorities)
+    priorities = np.ones(5)
+    policy = LowestPriority(view(5, priorities=priorities))
     rng = np.random.default_rng(0)
     for _ in range(2000):
         rows = rng.integers(0, 5, 3)
@@ -71,7 +79,7 @@ def test_lowest_priority_heap_stays_small() -> None:
 
 
 def test_uniform_draws_every_row_alike() -> None:
-    rows, weights = Uniform(np.random.default_rng(0), replacement=True).draw(100_000, 10)
+    rows, weights = Uniform(view(10)).draw(100_000, 10)
     np.testing.assert_allclose(np.bincount(rows) / 100_000, 0.1, atol=0.005)
     assert weights.dtype == np.float32
     assert (weights == 1).all()
@@ -79,7 +87,7 @@ def test_uniform_draws_every_row_alike() -> None:
 
 @pytest.mark.parametrize(("count", "size"), [(32, 33), (32, 32), (10, 10_000), (7, 3), (32, 5)])
 def test_without_replacement_none_comes_again_before_all_others(count: int, size: int) -> None:
-    policy = Uniform(np.random.default_rng(0), replacement=False)
+    policy = Uniform(replace(view(size), replacement=False))
     drawn = np.zeros(size)
     for _ in range(300):
         rows, weights = policy.draw(count, size)
@@ -94,7 +102,7 @@ def test_without_replacement_none_comes_again_before_all_others(count: int, size
 @pytest.mark.parametrize(("alpha", "beta"), [(1.0, 1.0), (0.6, 0.4), (0.0, 1.0)])
 def test_proportional_draws_and_weights(alpha: float, beta: float) -> None:
     priorities = np.array([1.0, 4.0, 0.0, 2.0, 0.5])
-    policy = Proportional(8, np.random.default_rng(0), alpha, beta)
+    policy = Proportional(replace(view(8), priority_exponent=alpha, importance_exponent=beta))
     policy.prioritise(np.arange(5), priorities)
     expected = np.maximum(priorities, 1e-6) ** alpha
     expected /= expected.sum()

@@ -7,12 +7,13 @@ import pytest
 
 from common.errors import RunError, UsageError
 from common.settings.config import RunConfig
+from common.settings.medqn import MedqnSettings
 from common.settings.options import RunOptions, parse_run
 from common.settings.resuming import check_resumed
 from common.settings.sources import base_config
 from common.settings.tables import load_tables, preset_names, resolve, to_tables, to_toml, validated
 
-METHODS = ["dqn", "edql", "g-coop", "coop"]
+METHODS = ["dqn", "edql", "g-coop", "coop", "medqn"]
 
 
 def parsed(flags: list[str], monkeypatch: pytest.MonkeyPatch, *, lockstep: bool = False) -> RunConfig:
@@ -101,6 +102,12 @@ def test_tables_of_methods_are_checked(text: str, words: str) -> None:
         (["--env.episodic-life", "--env.clip-rewards"], ["env.episodic-life"]),
         (["--preset", "breakout", "--env.no-episodic-life"], []),
         (["--env.no-episodic-life"], ["env.episodic-life"]),
+        (["--method", "medqn", "--medqn.epochs", "2", "--medqn.states", "real"], []),
+        (["--method", "dqn", "--medqn.epochs", "2"], ["medqn.epochs"]),
+        (
+            ["--method", "medqn", "--medqn.lambda-start", "0", "--medqn.lambda-end", "0", "--medqn.states", "real"],
+            ["medqn.states"],
+        ),
     ],
 )
 def test_flags_without_an_effect_are_named(
@@ -120,6 +127,30 @@ def test_the_reason_is_said_and_files_may_hold_everything(
     file.write_text(to_toml(config))
     assert parsed([f"--config={file}"], monkeypatch) == config
     assert capsys.readouterr().err == ""
+
+
+def test_a_methods_own_settings_are_kept_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = ["--medqn.states", "real", "--medqn.lambda-end=2", "--medqn.epochs", "3"]
+    config = parsed(["--method", "medqn", *flags], monkeypatch)
+    assert config.own == MedqnSettings("real", 0.01, 2.0, 3)
+    assert to_tables(config)["medqn"] == {"states": "real", "lambda_start": 0.01, "lambda_end": 2.0, "epochs": 3}
+    file = tmp_path / "config.toml"
+    file.write_text(to_toml(config))
+    assert parsed([f"--config={file}"], monkeypatch) == config
+    assert parsed([f"--config={file}", "--medqn.epochs", "4"], monkeypatch).own == MedqnSettings("real", 0.01, 2.0, 4)
+    other = parsed([f"--config={file}", "--method", "dqn"], monkeypatch)
+    assert other.own is None
+    assert "medqn" not in to_tables(other)
+    file.write_text(to_toml(other))
+    assert parsed([f"--config={file}", "--method", "medqn"], monkeypatch) == config
+
+
+def test_a_presets_table_of_one_method_overrides_its_own_settings() -> None:
+    tables = {"medqn": {"epochs": 2, "states": "real"}, "methods": {"medqn": {"medqn": {"epochs": 3}, "seed": 7}}}
+    config = resolve(tables, "medqn")
+    assert (config.own, config.seed) == (MedqnSettings("real", epochs=3), 7)
+    again = resolve(to_tables(resolve(to_tables(resolve(tables, "dqn")), "coop")), "medqn")
+    assert again == config
 
 
 def test_what_only_processes_have_means_nothing_in_lockstep(

@@ -13,8 +13,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from table_reference import Copies, Stream, check_references, held_ids, make_spec, whole_state
 
+from common.settings.policies import EVICTIONS, SAMPLERS
 from common.types import Batch
-from replay.table.selection import EVICTIONS, SAMPLINGS
 from replay.table.table import Table
 
 
@@ -30,8 +30,8 @@ cases = st.fixed_dictionaries(
         "capacity": st.integers(1, 40),
         "stack": st.integers(1, 4),
         "dtype": st.sampled_from(["uint8", "float32"]),
-        "eviction": st.sampled_from(EVICTIONS),
-        "sampling": st.sampled_from(SAMPLINGS),
+        "eviction": st.sampled_from(EVICTIONS.names()),
+        "sampling": st.sampled_from(SAMPLERS.names()),
         "streams": st.integers(1, 3),
         "episode_length": st.sampled_from([1, 5, 50]),
         "seed": st.integers(0, 10_000),

@@ -146,8 +146,8 @@ def test_estimate_covers_a_full_table() -> None:
     ("settings", "words"),
     [
         ({"capacity": 0}, "capacity: 0"),
-        ({"eviction": "lifo"}, "eviction: 'lifo' is not one of fifo"),
-        ({"sampling": "best"}, "sampling: 'best' is not one of uniform"),
+        ({"eviction": "lifo"}, "replay.eviction = 'lifo': unknown; perhaps fifo; allowed: fifo, reservoir"),
+        ({"sampling": "best"}, "replay.sampling = 'best': unknown; allowed: uniform, prioritized"),
         ({"priority_exponent": -1.0}, "priority_exponent"),
         ({"importance_exponent": float("nan")}, "importance_exponent"),
     ],

@@ -1,0 +1,165 @@
+"""Methods and policies of other packages: found by entry point, chosen by name, refused in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from common.errors import UsageError
+from common.registry import Registry
+from common.settings.methods import METHODS, Method
+
+MODULE = """
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.settings.conditions import Condition
+from common.settings.methods import Method
+from common.settings.policies import EvictionPolicy, SamplingPolicy
+from replay.table.policies import Eviction, Sampling
+
+
+@dataclass(frozen=True)
+class SoftSettings:
+    weight: float = 0.5
+    other: int = 1
+
+
+class MostDrawn(Eviction):
+    def place(self, first, count):
+        size, capacity = min(first, self.table.capacity), self.table.capacity
+        kept = min(count, capacity)
+        unused = np.arange(size, min(size + kept, capacity))
+        worst = np.argsort(-self.table.reuse[:size], kind="stable")[: kept - len(unused)]
+        return np.concatenate((unused, worst)), slice(count - kept, count)
+
+
+class Newest(Sampling):
+    def draw(self, count, size):
+        return np.argsort(-self.table.ids[:size])[np.arange(count) % size], np.ones(count, np.float32)
+
+
+def make_newest(table):
+    return Newest(table)
+
+
+SOFT = Method("soft-max", "a mean of both", rule="my_rules:Soft", settings=SoftSettings,
+              conditions=(Condition(("soft_max.other",), lambda c: c.own.weight > 0, "soft_max.weight = 0"),))
+EVICTION = EvictionPolicy("most-drawn", "what was drawn most often", MostDrawn)
+SAMPLER = SamplingPolicy("newest", "the newest ones", make_newest)
+"""
+RULES = """
+from learner.methods.rule import Rule
+
+
+class Soft(Rule):
+    def bootstrap(self, next_values, preferred):
+        weight = self.config.own.weight
+        return weight * next_values.max(1) + (1 - weight) * next_values.mean(1)
+"""
+ENTRY_POINTS = """
+[coop.methods]
+soft-max = my_methods:SOFT
+broken = my_methods:NOTHING
+renamed = my_methods:SOFT
+kind = my_methods:EVICTION
+[coop.evictions]
+most-drawn = my_methods:EVICTION
+[coop.samplers]
+newest = my_methods:SAMPLER
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A folder for the module path with an installed package that has a method and two policies."""
+    info = tmp_path / "my_methods-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-methods\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    (tmp_path / "my_methods.py").write_text(MODULE)
+    (tmp_path / "my_rules.py").write_text(RULES)
+    return tmp_path
+
+
+def methods() -> Registry[Method]:
+    return Registry(
+        "method", "coop.methods", Method, {"dqn": METHODS.get("dqn"), "medqn": "common.settings.medqn:MEDQN"}
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("soft-min", "method = 'soft-min': unknown; perhaps soft-max; allowed: dqn, medqn, broken, kind"),
+        ("broken", "method 'broken' = 'my_methods:NOTHING': module 'my_methods' has no 'NOTHING'"),
+        ("renamed", "method 'renamed': my_methods:SOFT has another name, 'soft-max'"),
+        ("kind", "method 'kind': my_methods:EVICTION is no Method"),
+    ],
+)
+def test_what_is_no_method_is_refused(name: str, words: str, package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(package)
+    with pytest.raises(UsageError) as caught:
+        methods().get(name)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_installed_method_is_imported_only_when_asked_for(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(package)
+    sys.modules.pop("my_methods", None)
+    registry = methods()
+    assert registry.names()[:2] == ("dqn", "medqn")
+    assert "soft-max" in registry.names()
+    assert "my_methods" not in sys.modules
+    assert registry.get("soft-max").table == "soft_max"
+
+
+def test_a_name_belongs_to_one(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    registry = methods()
+    registry.register(Method("mine", "mine"))
+    assert registry.get("mine").summary == "mine"
+    with pytest.raises(UsageError, match="method = 'mine': there is one of that name already"):
+        registry.register(Method("mine", "another"))
+    (package / "my_methods-1.0.dist-info" / "entry_points.txt").write_text("[coop.methods]\ndqn = my_methods:SOFT\n")
+    monkeypatch.syspath_prepend(package)
+    assert methods().get("dqn") is METHODS.get("dqn"), "no package takes the name of a method of ours"
+
+
+def lockstep(package: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    program = [sys.executable, "-c", "from deploy.commands import lockstep; lockstep()"]
+    line = [*program, "--preset", "cartpole", "--total-steps", "400", "--replay.capacity", "60", *flags]
+    environment = {"PYTHONPATH": str(package), "OMP_NUM_THREADS": "1", "PATH": ""}
+    return subprocess.run(line, env=environment, capture_output=True, text=True, timeout=100, check=False)
+
+
+def test_a_run_with_parts_of_another_package(package: Path, tmp_path: Path) -> None:
+    policies = ["--replay.eviction", "most-drawn", "--replay.sampling", "newest"]
+    flags = ["--method", "soft-max", "--soft-max.weight", "0", "--soft-max.other", "3", *policies]
+    run = lockstep(package, *flags, "--run-dir", str(tmp_path / "run"))
+    assert run.returncode == 0, run.stderr
+    assert run.stderr == "warning: --soft-max.other has no effect: soft_max.weight = 0\n"
+    text = (tmp_path / "run" / "config.toml").read_text()
+    assert "[soft_max]\nweight = 0.0\nother = 3\n" in text
+    assert 'eviction = "most-drawn"\nsampling = "newest"\n' in text
+    shown = lockstep(package, "--help")
+    assert "--soft-max.weight" in shown.stdout
+    assert "most-drawn" in shown.stdout
+
+
+def test_the_replay_service_knows_every_name_without_torch() -> None:
+    code = (
+        "import sys, replay.cli\n"
+        "from common.settings.tables import resolve\n"
+        "from common.types import EnvSpec\n"
+        "from replay.core import ReplayCore\n"
+        "spec = EnvSpec('x', (4,), 'float32', 1, 2)\n"
+        "for method in ('dqn', 'edql', 'g-coop', 'coop', 'medqn'):\n"
+        "    ReplayCore(resolve({'replay': {'eviction': 'prioritized'}}, method), spec)\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=100, check=False).returncode == 0
