@@ -13,6 +13,7 @@ from actors.policy import Policy
 from actors.service import ActorService
 from common.envs.make import make_vector_env
 from common.errors import JoinError
+from common.imports import check_allowed
 from common.messaging.joining import Membership, join, leave_run
 from common.messaging.messages.join import Join, Joined
 from common.messaging.route import ReplayRoute
@@ -32,6 +33,8 @@ class ActorOptions(RoleOptions):
 
     envs: int | None = None
     """Emulators in this process; the run's actor.envs if not given."""
+    allow_import: tuple[str, ...] = ()
+    """Modules, such as my_envs, that this process may import if the run's environment or network is theirs."""
 
 
 def main() -> None:
@@ -63,8 +66,15 @@ def _run() -> None:
 
 
 def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined, console: Console) -> None:
-    """Play until the stop; raises JoinError if this process's environment or network differs from the learner's."""
+    """Play until the stop.
+
+    Raises:
+        JoinError: the run needs a module that this process may not import, or this process's environment or network
+            differs from the learner's.
+    """
     config = joined.config
+    for field, path in config.imports.items():
+        check_allowed(path, options.allow_import, field)
     # The learner gives each number once per run, also across restarts, so no two processes play the same seeds.
     seed = np.random.SeedSequence([config.seed, 3, joined.index])
     env_seed, policy_seed = seed.spawn(2)

@@ -65,8 +65,10 @@ class Topology:
         serving = [*joining, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}", "--resume"]
         self.learner = ChildProcess("learner", command("coop-learner", *learning), logs / "learner.log", locks)
         self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]
+        modules = [path.partition(":")[0] for path in config.imports.values()]
+        playing = [*joining, "--allow-import", *modules] if modules else joining
         self._others += [
-            ChildProcess(f"actor {number}", command("coop-actor", *joining), logs / f"actor-{number}.log")
+            ChildProcess(f"actor {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")
             for number in range(1, options.actors + 1)
         ]
         self._policies = {process.name: RestartPolicy() for process in self._all()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+import zlib
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -57,7 +58,9 @@ class Lockstep:
         self._replay = ReplayCore(config, self.env.spec)
         self._table = self._replay.table
         self._actions: list[int] = []
-        self._segments.begin(self._player.begin())
+        first_obs = self._player.begin()
+        self._seen = zlib.crc32(first_obs.tobytes())
+        self._segments.begin(first_obs)
 
     def play(self) -> Iterator[Effects]:
         """Run one iteration of Algorithm 1's inner loop; yields the effects of each update."""
@@ -65,7 +68,7 @@ class Lockstep:
         self._policy.acting = self.agent.acting
         self._player.send(self.step, self.agent.updates)
         turn = self._player.recv()
-        self._actions.append(int(turn.actions[0]))
+        self._follow(turn)
         self._store(turn)
         self.step += 1
         table = self._table
@@ -89,6 +92,14 @@ class Lockstep:
         if learner.reset_role_at_episode and turn.ended and self.agent.acting:
             self.agent.swap()
 
+    def _follow(self, turn: Turn) -> None:
+        """Note the action, and add what the emulator answered to a checksum of all that it showed."""
+        self._actions.append(int(turn.actions[0]))
+        steps = turn.steps
+        newest = steps.next_obs[0, -1] if self.env.spec.stack > 1 else steps.next_obs
+        for shown in (newest, steps.raw_rewards, steps.terminated, *([steps.obs] if steps.restarted[0] else [])):
+            self._seen = zlib.crc32(shown.tobytes(), self._seen)
+
     def _store(self, turn: Turn) -> None:
         for segment in self._segments.add(turn.actions, turn.steps, turn.version, turn.ended):
             self._table.insert(segment)
@@ -110,7 +121,11 @@ class Lockstep:
         """
         state = {
             **self.trainer.state(time.monotonic()),
-            "player": {"policy": generator_state(self._policy_rng), "actions": torch.tensor(self._actions)},
+            "player": {
+                "policy": generator_state(self._policy_rng),
+                "actions": torch.tensor(self._actions),
+                "seen": self._seen,
+            },
             "sizes": directory.sizes(),
         }
         mark = Mark(directory.run_id(), 0)
@@ -133,6 +148,7 @@ class Lockstep:
 
         Raises:
             UsageError: the epoch does not belong to a lockstep run.
+            RunError: the environment is not deterministic: its observations, rewards or ends differ from the run's.
         """
         state = load_learner(epoch)
         if old_checkpoints.is_old(epoch):
@@ -141,6 +157,11 @@ class Lockstep:
             raise UsageError(f"{epoch}: saved by a distributed run; coop-local --resume continues it")
         else:
             self._replay_actions(state["player"]["actions"].tolist())
+            if state["player"].get("seen", self._seen) != self._seen:  # earlier versions did not save it
+                raise RunError(
+                    f"{epoch}: {self.config.env.id} showed something else when the run's {len(self._actions):,} "
+                    "actions were played again; a lockstep run goes on only where the seed determines the environment"
+                )
             load_snapshot(self._replay, epoch / "replay", read_run_id(epoch.parents[1]))
         self.trainer.load_state(state, time.monotonic())
         set_generator_state(self._policy_rng, state["player"]["policy"])
@@ -153,4 +174,4 @@ class Lockstep:
         for step, action in enumerate(actions):
             turn = self._player.replay(np.array([action], np.int32))
             self._segments.add(turn.actions, turn.steps, self._updates_by(step), turn.ended)
-            self._actions.append(action)
+            self._follow(turn)

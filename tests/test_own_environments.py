@@ -1,7 +1,6 @@
 """Environments of one's own: found in modules and packages, given keyword arguments, and shown as they are."""
 
 from importlib.metadata import EntryPoint
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -18,8 +17,6 @@ from common.networks.network import FlatNetwork, build_network, preprocess
 from common.settings.environment import EnvSettings
 from common.settings.tables import load_tables, resolve
 from common.types import Array, EnvSpec
-
-OWN = Path(__file__).with_name("data") / "own"
 
 
 class Scene(gymnasium.Env[Array, int]):
@@ -200,8 +197,7 @@ def test_observations_other_than_their_space_are_refused() -> None:
         env.reset()
 
 
-def test_a_module_s_environments_and_their_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(OWN)
+def test_a_module_s_environments_and_their_arguments() -> None:
     assert env_spec(EnvSettings(id="my_envs:Planes-v0")).frame_shape == (10, 10, 4)
     settings = EnvSettings(id="my_envs:Room-v0", kwargs={"kind": "depth", "side": 3})
     assert env_spec(settings) == EnvSpec("my_envs:Room-v0", (12, 9), "float32", 1, 2)

@@ -216,6 +216,12 @@ class RunConfig:
     """Settings that the preset or file changes for other methods, kept for running them with this config."""
 
     @property
+    def imports(self) -> dict[str, str]:
+        """The settings that name a module to import, with their values ("module:name")."""
+        named = {"env.id": self.env.id, "network.kind": self.network.kind}
+        return {field: value for field, value in named.items() if ":" in value}
+
+    @property
     def planned_updates(self) -> int:
         """Updates of a run of all `total_steps`: the ratio applies from `learning_starts` on."""
         return round(self.replay.ratio * (self.total_steps - self.replay.learning_starts))
