@@ -117,6 +117,17 @@ class Recurrent(nn.Module):
         return self.out(self.cell(x.flatten(1)[..., None])[0][:, -1])
 
 
+class Doubled(nn.Sequential):
+    """A stack with a forward of its own, which no chain of its layers computes."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 2 * super().forward(x)
+
+
+def doubled(spec: EnvSpec) -> nn.Module:
+    return Doubled(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, spec.num_actions))
+
+
 def duel(spec: EnvSpec) -> nn.Module:
     return Duel(prod(spec.obs_shape), spec.num_actions)
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from custom_networks import Borrowed, Centred, Duel, Pictures, Recurrent, Residual, Tied, Twice
+from custom_networks import Borrowed, Centred, Doubled, Duel, Pictures, Recurrent, Residual, Tied, Twice
 from torch import Tensor, nn
 
 from common.networks.network import build_network
@@ -12,6 +12,8 @@ from learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
 from learner.edl.graph import Graph
 from learner.edl.layers import _examined, make_passes
 from learner.edl.passes import UnsupportedLayerError
+from learner.edl.polar import whitened
+from learner.edl.transforms import Transforms
 
 
 def _inputs(shape: tuple[int, ...], actions: int, batch: int, seed: int = 1) -> tuple[Tensor, Tensor]:
@@ -97,11 +99,12 @@ def _networks(actions: int) -> list[tuple[nn.Module, tuple[int, ...]]]:
         (Pictures(3, 49, actions), (3, 7, 7)),
         (nn.Sequential(nn.Linear(5, 40), nn.Tanh(), nn.Linear(40, actions)), (5,)),
         (Recurrent(actions), (5,)),
+        (Doubled(nn.Linear(5, 40), nn.ReLU(), nn.Linear(40, actions)), (5,)),
     ]
     return [(network.double(), shape) for network, shape in networks]
 
 
-@pytest.mark.parametrize("index", range(5))
+@pytest.mark.parametrize("index", range(6))
 @pytest.mark.parametrize(("actions", "batch"), [(2, 16), (3, 7), (6, 1), (9, 12)])
 def test_autograd_and_the_svd_of_each_sample_agree(index: int, actions: int, batch: int) -> None:
     network, shape = _networks(actions)[index]
@@ -146,6 +149,16 @@ def test_what_no_weight_can_reach_gets_no_feedback(actions: int) -> None:
     torch.testing.assert_close(matrices["value.2"], unit * (1 + s * actions**-0.5))
 
 
+@pytest.mark.parametrize("actions", [2, 6])
+def test_a_dueling_network_needs_no_svd(actions: int) -> None:
+    network, shape = _networks(actions)[0]
+    x, error = (part.float() for part in _inputs(shape, actions, 32))
+    passes = make_passes(network.float(), x)
+    grams = Transforms(passes, passes.forward(x))._grams()
+    assert grams.shape == (5, 32, actions, actions)
+    assert whitened(grams, error)[1] is None
+
+
 def test_dead_units_are_completed_within_the_range() -> None:
     network, shape = _networks(3)[0]
     x, error = _inputs(shape, 3, 8)
@@ -178,6 +191,12 @@ def test_initial_weights_of_zero_hide_no_rank() -> None:
         torch.testing.assert_close(torch.linalg.svdvals(b)[:, 2] >= 0.5 * (1 - 1e-6), torch.ones(4, dtype=torch.bool))
 
 
+def _frozen() -> nn.Module:
+    network = nn.Sequential(nn.Linear(5, 3), nn.Tanh())
+    network[0].bias.requires_grad_(False)
+    return network
+
+
 @pytest.mark.parametrize(
     ("network", "text"),
     [
@@ -191,6 +210,7 @@ def test_initial_weights_of_zero_hide_no_rank() -> None:
          "layer '1' (InstanceNorm1d) has a buffer, 'running_mean'; only parameters are trained"),
         (nn.Sequential(nn.Unflatten(0, (-1, 2)), nn.Linear(5, 3), nn.Flatten(0, 1)),
          "layer '1' (Linear) gives [3, 2, 3] for a batch of 6; its first axis must be the batch"),
+        (_frozen(), "parameter '0.bias' does not require a gradient"),
         (nn.Sequential(nn.LayerNorm(5)), "no Linear or Conv2d layer takes error-driven feedback"),
     ],
 )  # fmt: skip

@@ -16,12 +16,13 @@ from learner.edl.passes import Passes, Range, UnsupportedLayerError
 
 _ROUNDING = 1e-5  # of singular values of T in float32, relative to the largest
 _TRIALS = 3
+_SAMPLES = 8  # of an example
 
 
 def make_passes(module: nn.Module, example: Tensor | None) -> Passes:
     """The hand-written chain for a plain stack of Linear, Conv2d, ReLU and Flatten; autograd for any other module.
 
-    example: float [batch, *input], on which the module is run; None if it is trained by ordinary gradients only.
+    example: float [batch, *input], on which the module is tried; None if it is trained by ordinary gradients only.
 
     Raises:
         UnsupportedLayerError: error-driven feedback has no meaning for a layer.
@@ -29,7 +30,7 @@ def make_passes(module: nn.Module, example: Tensor | None) -> Passes:
     try:
         return Chain(module)
     except UnsupportedLayerError:
-        return Graph(module) if example is None else _examined(module, example)
+        return Graph(module) if example is None else _examined(module, example[:_SAMPLES])
 
 
 def _examined(module: nn.Module, x: Tensor) -> Graph:
@@ -67,6 +68,9 @@ def _check_state(module: nn.Module) -> None:
             raise UnsupportedLayerError(
                 f"layer {name!r} ({kind}) has a buffer, {buffer!r}; only parameters are trained"
             )
+    for name, parameter in module.named_parameters():
+        if not parameter.requires_grad:
+            raise UnsupportedLayerError(f"parameter {name!r} does not require a gradient")
 
 
 def _check_sharing(module: nn.Module, layers: list[Layer]) -> None:

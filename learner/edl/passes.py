@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import torch
 
+from common.errors import UsageError
 from learner.edl.arrays import Array
 
 
-class UnsupportedLayerError(ValueError):
+class UnsupportedLayerError(UsageError, ValueError):
     """A layer has no meaning in these passes; the message names it."""
 
 
