@@ -26,8 +26,8 @@ from common.settings.tables import validated
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
 from learner.edl.arrays import Array, convert_like
-from learner.edl.backprop import Tape
 from learner.edl.feedback import FeedbackRule
+from learner.edl.passes import Tape
 
 BATCH, GAMMA, RATE = 32, 0.99, 0.1
 BLOCKS = 5

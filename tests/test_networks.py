@@ -1,5 +1,8 @@
 """Networks of a user's own: built and refused by name, acting, training by every method, saved and taken up again."""
 
+import json
+import subprocess
+import sysconfig
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,3 +140,19 @@ def test_every_method_trains_it_the_same_way_for_a_seed_and_after_a_resume(
         changed = {part for part, view in network.views(network.flat - initial).items() if view.any()}
         assert changed == {part for part, _ in network.layout}
     assert len(evaluate(tmp_path / "torn", 2, 0).returns) == 2
+
+
+def test_the_network_of_the_page_trains(tmp_path: Path) -> None:
+    """A console script finds the module in the working directory, as the page on networks says."""
+    page = (Path(__file__).parents[1] / "docs" / "networks.md").read_text()
+    (tmp_path / "my_nets.py").write_text(page.split("```python\n")[1].split("```")[0])
+    flags = ["--network.kind", "my_nets:make", "--total-steps", "200", "--run-dir", "run"]
+    command = [str(Path(sysconfig.get_path("scripts")) / "coop-lockstep"), *flags]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, timeout=100)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["exit"].startswith("complete")
+    command[-1] = "other"
+    (tmp_path / "my_nets.py").write_text("def make(spec): return spec")
+    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100)
+    assert refused.returncode == 2
+    text = "network.kind = 'my_nets:make': gives a EnvSpec; it must give a torch.nn.Module"
+    assert refused.stderr.splitlines()[-1].endswith(text)
