@@ -41,7 +41,7 @@ class Policy:
 
     def _values(self, number: int, obs: Array) -> NDArray[np.floating[Any]]:
         network = self.networks[number]
-        if network.dense is not None:
-            return network.dense(preprocess(obs, self._spec))
+        if network.in_numpy is not None:
+            return network.in_numpy(preprocess(obs, self._spec))
         with torch.inference_mode():
             return network(preprocess(torch.from_numpy(obs), self._spec).to(network.flat.dtype)).float().numpy()

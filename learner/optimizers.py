@@ -34,7 +34,15 @@ class Optimizer(ABC):
     def step(self, rate: float) -> None:
         """Apply one update with learning rate `rate`."""
         self.steps += 1
-        self._step(rate)
+        if not self._fused:
+            self._step(rate)
+            return
+        # Running means of parameters without gradient become denormals, with which an update takes 30 times as long.
+        torch.set_flush_denormal(True)
+        try:
+            self._step(rate)
+        finally:
+            torch.set_flush_denormal(False)
 
     @abstractmethod
     def _step(self, rate: float) -> None: ...
@@ -72,7 +80,9 @@ class Optimizer(ABC):
 
     def _descend(self, direction: Array, rate: float, denominator: Array | None = None) -> None:
         """Apply theta <- theta - rate direction / denominator; both arguments may be in the scratch memory."""
-        if denominator is None:
+        if denominator is None and self._fused:
+            self.theta.add_(direction, alpha=-rate)
+        elif denominator is None:
             self.theta -= self._xp.multiply(direction, rate, out=self._scratch)
         elif self._fused:
             self.theta.addcdiv_(direction, denominator, value=-rate)
@@ -124,7 +134,10 @@ class RMSProp(Optimizer):
         if self._momentum:
             velocity = self.buffers["velocity"]
             velocity *= self._momentum
-            velocity += self._xp.divide(self.gradient, root, out=root)
+            if self._fused:
+                velocity.addcdiv_(self.gradient, root)
+            else:
+                velocity += self._xp.divide(self.gradient, root, out=root)
             self._descend(velocity, rate)
         else:
             self._descend(self.gradient, rate, root)

@@ -14,7 +14,7 @@ from common.errors import UsageError
 from common.networks.network import FlatNetwork, build_network, preprocess, sample_inputs
 from common.settings.config import RunConfig
 from common.types import Batch, EnvSpec
-from learner.edl.arrays import Array, assign
+from learner.edl.arrays import Array, assign, convert_like
 from learner.edl.feedback import FeedbackRule
 from learner.edl.graph import Graph
 from learner.edl.passes import Tape, UnsupportedLayerError
@@ -100,7 +100,7 @@ class QNetwork:
 
     def decay(self, rates: Array) -> None:
         """Add rates * theta, rates float32 [P], to the gradient."""
-        self.gradient += self._trained.cast(rates) * self.theta
+        self.gradient += convert_like(rates, self.theta) * self.theta
 
     def load(self, flat: Tensor | NDArray[np.float32]) -> None:
         """Overwrite all parameters, float32 [P]."""

@@ -92,19 +92,19 @@ def test_a_network_has_a_form_in_numpy_where_it_is_small_and_dense(kind: str) ->
     shape = (4,) if kind == "mlp" else (84, 84)
     spec = EnvSpec("case", shape, "float32" if kind == "mlp" else "uint8", 1, 3)
     network = FlatNetwork(build_network(kind, spec, (8, 8), 0))
-    assert (network.dense is not None) == (kind == "mlp")
-    assert FlatNetwork(build_network(kind, spec, (8, 8), 0).bfloat16()).dense is None
+    assert (network.in_numpy is not None) == (kind == "mlp")
+    assert FlatNetwork(build_network(kind, spec, (8, 8), 0).bfloat16()).in_numpy is None
 
 
 def test_it_follows_the_parameters() -> None:
     network = FlatNetwork(build_network("mlp", EnvSpec("case", (4,), "float32", 1, 3), (8,), 0))
-    assert network.dense is not None
+    assert network.in_numpy is not None
     x = np.ones((2, 4), np.float32)
-    before = network.dense(x)
+    before = network.in_numpy(x)
     network.load(2 * network.snapshot())
     with torch.no_grad():
-        np.testing.assert_allclose(network.dense(x), network(torch.from_numpy(x)).numpy(), rtol=1e-6)
-    assert not np.allclose(network.dense(x), before)
+        np.testing.assert_allclose(network.in_numpy(x), network(torch.from_numpy(x)).numpy(), rtol=1e-6)
+    assert not np.allclose(network.in_numpy(x), before)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from torch import nn
 
 from common.types import Array
 
-_DTYPES = (torch.float32, torch.float64)
+DTYPES = (torch.float32, torch.float64)
 
 
 class Dense:
@@ -21,10 +21,10 @@ class Dense:
 
     def __init__(self, module: nn.Module) -> None:
         """`module` must fit (see `fits`)."""
-        layers = [(name, step) for name, step in module.named_children() if isinstance(step, nn.Linear)]
+        layers = [(name, step) for name, step in module.named_children() if isinstance(step, nn.Linear | nn.Conv2d)]
         self.names = [f"{name}." for name, _ in layers]
-        self.weights: list[Array] = [step.weight.detach().numpy() for _, step in layers]
-        self.biases: list[Array] = [step.bias.detach().numpy()[:, None] for _, step in layers]
+        self.weights: list[Array] = [step.weight.detach().flatten(1).numpy() for _, step in layers]
+        self.biases: list[Array] = [step.bias.detach().numpy()[:, None] for _, step in layers if step.bias is not None]
 
     @staticmethod
     def fits(module: nn.Module) -> bool:
@@ -35,7 +35,7 @@ class Dense:
             len(steps) % 2 == 1
             and kinds == ([nn.Linear, nn.ReLU] * len(steps))[: len(steps)]
             and all(isinstance(step.bias, torch.Tensor) for step in steps[::2])
-            and all(p.device.type == "cpu" and p.dtype in _DTYPES for p in module.parameters())
+            and all(p.device.type == "cpu" and p.dtype in DTYPES for p in module.parameters())
         )
 
     def __call__(self, x: Array) -> Array:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
+from common.networks.convolution import ConvolutionNetwork
 from common.networks.custom import custom_network
 from common.networks.dense import Dense
 from common.settings.config import NETWORK_KINDS
@@ -141,12 +142,16 @@ def _function(layer: nn.Module, fresh: bool) -> Callable[[Tensor], Tensor]:
     return layer
 
 
+def _in_numpy(module: nn.Module) -> Dense | None:
+    return next((form(module) for form in (Dense, ConvolutionNetwork) if form.fits(module)), None)
+
+
 class FlatNetwork:
     """A network whose parameters are views of one flat buffer.
 
     flat: float32 [P] (or the module's dtype), all parameters, which the learner trains, publishes and saves.
     module: the network; its named parameters view `flat`.
-    dense: the network in numpy, over the same parameters; None if it does not fit (see `Dense.fits`).
+    in_numpy: the network in numpy, over the same parameters; None if it has no such form.
     layout: (name, shape) of each parameter in the order of the buffer.
     """
 
@@ -158,7 +163,7 @@ class FlatNetwork:
         for (_, p), view in zip(parameters, self.views(self.flat).values(), strict=True):
             p.data = view
         self._functions = layer_functions(module if type(module) is nn.Sequential else [module])
-        self.dense = Dense(module) if Dense.fits(module) else None
+        self.in_numpy = _in_numpy(module)
 
     def __call__(self, x: Tensor) -> Tensor:
         """The module's output for a preprocessed batch: float32 [batch, *input] -> [batch, num_actions]."""

@@ -2,32 +2,48 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
+from common.networks.convolution import ConvolutionNetwork
 from common.networks.network import FlatNetwork
-from learner.edl.arrays import Array, convert_like, namespace
+from learner.edl.arrays import Array, convert_like
+from learner.edl.convolution import ConvolutionChain
 from learner.edl.dense import DenseChain
 from learner.edl.layers import make_passes
 from learner.edl.passes import Passes
 
 
 class Trainable:
-    """The network's own parameters and their gradient, as tensors or, with `in_numpy`, as numpy arrays.
+    """The network's own parameters and their gradient, with passes over tensors or, with `in_numpy`, numpy arrays.
 
-    theta, gradient: <float>[P], in the order of the network's layout. gradients: name -> view of `gradient`, in the
-    shape of the parameter. chain: the network's forward and backward passes. values: its forward pass alone.
+    theta, gradient: <float>[P], in the order of the network's layout, for the optimizer; of numpy for small networks.
+    gradients: name -> view of `gradient` in the shape of the parameter, of the library of the passes.
+    chain: the network's forward and backward passes. values: its forward pass alone.
     """
 
     def __init__(self, network: FlatNetwork, in_numpy: bool, example: Tensor | None) -> None:
         """in_numpy: use numpy if the network has a form in numpy. example: see `make_passes`, which may raise."""
-        dense = network.dense if in_numpy else None
-        self.in_numpy = dense is not None
-        self.chain: Passes = make_passes(network.module, example) if dense is None else DenseChain(dense)
-        self.values = dense or network
-        self.theta: Array = network.flat if dense is None else network.flat.numpy()
-        self.gradient: Array = namespace(self.theta).zeros_like(self.theta)
-        self.gradients = network.views(self.gradient)
+        form = network.in_numpy if in_numpy else None
+        self.in_numpy = form is not None
+        self.values = form or network
+        theta: Array = network.flat
+        gradient: Array = torch.zeros_like(theta)
+        arrays = (theta, gradient) if form is None else (theta.numpy(), gradient.numpy())
+        self._like, in_passes = arrays
+        self.gradients = network.views(in_passes)
+        self.theta, self.gradient = arrays
+        self.chain: Passes
+        match form:
+            case None:
+                self.chain = make_passes(network.module, example)
+            case ConvolutionNetwork():
+                self.chain = ConvolutionChain(form)
+                # With many parameters, PyTorch's fused operations are worth their calls.
+                self.theta, self.gradient = theta, gradient
+            case _:
+                self.chain = DenseChain(form)
 
     def cast(self, array: Array) -> Array:
         """Convert an array of either library for this network's passes."""
-        return convert_like(array, self.theta)
+        return convert_like(array, self._like)

@@ -1,0 +1,96 @@
+"""Networks of one convolution and Linear layers behind it, as matrix products over arrays of numpy.
+
+The batch is the last axis of every array, so a picture's windows are copied in long runs, and no array is transposed
+between the convolution and the Linear layers. The products are PyTorch's, whose library (MKL) takes half the time of
+numpy's for these sizes; everything else costs less to call in numpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import nn
+
+from common.networks.dense import DTYPES, Dense
+from common.types import Array
+
+
+def product(a: Array, b: Array) -> Array:
+    """The matrix product of a [m, k] and b [k, n]."""
+    result: Array = torch.mm(torch.from_numpy(a), torch.from_numpy(b)).numpy()
+    return result
+
+
+class ConvolutionNetwork(Dense):
+    """The forward pass of such a network, over the parameters in place.
+
+    The convolution's weight is [out, channels * height * width].
+    """
+
+    def __init__(self, module: nn.Sequential) -> None:
+        """`module` must fit (see `fits`)."""
+        super().__init__(module)
+        convolution = module[0]
+        assert isinstance(convolution, nn.Conv2d)
+        self._kernel, self._stride = convolution.kernel_size, convolution.stride
+
+    @staticmethod
+    def fits(module: nn.Module) -> bool:
+        """Whether a network is Conv2d, ReLU, Flatten, Linear, ReLU, Linear, ..., Linear in a float on the CPU.
+
+        All layers must have biases, and the convolution neither padding, dilation nor groups. Later convolutions are
+        faster in PyTorch.
+        """
+        match list(module.children()) if isinstance(module, nn.Sequential) else []:
+            case [nn.Conv2d() as convolution, nn.ReLU(), nn.Flatten(start_dim=1, end_dim=-1), *behind]:
+                return (
+                    type(convolution) is nn.Conv2d
+                    and convolution.padding == (0, 0)
+                    and convolution.dilation == (1, 1)
+                    and convolution.groups == 1
+                    and convolution.bias is not None
+                    and all(p.device.type == "cpu" and p.dtype in DTYPES for p in convolution.parameters())
+                    and Dense.fits(nn.Sequential(*behind))
+                )
+        return False
+
+    def activations(self, x: Array) -> list[Array]:
+        """What the kernel sees, the output of each ReLU, and the network's output: [batch, ...] each.
+
+        They are views of arrays with the batch last. What the kernel sees at a place ends with a one, for the bias:
+        [batch, places, channels * height * width + 1].
+        """
+        windows = self._windows(x)
+        return [windows.T, *(column.T for column in self._behind(windows))]
+
+    def _columns(self, x: Array) -> Iterator[Array]:
+        return self._behind(self._windows(x))
+
+    def _behind(self, windows: Array) -> Iterator[Array]:
+        """Yield each ReLU's and the network's output: [n, batch]."""
+        with np.errstate(over="ignore", invalid="ignore"):  # of diverging networks, as in PyTorch
+            kernel = np.concatenate((self.weights[0], self.biases[0]), axis=1)
+            column = product(kernel, windows.reshape(len(windows), -1)).reshape(-1, windows.shape[-1])
+            for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+                yield np.maximum(column, 0, out=column)
+                column = product(weight, column)
+                column += bias
+            yield column
+
+    def _windows(self, x: Array) -> Array:
+        """What the kernel sees at each place of pictures x, and a one: [inputs + 1, places, batch]."""
+        pictures = np.ascontiguousarray(x.transpose(1, 2, 3, 0), dtype=self.weights[0].dtype)
+        (channels, *sides, batch), (plane, row, column, sample) = pictures.shape, pictures.strides
+        (down, right), geometry = self._stride, zip(sides, self._kernel, self._stride, strict=True)
+        places = [(side - kernel) // stride + 1 for side, kernel, stride in geometry]
+        view = np.ndarray(
+            (channels, *self._kernel, *places, batch), pictures.dtype, pictures, 0,
+            (plane, row, column, row * down, column * right, sample),
+        )  # fmt: skip
+        inputs = self.weights[0].shape[1]
+        windows = np.empty((inputs + 1, places[0] * places[1], batch), pictures.dtype)
+        windows[:inputs].reshape(view.shape)[...] = view
+        windows[inputs] = 1
+        return windows

@@ -1,0 +1,56 @@
+"""Forward and backward passes of one convolution and Linear layers behind it: matrix products over arrays of numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import torch
+
+from common.networks.convolution import product
+from learner.edl.arrays import Array
+from learner.edl.backprop import Tape
+from learner.edl.dense import DenseChain
+
+
+class ConvolutionChain(DenseChain):
+    """The products of backpropagation for a `ConvolutionNetwork`; the outputs of every step are [batch, n].
+
+    The convolution comes first, so nothing is propagated through it. For the tape, see `ConvolutionNetwork.activations`.
+    """
+
+    def walk(self, tape: Tape, cotangent: Array, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Array]]:
+        """As `Chain.walk`: (layer, cotangents [b, k, n] of its pre-activation), last first; in the network's dtype."""
+        rows = cotangent
+        for index in reversed(self.parametrised):
+            yield index, rows
+            if index == 0:
+                return
+            weight, h = self._network.weights[index], tape.inputs[index]
+            if rows.shape[1] == 1:
+                column = product(weight.T, rows[:, 0].T)
+                rows = (column * (h.T > 0)).T[:, None]
+            else:  # samples one after another, as Gram matrices read them
+                b, k, n = rows.shape
+                rows = product(rows.swapaxes(0, 1).reshape(k * b, n), weight).reshape(k, b, -1)
+                mask = np.ascontiguousarray(h > 0).astype(h.dtype)
+                rows = (np.multiply(rows, mask, out=rows) if b == len(mask) else rows * mask).swapaxes(0, 1)
+
+    def write(self, tape: Tape, index: int, delta: Array, out: Mapping[str, Array]) -> None:
+        """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its pre-activation."""
+        weight, bias = (out[self.names[index] + kind] for kind in ("weight", "bias"))
+        h = tape.inputs[index]
+        if index:
+            torch.mm(torch.from_numpy(delta.T), torch.from_numpy(h), out=torch.from_numpy(weight))
+            np.add.reduce(delta, 0, out=bias)
+        else:
+            inputs = h.shape[2]
+            gradient = product(h.T.reshape(inputs, -1), delta.T.reshape(len(bias), -1).T)
+            weight.reshape(len(bias), -1)[...] = gradient[:-1].T
+            bias[...] = gradient[-1]
+
+    @staticmethod
+    def gram(t: Array) -> Array:
+        """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
+        rows = torch.from_numpy(t)
+        return torch.bmm(rows, rows.mT).numpy()
