@@ -16,7 +16,7 @@ from learner.edl.dense import DenseChain
 class ConvolutionChain(DenseChain):
     """The products of backpropagation for a `ConvolutionNetwork`; the outputs of every step are [batch, n].
 
-    The convolution comes first, so nothing is propagated through it. For the tape, see `ConvolutionNetwork.activations`.
+    The convolution comes first, so nothing is propagated through it. The tape holds `ConvolutionNetwork.activations`.
     """
 
     def walk(self, tape: Tape, cotangent: Array, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Array]]:

@@ -1,0 +1,185 @@
+"""Speed on MinAtar against Stable-Baselines3's DQN: `python benchmarks/minatar_speed.py [--game breakout]`.
+
+Network, batch, optimizer and one update a step are those of the preset `minatar-GAME`, in both. Measured are lockstep
+runs, which act, play, store and sample as well, and updates alone, each from its own replay; on one thread, in one
+process, in turns: a round is one turn of each. The tables give the median (lowest..highest) over the rounds of steps or
+updates per second and of their ratio to Stable-Baselines3's in the same round, beside the arithmetic of an update.
+Needs the extras `bench` and `minatar`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3 import DQN
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from common.networks.network import build_network
+from common.process.threads import use_threads
+from common.settings.config import Method, RunConfig
+from common.settings.sources import base_config
+from common.types import EnvSpec
+from experiments.lockstep import Lockstep
+from learner.records.run_directory import RunDirectory
+
+SB3 = "sb3 dqn"
+START = 500  # steps before the first update
+
+Turn = Callable[[int], object]
+
+
+class Player:
+    """One subject: `play` does a number of lockstep steps, `update` a number of updates."""
+
+    def __init__(self, play: Turn, update: Turn, mflop: float) -> None:
+        self.play, self.update, self.mflop = play, update, mflop
+
+
+class Features(BaseFeaturesExtractor):
+    """The preset's network up to its last ReLU, for pictures of height x width x channels."""
+
+    def __init__(self, space: gymnasium.spaces.Box, body: nn.Sequential, width: int) -> None:
+        super().__init__(space, width)
+        self.body = body
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+        return self.body(pictures.permute(0, 3, 1, 2))
+
+
+class Numbers(gymnasium.ObservationWrapper):
+    """Bool pictures as the 0 and 1 that Stable-Baselines3 takes, in bytes."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self.observation_space = gymnasium.spaces.Box(0, 1, env.observation_space.shape, np.uint8)
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        return observation.view(np.uint8)
+
+
+def rival(config: RunConfig, spec: EnvSpec) -> Player:
+    """Stable-Baselines3's DQN, configured like the preset."""
+    learner, replay = config.learner, config.replay
+    body = build_network(config.network.kind, spec, config.network.hidden, 0)[:-1]
+    rmsprop = {"alpha": learner.alpha, "eps": learner.eps, "momentum": learner.momentum}
+    adam = {"betas": (learner.beta1, learner.beta2), "eps": learner.eps}
+    kind, options = {"rmsprop": (torch.optim.RMSprop, rmsprop), "adam": (torch.optim.Adam, adam)}[learner.optimizer]
+    model = DQN(
+        "MlpPolicy",
+        Numbers(gymnasium.make(config.env.id)),
+        learning_rate=learner.learning_rate,
+        buffer_size=replay.capacity,
+        learning_starts=START,
+        batch_size=learner.batch_size,
+        gamma=learner.gamma,
+        train_freq=1,
+        gradient_steps=1,
+        target_update_interval=learner.swap_every,
+        exploration_final_eps=config.actor.epsilon_final,
+        policy_kwargs={
+            "net_arch": [],
+            "normalize_images": False,
+            "features_extractor_class": Features,
+            "features_extractor_kwargs": {"body": body, "width": body[-2].out_features},
+            "optimizer_class": kind,
+            "optimizer_kwargs": options,
+        },
+        seed=0,
+        device="cpu",
+    )
+    model.set_logger(Logger(None, []))
+
+    def play(steps: int) -> None:
+        model.learn(steps, log_interval=10**9, reset_num_timesteps=False)
+
+    return Player(play, lambda count: model.train(count, learner.batch_size), arithmetic(config, spec))
+
+
+def ours(config: RunConfig, path: Path) -> Player:
+    """A lockstep run with its files."""
+    run = Lockstep(config)
+    directory = RunDirectory(path, config)
+
+    def play(steps: int) -> None:
+        for _ in range(steps):
+            for effects in run.play():
+                directory.record(effects.episodes, effects.metrics)
+
+    def update(count: int) -> None:
+        for _ in range(count):
+            run.agent.update(run._table.sample(config.learner.batch_size))
+
+    return Player(play, update, arithmetic(config, run.env.spec))
+
+
+def arithmetic(config: RunConfig, spec: EnvSpec) -> float:
+    """Millions of multiplications and additions of the matrix products of one update."""
+    network = build_network(config.network.kind, spec, config.network.hidden, 0)
+    products = []  # of one sample, of each layer
+    x = torch.zeros(1, *spec.input_shape)
+    for layer in network:
+        x = layer(x)
+        if isinstance(layer, nn.Conv2d | nn.Linear):
+            places = x[0, 0].numel() if isinstance(layer, nn.Conv2d) else 1
+            products.append(2 * layer.weight.numel() * places)
+    passes = 3 if config.learner.double else 2
+    gradients, cotangents = sum(products), sum(products[1:])
+    # Error-driven feedback propagates one cotangent for each action, from the last hidden layer on.
+    rows = 1 if config.feedback == "none" else spec.num_actions
+    return config.learner.batch_size * (passes * sum(products) + gradients + rows * cotangents) / 1e6
+
+
+def spread(values: list[float], digits: int) -> str:
+    middle, low, high = statistics.median(values), min(values), max(values)
+    return f"{middle:.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("methods", nargs="*", default=list(get_args(Method)))
+    parser.add_argument("--game", default="breakout")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--steps", type=int, default=300, help="of each, in a round; and as many updates")
+    options = parser.parse_args()
+    use_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        subjects: dict[str, Player] = {}
+        for method in options.methods:
+            config = base_config(["--preset", f"minatar-{options.game}", "--method", method])
+            config = replace(config, replay=replace(config.replay, learning_starts=START))
+            if not subjects:
+                with_spec = Lockstep(config)
+                subjects[SB3] = rival(config, with_spec.env.spec)
+            subjects[method] = ours(config, Path(folder) / method)
+        speeds: dict[str, dict[str, list[float]]] = {"steps": {}, "updates": {}}
+        for player in subjects.values():
+            player.play(START + options.steps)
+            player.update(options.steps)
+        for _ in range(options.rounds):
+            for name, player in subjects.items():
+                for unit, turn in (("steps", player.play), ("updates", player.update)):
+                    began = time.perf_counter()
+                    turn(options.steps)
+                    speeds[unit].setdefault(name, []).append(options.steps / (time.perf_counter() - began))
+    for unit, speed in speeds.items():
+        print(f"{'':8}  {unit + '/s':24} {'ratio':24} MFLOP an update")
+        for name, values in speed.items():
+            ratios = [value / base for value, base in zip(values, speed[SB3], strict=True)]
+            print(f"{name:8}  {spread(values, 0):24} {spread(ratios, 2):24} {subjects[name].mflop:.0f}")
+
+
+if __name__ == "__main__":
+    main()
