@@ -29,10 +29,10 @@ class ConvolutionNetwork(Dense):
     The convolution's weight is [out, channels * height * width].
     """
 
-    def __init__(self, module: nn.Sequential) -> None:
+    def __init__(self, module: nn.Module) -> None:
         """`module` must fit (see `fits`)."""
         super().__init__(module)
-        convolution = module[0]
+        convolution = next(module.children())
         assert isinstance(convolution, nn.Conv2d)
         self._kernel, self._stride = convolution.kernel_size, convolution.stride
 
@@ -43,7 +43,7 @@ class ConvolutionNetwork(Dense):
         All layers must have biases, and the convolution neither padding, dilation nor groups. Later convolutions are
         faster in PyTorch.
         """
-        match list(module.children()) if isinstance(module, nn.Sequential) else []:
+        match list(module.children()) if type(module) is nn.Sequential else []:
             case [nn.Conv2d() as convolution, nn.ReLU(), nn.Flatten(start_dim=1, end_dim=-1), *behind]:
                 return (
                     type(convolution) is nn.Conv2d

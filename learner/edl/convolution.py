@@ -9,8 +9,8 @@ import torch
 
 from common.networks.convolution import product
 from learner.edl.arrays import Array
-from learner.edl.backprop import Tape
 from learner.edl.dense import DenseChain
+from learner.edl.passes import Tape
 
 
 class ConvolutionChain(DenseChain):
