@@ -43,7 +43,9 @@ def test_a_network_of_ones_own_is_flat_and_acts(name: str) -> None:
     actions = Policy((same, other), SPEC, np.random.default_rng(0)).act(obs, 0.0)
     values = _build(name)(torch.from_numpy(obs)).detach()
     np.testing.assert_array_equal(actions, values.argmax(1).numpy())
-    assert torch.equal(other.module(torch.from_numpy(obs)), values)
+    torch.testing.assert_close(other(torch.from_numpy(obs)), values)
+    if other.dense is not None:
+        np.testing.assert_allclose(other.dense(obs), values.numpy(), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +53,7 @@ def test_a_network_of_ones_own_is_flat_and_acts(name: str) -> None:
     [
         ("missing", "module 'custom_networks' has no 'missing'"),
         ("failing", "RuntimeError: no such game"),
-        ("number", "gives a int; it must give a torch.nn.Module"),
+        ("number", "gives int; it must give a torch.nn.Module"),
         ("scalar", "its output is float32 [4, 1] for inputs [4, 4]; it must be float32 [4, 3]"),
         ("normalised", "layer '1' is a BatchNorm1d, in which the samples of a batch meet"),
         ("dropped", "layer '1' is a Dropout; random layers are not supported"),
@@ -112,7 +114,8 @@ def _play(run: Lockstep, directory: RunDirectory, steps: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "name"), [("dqn", "recurrent"), ("edql", "residual"), ("g-coop", "twice"), ("coop", "duel")]
+    ("method", "name"),
+    [("dqn", "recurrent"), ("edql", "residual"), ("g-coop", "twice"), ("coop", "duel"), ("medqn", "duel")],
 )
 def test_every_method_trains_it_the_same_way_for_a_seed_and_after_a_resume(
     method: str, name: str, tmp_path: Path
@@ -142,17 +145,34 @@ def test_every_method_trains_it_the_same_way_for_a_seed_and_after_a_resume(
     assert len(evaluate(tmp_path / "torn", 2, 0).returns) == 2
 
 
-def test_the_network_of_the_page_trains(tmp_path: Path) -> None:
-    """A console script finds the module in the working directory, as the page on networks says."""
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A working directory with the module of the page on networks."""
     page = (Path(__file__).parents[1] / "docs" / "networks.md").read_text()
     (tmp_path / "my_nets.py").write_text(page.split("```python\n")[1].split("```")[0])
-    flags = ["--network.kind", "my_nets:make", "--total-steps", "200", "--run-dir", "run"]
-    command = [str(Path(sysconfig.get_path("scripts")) / "coop-lockstep"), *flags]
-    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, timeout=100)
-    assert json.loads((tmp_path / "run" / "summary.json").read_text())["exit"].startswith("complete")
-    command[-1] = "other"
-    (tmp_path / "my_nets.py").write_text("def make(spec): return spec")
-    refused = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100)
-    assert refused.returncode == 2
-    text = "network.kind = 'my_nets:make': gives a EnvSpec; it must give a torch.nn.Module"
-    assert refused.stderr.splitlines()[-1].endswith(text)
+    return tmp_path
+
+
+def _command(folder: Path, name: str) -> subprocess.CompletedProcess[str]:
+    flags = ["--network.kind", "my_nets:make", "--total-steps", "200", "--run-dir", name]
+    command = [str(Path(sysconfig.get_path("scripts")) / name), *flags]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=110)
+
+
+@pytest.mark.parametrize("name", ["coop-lockstep", "coop-local"])
+def test_the_network_of_the_page_trains(name: str, folder: Path) -> None:
+    done = _command(folder, name)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((folder / name / "summary.json").read_text())
+    assert (summary["exit"], summary["transitions_lost"]) == ("complete", 0)
+
+
+def test_a_console_command_refuses_a_network_in_one_line(folder: Path) -> None:
+    (folder / "my_nets.py").write_text("def make(spec): return spec")
+    refused = _command(folder, "coop-lockstep")
+    text = "coop-lockstep: error: network.kind = 'my_nets:make': gives EnvSpec; it must give a torch.nn.Module\n"
+    assert (refused.returncode, refused.stderr) == (2, text)
+
+
+def test_actors_need_the_permission_to_import_it() -> None:
+    assert RunConfig(network=NetworkSettings("my_nets:make")).imports == {"network.kind": "my_nets:make"}

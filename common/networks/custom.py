@@ -36,7 +36,7 @@ def custom_network(kind: str, spec: EnvSpec, inputs: Tensor) -> nn.Module:
 
 def _problems(module: object, spec: EnvSpec, inputs: Tensor) -> Iterator[str]:
     if not isinstance(module, nn.Module):
-        yield f"gives a {type(module).__name__}; it must give a torch.nn.Module"
+        yield f"gives {type(module).__name__}; it must give a torch.nn.Module"
         return
     values = module(inputs)  # also makes the parameters of lazy layers
     expected = [len(inputs), spec.num_actions]
