@@ -155,7 +155,7 @@ class Trainer:
 
     def _number_episodes(self, drawn: Drawn) -> list[EpisodeRow]:
         """Store the counters, and number the episodes."""
-        self.drawn = msgspec.structs.replace(drawn, episodes=()) if drawn.episodes else drawn
+        self.drawn = msgspec.structs.replace(drawn, episodes=())
         number, updates, s = self.telemetry.episode, self.agent.updates, self.agent.exploration_rate()
         return [EpisodeRow(number(record.end.episode_return), record, updates, s) for record in drawn.episodes]
 

@@ -106,7 +106,7 @@ def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
     assert rows[0].s == trainer.agent.exploration_rate() > 0
     assert trainer.telemetry.return_mean == 7.0
     assert trainer.drawn.inserted == 210
-    assert not trainer.drawn.episodes
+    assert trainer.drawn.episodes == ()
 
 
 @pytest.mark.parametrize(
@@ -203,6 +203,19 @@ def test_values_that_are_not_finite_on_the_fixed_states_end_a_run_with_the_row()
         network.load(flat)
     assert trainer.train(next(source), drawn(), 0.0).metrics is None
     assert trainer.outcome() == "diverged: q_gap is not finite at update 200"
+
+
+def test_a_loss_that_overflows_ends_a_run_with_the_row_and_without_a_warning() -> None:
+    learner = replace(CONFIG.learner, swap_every=1000, publish_every=1000)
+    trainer, source = Trainer(Agent(replace(CONFIG, method="dqn", learner=learner), SPEC), 0.0), batches()
+    for _ in range(199):
+        trainer.train(next(source), drawn(), 0.0)
+    for network in trainer.agent.networks:
+        flat = network.snapshot()
+        flat[-2:] = 1e25  # the biases of the output: errors of about 1e23, whose squares no float32 holds
+        network.load(flat)
+    assert trainer.train(next(source), drawn(), 0.0).metrics is None
+    assert trainer.outcome() == "diverged: loss is not finite at update 200"
 
 
 def test_values_beyond_what_the_rewards_allow_are_told() -> None:

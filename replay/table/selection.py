@@ -29,11 +29,10 @@ class Reservoir(Eviction):
         """Draw j from 0..i for transition i (from 0): it gets row j if j < capacity, and is not kept otherwise."""
         rows = np.arange(first, first + count)
         late = max(0, self.table.capacity - first)  # the first position at which the table is full
-        if late < count:
-            rows[late:] = self.table.rng.integers(0, rows[late:] + 1)
+        rows[late:] = self.table.rng.integers(rows[late:] + 1)
         # Of several transitions for the same row, only the last one is kept.
         last = {row: position for position, row in enumerate(rows.tolist()) if row < self.table.capacity}
-        kept = np.fromiter(sorted(last.values()), np.intp, len(last))
+        kept = np.array(sorted(last.values()), np.intp)
         return rows[kept], kept
 
 
@@ -52,19 +51,19 @@ class LowestPriority(Eviction):
         """Assign unused rows, then those of the lowest priorities; new transitions are evicted last."""
         size = min(first, self._capacity)
         skipped = max(0, count - self._capacity)
-        unused = min(self._capacity - size, count - skipped)
+        unused = min(self._capacity - size, count)
         rows = dict.fromkeys(range(size, size + unused))
         while len(rows) < count - skipped:
             priority, number, row = heapq.heappop(self._heap)
             if self._ids[row] == number and self._priorities[row] == priority:
-                rows[row] = None
-        return np.fromiter(rows, np.intp, len(rows)), slice(skipped, count)
+                rows.setdefault(row)
+        return np.array(list(rows), np.intp), slice(skipped, count)
 
     def prioritise(self, rows: Rows) -> None:
         """Add the rows to the heap with their new priorities."""
         if len(self._heap) + len(rows) > 2 * self._capacity + 1024:
-            live = {entry[2] for entry in self._heap if self._ids[entry[2]] == entry[1]}
-            rows = np.fromiter(live | set(rows.tolist()), np.intp)
+            held = {row for *_, row in self._heap}
+            rows = np.array(list(held.union(rows.tolist())), np.intp)
             self._heap.clear()
         entries = zip(self._priorities[rows].tolist(), self._ids[rows].tolist(), rows.tolist(), strict=True)
         for entry in entries:
@@ -129,15 +128,15 @@ class SumTree:
 
     def values(self, rows: Rows) -> Floats:
         """Values at these rows."""
-        found: Floats = self._levels[0].reshape(-1)[rows]
+        found: Floats = self._levels[0].ravel()[rows]
         return found
 
     def update(self, rows: Rows, values: Floats) -> None:
         """Set values; if a row repeats, its last value counts."""
-        self._levels[0].reshape(-1)[rows] = values
+        self._levels[0].ravel()[rows] = values
         for below, above in pairwise(self._levels):
             rows = rows >> 4
-            above.reshape(-1)[rows] = below[rows].cumsum(axis=1)[:, -1]
+            above.ravel()[rows] = below[rows].cumsum(axis=1)[:, -1]
 
     def find(self, sums: Floats) -> Rows:
         """For each running sum in [0, total), the row whose value covers it; never a row whose value is 0."""
