@@ -287,6 +287,18 @@ def test_a_bad_array_is_refused_by_name(kind: str, array: str, value: Any, named
     assert caught.value.field == f"arrays.{named}"
 
 
+def test_boolean_frames_hold_nothing_but_0_and_1() -> None:
+    spec = EnvSpec("x", (3, 3, 2), "bool", 1, 2)
+    frames = np.random.default_rng(0).integers(0, 2, (5, 3, 3, 2)).astype(bool)
+    message = wire.decode(bytes(encode_segment("r", make_segment(spec, frames=frames))))
+    back = SegmentReader(spec)(message).frames
+    assert (back.dtype, back.tobytes()) == (np.bool_, frames.tobytes())
+    with pytest.raises(BadMessage, match=r"arrays\.frames: values from 0 to 2"):
+        SegmentReader(spec)(
+            replace(message, arrays={**message.arrays, "frames": (2 * frames.view(np.uint8)).view(bool)})
+        )
+
+
 def test_the_largest_numbers_are_taken() -> None:
     end = EpisodeEnd(3, -1e15, MAX_COUNT, 1.0, MAX_FLOAT32, -MAX_FLOAT32, MAX_UPDATES)
     changes = {

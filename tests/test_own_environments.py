@@ -1,6 +1,7 @@
 """Environments of one's own: found in modules and packages, given keyword arguments, and shown as they are."""
 
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -204,6 +205,19 @@ def test_a_module_s_environments_and_their_arguments() -> None:
     env = make_vector_env(settings, 1, 0)
     env.reset()
     assert any(env.step(np.ones(1, np.int32)).terminated.all() for _ in range(2)), "a corridor of three cells"
+
+
+def test_the_environment_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "environments.md").read_text()
+    (tmp_path / "documented_envs.py").write_text(page.split("```python\n")[1].split("```")[0].replace("Room-", "Hall-"))
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = EnvSettings(id="documented_envs:Hall-v0", kwargs={"side": 12})
+    env = make_vector_env(settings, 2, 0)
+    assert env.spec == env_spec(settings) == EnvSpec("documented_envs:Hall-v0", (64, 64, 3), "uint8", 1, 2)
+    env.reset()
+    ends = [env.step(np.array([0, 1], np.int32)) for _ in range(60)]
+    assert any(step.terminated[1] for step in ends)
+    assert any(step.restarted[0] and not step.terminated[0] for step in ends)
 
 
 def register_for_tests() -> None:
