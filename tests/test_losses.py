@@ -49,8 +49,7 @@ def test_td_errors() -> None:
         actions=[0, 1, 1, 0], rewards=[1.0, 2.0, -1.0, 0.0], terminated=[False, True, False, False], span=[1, 1, 3, 2]
     )
     values = np.array([[1.0, 9.0], [9.0, 3.0], [9.0, 0.5], [4.0, 9.0]], np.float32)
-    next_values = np.array([[2.0, 9.0], [9.0, 9.0], [9.0, 8.0], [4.0, 9.0]], np.float32)
-    errors = td_errors(batch, values, next_values, np.array([0, 1, 1, 0]), gamma=0.5)
+    errors = td_errors(batch, values, np.array([2.0, 9.0, 8.0, 4.0], np.float32), gamma=0.5)
     assert errors.dtype == np.float32
     # 1 - (1 + 2/2); 3 - 2, without a future; 0.5 - (-1 + 8/8); 4 - 4/4
     assert errors.tolist() == [-1.0, 1.0, 0.5, 3.0]
