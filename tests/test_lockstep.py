@@ -14,6 +14,7 @@ import pytest
 import torch
 from table_reference import whole_state
 
+from common.settings.methods import METHODS
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
 from learner.records.epochs import load_learner
@@ -36,7 +37,7 @@ def _play(run: Lockstep, directory: RunDirectory) -> None:
         directory.record(effects.episodes, effects.metrics)
 
 
-@pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
+@pytest.mark.parametrize("method", METHODS.names())
 def test_the_same_bytes_for_a_seed(method: str, tmp_path: Path) -> None:
     first, second = (_run(tmp_path / name, method, 700) for name in "ab")
     content = (tmp_path / "a" / "episodes.csv").read_bytes()
@@ -45,8 +46,9 @@ def test_the_same_bytes_for_a_seed(method: str, tmp_path: Path) -> None:
     assert first.agent.updates == second.agent.updates == 700 - first.config.replay.learning_starts
 
 
-def test_killed_and_resumed_to_the_byte(tmp_path: Path) -> None:
-    flags = ["--total-steps", "1500", "--checkpoint-every", "300", "--seed", "4"]
+@pytest.mark.parametrize("method", ["coop", "medqn"])
+def test_killed_and_resumed_to_the_byte(method: str, tmp_path: Path) -> None:
+    flags = ["--method", method, "--total-steps", "1500", "--checkpoint-every", "300", "--seed", "4"]
     whole = subprocess.run([COMMAND, *flags, "--run-dir", str(tmp_path / "a")], capture_output=True, check=True)
     assert b"complete: 1,500 steps" in whole.stdout
     torn = [COMMAND, *flags, "--run-dir", str(tmp_path / "b")]

@@ -140,6 +140,7 @@ def test_a_methods_own_settings_are_kept_for_it(tmp_path: Path, monkeypatch: pyt
     assert parsed([f"--config={file}", "--medqn.epochs", "4"], monkeypatch).own == MedqnSettings("real", 0.01, 2.0, 4)
     other = parsed([f"--config={file}", "--method", "dqn"], monkeypatch)
     assert other.own is None
+    assert validated(to_tables(config)) == config, "what joining roles receive"
     assert "medqn" not in to_tables(other)
     file.write_text(to_toml(other))
     assert parsed([f"--config={file}", "--method", "medqn"], monkeypatch) == config

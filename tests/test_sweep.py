@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import UsageError
+from common.settings.medqn import MedqnSettings
 from common.settings.tables import resolve
 from experiments.sweep.cli import main
 from experiments.sweep.grid import load_grid, shipped_grids
@@ -93,6 +94,20 @@ def test_a_bad_grid_is_refused(text: str, words: str, tmp_path: Path) -> None:
     assert told.startswith(f"grid {path}: ")
     assert words in told
     assert "\n" not in told
+
+
+def test_a_method_with_settings_of_its_own_varies_in_them(tmp_path: Path) -> None:
+    path = tmp_path / "g.toml"
+    path.write_text('methods = ["dqn", "medqn"]\nfixed.medqn.states = "real"\nfixed.medqn.epochs = 2\n')
+    dqn, medqn = (cell.config for cell in load_grid(str(path)).cells)
+    assert (dqn.own, medqn.own) == (None, MedqnSettings("real", epochs=2))
+    path.write_text('methods = ["medqn"]\nvary.medqn.lambda_end = [1.0, 4.0]\n')
+    cells = load_grid(str(path)).cells
+    assert [cell.name for cell in cells] == ["medqn-lambda_end=1.0-seed=0", "medqn-lambda_end=4.0-seed=0"]
+    assert [cell.config.own.lambda_end for cell in cells] == [1.0, 4.0]
+    path.write_text('methods = ["dqn", "medqn"]\nvary.medqn.epochs = [1, 2]\n')
+    with pytest.raises(UsageError, match="dqn-epochs=1-seed=0 and dqn-epochs=2-seed=0 are the same run"):
+        load_grid(str(path))
 
 
 def test_bad_flags_are_refused_before_anything_runs(

@@ -56,7 +56,7 @@ class LearnerSettings:
     swap_every: Positive = 30
     """C: updates between swaps of the acting role."""
     target_update_every: Positive | None = None
-    """C of dqn and edql: updates between copies to the target network; equals swap_every if not given."""
+    """C of methods with one network: updates between copies to the target network; default: swap_every."""
     swap_unit: Literal["updates", "steps"] = "updates"
     """Unit of swap_every and target_update_every; "steps" means environment steps, in lockstep runs only."""
     reset_role_at_episode: bool = False
@@ -189,7 +189,7 @@ class RunConfig:
     run: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")] = "coop"
     """Name of the run: roles with the same name find each other."""
     method: MethodName = "coop"
-    """Training method: gradient (dqn, g-coop, medqn) or error-driven (edql, coop); with two networks: g-coop, coop."""
+    """Training method."""
     seed: Count = 0
     """Seed of all random numbers."""
     total_steps: Steps = 50_000

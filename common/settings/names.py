@@ -26,6 +26,6 @@ def _shown(registry: Registry[Any]) -> object:
     return tyro.conf.arg(metavar=f"{{{','.join(registry.names())}}}")
 
 
-MethodName = Annotated[str, _known(METHODS), _shown(METHODS)]
+MethodName = Annotated[str, _known(METHODS)]
 EvictionName = Annotated[str, _known(EVICTIONS), _shown(EVICTIONS)]
 SamplingName = Annotated[str, _known(SAMPLERS), _shown(SAMPLERS)]

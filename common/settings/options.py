@@ -8,7 +8,9 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
+
+import tyro
 
 from common.errors import RunError, UsageError
 from common.process import cli
@@ -115,8 +117,7 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     args = sys.argv[1:]
     base = base_config(args)
     args = current_flags(args, base.learner.optimizer)
-    own = [(table, settings, field(default_factory=settings)) for table, settings in _own_tables(kind).items()]
-    extended = make_dataclass(kind.__name__, own, bases=(kind,), frozen=True)
+    extended = _with_methods(kind)
     given_own = {} if base.own is None else {table_of(base.method): base.own}
     default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **given_own)
     parsed = cli.parse(extended, program, description, default, args)
@@ -129,12 +130,19 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     return options
 
 
-def _own_tables(kind: type[RunOptions]) -> dict[str, type[Any]]:
-    """The classes of methods' own settings by table; a method that can't be imported is refused only if chosen."""
-    found = {}
+def _with_methods(kind: type[OptionsT]) -> type[OptionsT]:
+    """The options with a field for each method's own settings, and with every method in the help.
+
+    A method that can't be imported is refused if it is chosen, and otherwise left out.
+    """
+    added: list[tuple[str, Any, Any]] = []
+    summaries = []
     for name in METHODS.names():
         with suppress(UsageError):
             method = METHODS.get(name)
+            summaries.append(f"{name}: {method.summary}")
             if method.settings is not None and not hasattr(kind, method.table):
-                found[method.table] = method.settings
-    return found
+                added.append((method.table, method.settings, field(default_factory=method.settings)))
+    shown = tyro.conf.arg(metavar=f"{{{','.join(METHODS.names())}}}", help=f"Training method; {'; '.join(summaries)}.")
+    added.append(("method", Annotated[str, shown], RunConfig.method))
+    return make_dataclass(kind.__name__, added, bases=(kind,), frozen=True)

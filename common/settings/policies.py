@@ -13,14 +13,13 @@ from common.registry import Registry
 class Policy:
     """A policy of a replay table.
 
-    name: as the setting has it. summary: what it does, in a few words.
+    name: as the setting has it.
     make: its class, a function of a `replay.table.policies.TableView`, or "module:Class" to import it in the replay
         service only.
     priorities: it uses the priorities of transitions, which the learner then sends.
     """
 
     name: str
-    summary: str
     make: str | Callable[..., Any]
     priorities: bool = False
 
@@ -50,11 +49,9 @@ EVICTIONS = Registry(
     "coop.evictions",
     EvictionPolicy,
     {
-        "fifo": EvictionPolicy("fifo", "the oldest", "replay.table.selection:Fifo", in_order=True),
-        "reservoir": EvictionPolicy("reservoir", "a random one", "replay.table.selection:Reservoir"),
-        "prioritized": EvictionPolicy(
-            "prioritized", "the one of the lowest priority", "replay.table.selection:LowestPriority", priorities=True
-        ),
+        "fifo": EvictionPolicy("fifo", "replay.table.selection:Fifo", in_order=True),
+        "reservoir": EvictionPolicy("reservoir", "replay.table.selection:Reservoir"),
+        "prioritized": EvictionPolicy("prioritized", "replay.table.selection:LowestPriority", priorities=True),
     },
 )
 SAMPLERS = Registry(
@@ -62,9 +59,7 @@ SAMPLERS = Registry(
     "coop.samplers",
     SamplingPolicy,
     {
-        "uniform": SamplingPolicy("uniform", "all alike", "replay.table.selection:Uniform", without_replacement=True),
-        "prioritized": SamplingPolicy(
-            "prioritized", "by priority", "replay.table.selection:Proportional", priorities=True
-        ),
+        "uniform": SamplingPolicy("uniform", "replay.table.selection:Uniform", without_replacement=True),
+        "prioritized": SamplingPolicy("prioritized", "replay.table.selection:Proportional", priorities=True),
     },
 )
