@@ -17,7 +17,8 @@ INCARNATION = 77
 def make_segment(spec: EnvSpec, sequence: int = 0, steps: int = 4, incarnation: int = 7, **changes: object) -> Segment:
     """Consecutive steps with distinguishable frames; the last step ends an episode."""
     first = sequence * steps
-    frames = np.arange(first, first + steps + 1, dtype=np.float32)[:, None] + np.zeros(spec.frame_shape, np.float32)
+    numbers = np.arange(first, first + steps + 1, dtype=np.float32).reshape(-1, *[1] * len(spec.frame_shape))
+    frames = numbers + np.zeros(spec.frame_shape, np.float32)
     index = np.arange(steps, dtype=np.int32)[:, None]
     values: dict[str, object] = {
         "incarnation": incarnation,
