@@ -202,3 +202,9 @@ def huge(spec: EnvSpec) -> nn.Module:
     body = nn.Linear(4, spec.num_actions)
     body.wide = wide
     return body
+
+
+def repeated(spec: EnvSpec) -> nn.Module:
+    """A stack in which a Linear and a ReLU stand twice."""
+    layer, relu = nn.Linear(4, 4), nn.ReLU()
+    return nn.Sequential(layer, relu, layer, relu, nn.Linear(4, spec.num_actions))

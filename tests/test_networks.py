@@ -30,7 +30,7 @@ def _build(name: str, seed: int = 0) -> torch.nn.Module:
     return build_network(f"custom_networks:{name}", SPEC, (), seed)
 
 
-@pytest.mark.parametrize("name", ["duel", "residual", "recurrent", "lazy", "doubled"])
+@pytest.mark.parametrize("name", ["duel", "residual", "recurrent", "lazy", "doubled", "repeated"])
 def test_a_network_of_ones_own_is_flat_and_acts(name: str) -> None:
     state = torch.get_rng_state()
     same, other = FlatNetwork(_build(name)), FlatNetwork(_build(name, 1))
@@ -44,8 +44,8 @@ def test_a_network_of_ones_own_is_flat_and_acts(name: str) -> None:
     values = _build(name)(torch.from_numpy(obs)).detach()
     np.testing.assert_array_equal(actions, values.argmax(1).numpy())
     torch.testing.assert_close(other(torch.from_numpy(obs)), values)
-    if other.dense is not None:
-        np.testing.assert_allclose(other.dense(obs), values.numpy(), rtol=1e-4, atol=1e-6)
+    if other.in_numpy is not None:
+        np.testing.assert_allclose(other.in_numpy(obs), values.numpy(), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(

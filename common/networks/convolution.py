@@ -43,7 +43,7 @@ class ConvolutionNetwork(Dense):
         All layers must have biases, and the convolution neither padding, dilation nor groups. Later convolutions are
         faster in PyTorch.
         """
-        match list(module.children()) if type(module) is nn.Sequential else []:
+        match list(module) if type(module) is nn.Sequential else []:
             case [nn.Conv2d() as convolution, nn.ReLU(), nn.Flatten(start_dim=1, end_dim=-1), *behind]:
                 return (
                     type(convolution) is nn.Conv2d

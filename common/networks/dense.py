@@ -28,13 +28,17 @@ class Dense:
 
     @staticmethod
     def fits(module: nn.Module) -> bool:
-        """Whether a network is Linear, ReLU, Linear, ..., Linear with biases, in float32 or float64 on the CPU."""
-        steps = list(module.children()) if type(module) is nn.Sequential else []
+        """Whether a network is Linear, ReLU, Linear, ..., Linear with biases, in float32 or float64 on the CPU.
+
+        No two layers may share a parameter.
+        """
+        steps = list(module) if type(module) is nn.Sequential else []
         kinds = [type(step) for step in steps]
         return (
             len(steps) % 2 == 1
             and kinds == ([nn.Linear, nn.ReLU] * len(steps))[: len(steps)]
             and all(isinstance(step.bias, torch.Tensor) for step in steps[::2])
+            and len(list(module.parameters())) == len(steps) + 1
             and all(p.device.type == "cpu" and p.dtype in DTYPES for p in module.parameters())
         )
 

@@ -32,8 +32,9 @@ class Chain(Passes):
         self._weights = [step.weight if isinstance(step, Parametrised) else None for step in self._steps]
         self._biases = [step.bias if isinstance(step, Parametrised) else None for step in self._steps]
         self.parametrised = [i for i, weight in enumerate(self._weights) if weight is not None]
-        if not self.parametrised or len({id(self._weights[i]) for i in self.parametrised}) < len(self.parametrised):
-            raise UnsupportedLayerError("the network must hold parameters, and no layer twice")
+        held = sum(self._biases[i] is not None for i in self.parametrised) + len(self.parametrised)
+        if not self.parametrised or len(list(network.parameters())) < held:
+            raise UnsupportedLayerError("the network must hold parameters, and none twice")
 
     @property
     def output_weight(self) -> Tensor | None:
