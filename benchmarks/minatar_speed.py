@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import gymnasium
 import numpy as np
@@ -25,10 +24,12 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from common.networks.network import build_network
 from common.process.threads import use_threads
-from common.settings.config import Method, RunConfig
+from common.settings.config import RunConfig
+from common.settings.methods import METHODS
 from common.settings.sources import base_config
 from common.types import EnvSpec
 from experiments.lockstep import Lockstep
@@ -43,8 +44,8 @@ Turn = Callable[[int], object]
 class Player:
     """One subject: `play` does a number of lockstep steps, `update` a number of updates."""
 
-    def __init__(self, play: Turn, update: Turn, mflop: float) -> None:
-        self.play, self.update, self.mflop = play, update, mflop
+    def __init__(self, play: Turn, update: Turn) -> None:
+        self.play, self.update = play, update
 
 
 class Features(BaseFeaturesExtractor):
@@ -104,7 +105,7 @@ def rival(config: RunConfig, spec: EnvSpec) -> Player:
     def play(steps: int) -> None:
         model.learn(steps, log_interval=10**9, reset_num_timesteps=False)
 
-    return Player(play, lambda count: model.train(count, learner.batch_size), arithmetic(config, spec))
+    return Player(play, lambda count: model.train(count, learner.batch_size))
 
 
 def ours(config: RunConfig, path: Path) -> Player:
@@ -121,24 +122,14 @@ def ours(config: RunConfig, path: Path) -> Player:
         for _ in range(count):
             run.agent.update(run._table.sample(config.learner.batch_size))
 
-    return Player(play, update, arithmetic(config, run.env.spec))
+    return Player(play, update)
 
 
-def arithmetic(config: RunConfig, spec: EnvSpec) -> float:
-    """Millions of multiplications and additions of the matrix products of one update."""
-    network = build_network(config.network.kind, spec, config.network.hidden, 0)
-    products = []  # of one sample, of each layer
-    x = torch.zeros(1, *spec.input_shape)
-    for layer in network:
-        x = layer(x)
-        if isinstance(layer, nn.Conv2d | nn.Linear):
-            places = x[0, 0].numel() if isinstance(layer, nn.Conv2d) else 1
-            products.append(2 * layer.weight.numel() * places)
-    passes = 3 if config.learner.double else 2
-    gradients, cotangents = sum(products), sum(products[1:])
-    # Error-driven feedback propagates one cotangent for each action, from the last hidden layer on.
-    rows = 1 if config.feedback == "none" else spec.num_actions
-    return config.learner.batch_size * (passes * sum(products) + gradients + rows * cotangents) / 1e6
+def arithmetic(update: Turn) -> float:
+    """Millions of multiplications and additions in the matrix products of one update, as PyTorch counts them."""
+    with FlopCounterMode(display=False) as counter:
+        update(1)
+    return counter.get_total_flops() / 1e6
 
 
 def spread(values: list[float], digits: int) -> str:
@@ -149,7 +140,7 @@ def spread(values: list[float], digits: int) -> str:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("methods", nargs="*", default=list(get_args(Method)))
+    parser.add_argument("methods", nargs="*", default=list(METHODS.names()))
     parser.add_argument("--game", default="breakout")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--steps", type=int, default=300, help="of each, in a round; and as many updates")
@@ -178,7 +169,7 @@ def main() -> None:
         print(f"{'':8}  {unit + '/s':24} {'ratio':24} MFLOP an update")
         for name, values in speed.items():
             ratios = [value / base for value, base in zip(values, speed[SB3], strict=True)]
-            print(f"{name:8}  {spread(values, 0):24} {spread(ratios, 2):24} {subjects[name].mflop:.0f}")
+            print(f"{name:8}  {spread(values, 0):24} {spread(ratios, 2):24} {arithmetic(subjects[name].update):.0f}")
 
 
 if __name__ == "__main__":

@@ -26,6 +26,11 @@ def convert_like(values: Array, array: Array) -> Array:
     return namespace(array).asarray(values, dtype=array.dtype, device=array.device)
 
 
+def widened(array: Array) -> Array:
+    """A copy of `array` in float64."""
+    return array.double() if isinstance(array, torch.Tensor) else array.astype(np.float64)
+
+
 def assign(array: Array, values: Array) -> None:
     """Overwrite `array` with `values`, of either library and any dtype, in one pass."""
     array[:] = values if namespace(values) is namespace(array) else convert_like(values, array)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import Array, convert_like, namespace
+from learner.edl.arrays import Array, convert_like, namespace, widened
 
 _SMALL = 8  # the shorter side up to which an SVD is faster than the algebra with a Gram matrix
 
@@ -42,8 +42,8 @@ def whitened(gram: Array, e: Array) -> tuple[Array, Array | None]:
     if gram.shape[-1] == 2:
         white, doubtful = _whitened_pairs(gram, e, limits)
     else:
-        wide, unsafe = _whitened_by_eigh(torch.as_tensor(gram).double(), torch.as_tensor(e).double(), limits)
-        white, doubtful = convert_like(wide, gram), None if unsafe is None else namespace(gram).asarray(unsafe)
+        wide, doubtful = _whitened_by_eigh(widened(gram), widened(e), limits)
+        white = convert_like(wide, gram)
     if doubtful is not None:
         white[namespace(gram).broadcast_to(doubtful, white.shape[:-1])] = 0
     return white, doubtful
@@ -70,16 +70,18 @@ def _whitened_pairs(g: Array, e: Array, limits: _Limits) -> tuple[Array, Array |
     return white, doubtful
 
 
-def _whitened_by_eigh(g: Tensor, e: Tensor, limits: _Limits) -> tuple[Tensor, Tensor | None]:
-    diagonal = g.diagonal(dim1=-2, dim2=-1)
-    safe = g.isfinite().all(-1).all(-1) & (diagonal.amin(-1) > limits.square)
-    values, vectors = torch.linalg.eigh(g if safe.all() else g.masked_fill(~safe[..., None, None], 0))
+def _whitened_by_eigh(g: Array, e: Array, limits: _Limits) -> tuple[Array, Array | None]:
+    xp = namespace(g)
+    diagonal = xp.einsum("...ii->...i", g)
+    safe = xp.isfinite(g).all((-2, -1)) & (xp.amin(diagonal, -1) > limits.square)
+    values, vectors = xp.linalg.eigh(g if safe.all() else xp.where(safe[..., None, None], g, 0))
     safe &= values[..., 0] > limits.ratio * values[..., -1]
-    inverse = values.clamp_min(limits.square).reciprocal()
-    inflation = (diagonal * (vectors.square() * inverse.unsqueeze(-2)).sum(-1)).sum(-1)
+    inverse = 1 / xp.clip(values, limits.square, None)
+    inflation = xp.einsum("...i,...ij,...j->...", diagonal, vectors * vectors, inverse)
     safe &= inflation <= limits.inflation
-    white = vectors @ (inverse.sqrt() * (vectors.mT @ e.unsqueeze(-1)).squeeze(-1)).unsqueeze(-1)
-    return white.squeeze(-1), None if safe.all() else ~safe
+    rotated = xp.einsum("...ij,...i->...j", vectors, e)
+    white = xp.einsum("...ij,...j->...i", vectors, inverse**0.5 * rotated)
+    return white, None if safe.all() else ~safe
 
 
 def polar(matrix: Tensor, rng: np.random.Generator) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import Array, convert_like, namespace
+from learner.edl.arrays import Array, convert_like, namespace, widened
 from learner.edl.passes import Passes, Range, Tape
 from learner.edl.polar import polar_by_svd, whitened
 
@@ -114,9 +114,10 @@ def _basis(output_weight: Array | None, output: Array) -> Array:
         return convert_like(_SUM_AND_DIFFERENCE, output)
     if output_weight is None:
         return convert_like(_reflection(actions), output)
-    w = torch.as_tensor(output_weight).double()
-    vectors: Tensor = torch.linalg.eigh((w @ w.mT).nan_to_num_()).eigenvectors
-    return convert_like(vectors.mT, output)
+    xp, w = namespace(output), widened(output_weight)
+    gram = w @ w.T
+    _, vectors = xp.linalg.eigh(gram if xp.isfinite(gram).all() else xp.zeros_like(gram))
+    return convert_like(vectors.T, output)
 
 
 def _reflection(size: int) -> Tensor:
