@@ -4,11 +4,20 @@ import json
 import os
 import subprocess
 import sysconfig
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium
+import my_envs
 import pytest
 
+from common.errors import RunError
 from common.process.processes import free_endpoint
+from common.settings.environment import EnvSettings
+from common.settings.sources import base_config
+from experiments.lockstep import Lockstep
+from learner.records.run_directory import RunDirectory
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 OWN = Path(__file__).with_name("data") / "own" / "my_envs.py"
@@ -48,20 +57,51 @@ def test_a_module_elsewhere_is_trained(folder: Path, env_id: str, network: str, 
         assert "return of 2 greedy episodes" in played.stdout, played.stderr
 
 
-def test_lockstep_goes_on_only_where_the_environment_repeats(folder: Path) -> None:
-    module = folder / "my_envs.py"
-    flags = ["--env.id", "my_envs:Planes-v0", *SHORT]
-    assert run(folder, "coop-lockstep", *flags, "--run-dir", "run").returncode == 0
-    longer = ["--resume", "--run-dir", "run", "--total-steps"]
-    again = run(folder, "coop-lockstep", *longer, "220")
-    assert again.returncode == 0, again.stderr
-    module.write_text(module.read_text().replace("float(arrived), arrived", "2 * float(arrived), arrived"))
-    before = (folder / "run" / "episodes.csv").read_bytes()
-    refused = run(folder, "coop-lockstep", *longer, "240")
-    assert refused.returncode == 1
-    assert "my_envs:Planes-v0 showed something else when the run's 220 actions were played again" in refused.stderr
-    assert refused.stderr.count("\n") == 1
-    assert (folder / "run" / "episodes.csv").read_bytes() == before
+class Changed(my_envs.Room):
+    """The same room with one thing changed, by name."""
+
+    def __init__(self, what: str, **options: Any) -> None:
+        super().__init__(**options)
+        self.what = what
+
+    def reset(self, **options: Any) -> Any:
+        observation, info = super().reset(**options)
+        return (observation ^ (self.what == "first pixel" and self.count == 1)), info
+
+    def step(self, action: int) -> Any:
+        observation, reward, over, cut, info = super().step(action)
+        late = self.count > 90
+        observation ^= self.what == "pixel" and late
+        return (
+            observation,
+            reward + 0.5 * (self.what == "reward" and late),
+            over,
+            cut or (self.what == "end" and late),
+            info,
+        )
+
+
+gymnasium.register("test/Changed-v0", entry_point=Changed)
+
+
+@pytest.mark.parametrize("what", ["nothing", "first pixel", "pixel", "reward", "end"])
+@pytest.mark.parametrize("stack", [1, 2])
+def test_lockstep_goes_on_only_where_the_environment_repeats(tmp_path: Path, what: str, stack: int) -> None:
+    config = base_config(["--method", "dqn"])
+    kwargs = {"kind": "planes", "what": "nothing"}
+    config = replace(config, env=EnvSettings(id="test/Changed-v0", stack=stack, kwargs=kwargs))
+    first = Lockstep(config)
+    with RunDirectory(tmp_path, config) as directory:
+        for _ in range(100):
+            list(first.play())
+        first.save(directory)
+    again = Lockstep(replace(config, env=replace(config.env, kwargs={**kwargs, "what": what})))
+    epoch = tmp_path / "checkpoints" / "0"
+    if what == "nothing":
+        again.restore(epoch)
+        return
+    with pytest.raises(RunError, match="test/Changed-v0 showed something else when the run's 100 actions were played"):
+        again.restore(epoch)
 
 
 def test_an_actor_imports_only_what_its_own_user_allows(folder: Path, tmp_path: Path) -> None:
