@@ -121,6 +121,7 @@ class _Trial:
         return self._calls[layer.name].passed is self._root
 
     def _depends_on(self, layer: Layer) -> bool:
+        """Whether the output depends on the layer; raises unless its parameters act through its own output alone."""
         output = self._calls[layer.name].output
         error = torch.linspace(-1, 1, self._root.numel(), dtype=output.dtype, device=output.device)
         error = error.view_as(self._root)
