@@ -19,6 +19,7 @@ from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
 
+pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 OWN = Path(__file__).with_name("data") / "own" / "my_envs.py"
 SHORT = [
@@ -39,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
 def run(folder: Path, name: str, *flags: str) -> subprocess.CompletedProcess[str]:
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     return subprocess.run(
-        [SCRIPTS / name, *flags], cwd=folder, env=environment, capture_output=True, text=True, timeout=110, check=False
+        [SCRIPTS / name, *flags], cwd=folder, env=environment, capture_output=True, text=True, timeout=280, check=False
     )
 
 
