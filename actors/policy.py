@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from common.networks.network import FlatNetwork, preprocess
+from common.networks.network import FlatNetwork, q_values
 from common.types import Array, EnvSpec
 
 
@@ -29,19 +26,12 @@ class Policy:
         actions = np.empty(len(obs), np.int32)
         random = (self._rng.random(len(obs)) < epsilon).nonzero()[0]
         if len(random) < len(obs):
-            actions[:] = self._values(self.acting, obs).argmax(1)
+            actions[:] = q_values(self.networks[self.acting], obs, self._spec).argmax(1)
         if len(random):
             actions[random] = self._rng.integers(self._spec.num_actions, size=len(random), dtype=np.int32)
         return actions
 
     def mean_values(self, obs: Array) -> tuple[float, float]:
         """Mean over actions of Q1 and of Q2 at one observation <frame_dtype>[*obs_shape]."""
-        first, second = (float(self._values(number, obs[None]).mean()) for number in (0, 1))
+        first, second = (float(q_values(network, obs[None], self._spec).mean()) for network in self.networks)
         return first, second
-
-    def _values(self, number: int, obs: Array) -> NDArray[np.floating[Any]]:
-        network = self.networks[number]
-        if network.in_numpy is not None:
-            return network.in_numpy(preprocess(obs, self._spec))
-        with torch.inference_mode():
-            return network(preprocess(torch.from_numpy(obs), self._spec).to(network.flat.dtype)).float().numpy()

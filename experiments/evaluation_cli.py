@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -38,10 +37,10 @@ def _run() -> None:
         raise UsageError(f"--episodes {options.episodes}: must be at least 1")
     if options.seed < 0:
         raise UsageError(f"--seed {options.seed}: must be at least 0")
-    from experiments.evaluation import evaluate  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+    from experiments.evaluation import evaluate_checkpoint  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
-    done = evaluate(options.run_dir, options.episodes, options.seed)
-    mean, sd = statistics.fmean(done.returns), statistics.pstdev(done.returns)
+    done = evaluate_checkpoint(options.run_dir, options.episodes, options.seed)
+    mean, sd = done.mean, done.sd
     print(
         f"return of {len(done.returns)} greedy episodes: mean {mean:.2f}, sd {sd:.2f}, least {min(done.returns):g}, "
         f"most {max(done.returns):g}; network {done.network} of checkpoint {done.epoch} in {options.run_dir}"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.evaluation import evaluate
+from experiments.evaluation import evaluate_checkpoint
 from experiments.report.study import load_study
 
 DATA = Path(__file__).with_name("data") / "earlier-lockstep-run.tar.gz"
@@ -26,7 +26,7 @@ def earlier(tmp_path: Path) -> Path:
 
 
 def test_it_is_evaluated_and_reported(earlier: Path) -> None:
-    assert evaluate(earlier, 1, 0).epoch == 160
+    assert evaluate_checkpoint(earlier, 1, 0).epoch == 160
     (run,) = load_study(earlier.parent).runs
     assert run.config.replay.learning_starts == 40
     assert run.config.learner.beta2 == 0.999

@@ -17,7 +17,7 @@ from common.process.files import LineFile
 from common.process.lifecycle import Stop
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
-from experiments.lockstep_cli import run_lockstep
+from experiments.lockstep_run import play_lockstep
 from learner.records.epochs import complete_epochs
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import summarise
@@ -82,7 +82,7 @@ def test_a_lockstep_run_goes_on_without_its_epochs(small_disk: Path, capsys: pyt
     with RunDirectory(path, run.config) as directory:
         _fill(small_disk)
         with pytest.raises(RunError, match=r"how the run ended: failed: epoch 550 in .*: No space left on device"):
-            run_lockstep(run, directory, Stop())
+            play_lockstep(run, directory, Stop())
     run.env.close()
     assert run.step == run.config.total_steps
     assert complete_epochs(path) == []

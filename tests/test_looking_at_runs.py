@@ -13,7 +13,7 @@ import torch
 
 from common.settings.sources import base_config
 from experiments import evaluation_cli
-from experiments.evaluation import evaluate
+from experiments.evaluation import evaluate_checkpoint
 from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
 
@@ -39,13 +39,13 @@ def run_with(path: Path, acting: int, action: int) -> None:
 @pytest.mark.parametrize(("acting", "action"), [(0, 1), (1, 0)])
 def test_the_acting_network_plays_its_best_action(acting: int, action: int, tmp_path: Path) -> None:
     run_with(tmp_path / "run", acting, action)
-    done = evaluate(tmp_path / "run", 30, 5)
+    done = evaluate_checkpoint(tmp_path / "run", 30, 5)
     assert done.network == acting + 1
     # CartPole falls after 8 to 11 steps of the same push.
     assert len(done.returns) == 30
     assert {8.0, 9.0, 10.0} <= set(done.returns) <= {8.0, 9.0, 10.0, 11.0}
-    assert evaluate(tmp_path / "run", 30, 5) == done
-    assert evaluate(tmp_path / "run", 30, 6) != done
+    assert evaluate_checkpoint(tmp_path / "run", 30, 5) == done
+    assert evaluate_checkpoint(tmp_path / "run", 30, 6) != done
 
 
 def test_eval_on_the_command_line(

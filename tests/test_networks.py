@@ -17,7 +17,7 @@ from common.settings.config import EdlSettings, LearnerSettings, NetworkSettings
 from common.settings.sources import base_config
 from common.settings.tables import validated
 from common.types import EnvSpec
-from experiments.evaluation import evaluate
+from experiments.evaluation import evaluate_checkpoint
 from experiments.lockstep import Lockstep
 from learner.edl.graph import Graph
 from learner.qnetwork import make_q_network
@@ -142,7 +142,7 @@ def test_every_method_trains_it_the_same_way_for_a_seed_and_after_a_resume(
         assert torch.isfinite(network.flat).all()
         changed = {part for part, view in network.views(network.flat - initial).items() if view.any()}
         assert changed == {part for part, _ in network.layout}
-    assert len(evaluate(tmp_path / "torn", 2, 0).returns) == 2
+    assert len(evaluate_checkpoint(tmp_path / "torn", 2, 0).returns) == 2
 
 
 @pytest.fixture

@@ -8,7 +8,9 @@ import socket
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from common.errors import RunError
 from common.process.lifecycle import SIGNALS, SUPERVISED, status_after
@@ -23,14 +25,22 @@ class ChildProcess:
 
     Args:
         name: shown to users, for example "actor 2".
-        inherit: file descriptors of locks that the child holds too.
+        inherit: file descriptors of locks that the child holds too. environment: variables that it gets as well.
     """
 
-    def __init__(self, name: str, command: list[str], log: Path, inherit: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self,
+        name: str,
+        command: list[str],
+        log: Path,
+        inherit: tuple[int, ...] = (),
+        environment: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         self.name = name
         self._command = command
         self._log = log
         self._inherit = inherit
+        self._environment = environment
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -45,6 +55,7 @@ class ChildProcess:
                 start_new_session=True,  # a Ctrl-C at the terminal reaches the supervisor alone
                 env={
                     **os.environ,
+                    **self._environment,
                     SUPERVISED: str(os.getpid()),
                     INHERITED: ",".join(map(str, self._inherit)),
                 },

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,12 +14,11 @@ from common.process.cli import parse
 from common.process.lifecycle import Stop, run_main
 from experiments.sweep import slurm
 from experiments.sweep.display import SweepDisplay
-from experiments.sweep.folder import CellFolder
+from experiments.sweep.folder import CellFolder, claim_folder
 from experiments.sweep.grid import Grid, load_grid
 from experiments.sweep.runner import Runner
 
 TICK = 0.2  # seconds
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -58,14 +56,12 @@ def _run() -> None:
     grid = load_grid(options.grid, options.quick)
     folder = options.folder()
     cells = _chosen(options, grid, folder)
-    _claim_folder(grid, cells, folder)
+    claim_folder(grid, cells, folder)
     if options.slurm:
         left = [cell.cell.name for cell in cells if not (cell.finished() or cell.diverged())]
         print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
         return
-    # By default, the libraries that a run uses start a thread per core, and concurrent runs would starve each other.
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    _work(Runner(grid.file, cells, options.jobs or len(os.sched_getaffinity(0))), folder)
+    _work(Runner(grid.file, cells, options.jobs), folder)
 
 
 def _chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
@@ -73,19 +69,6 @@ def _chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]
     if not cells:
         raise UsageError(f"--cell {options.cell}: not in the grid; its first cell is {grid.cells[0].name}")
     return cells
-
-
-def _claim_folder(grid: Grid, cells: list[CellFolder], folder: Path) -> None:
-    """Assign the folder to this sweep, or refuse it before anything runs."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for cell in cells:
-            cell.check()
-        part = folder / f"sweep.toml.{os.getpid()}"  # the tasks of a job array write it concurrently
-        part.write_text(grid.to_toml(), encoding="utf-8")
-        part.replace(folder / "sweep.toml")
-    except OSError as error:
-        raise UsageError(f"--dir {folder}: {error.strerror}") from error
 
 
 def _work(runner: Runner, folder: Path) -> None:

@@ -8,7 +8,7 @@ import io
 import json
 import os
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from common.errors import UsageError
 from common.process.locks import FileLock
 from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, resolve, to_toml
-from experiments.sweep.grid import Cell
+from experiments.sweep.grid import Cell, Grid
 
 TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
 
@@ -93,3 +93,20 @@ class CellFolder:
         if not rows:
             return Progress(0, 0.0)
         return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
+
+
+def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
+    """Assign a folder to a sweep, or refuse it before anything runs.
+
+    Raises:
+        UsageError: it holds runs of other configs, or cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for cell in cells:
+            cell.check()
+        part = folder / f"sweep.toml.{os.getpid()}"  # the tasks of a job array write it concurrently
+        part.write_text(grid.to_toml(), encoding="utf-8")
+        part.replace(folder / "sweep.toml")
+    except OSError as error:
+        raise UsageError(f"--dir {folder}: {error.strerror}") from error

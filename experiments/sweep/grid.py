@@ -64,6 +64,11 @@ class Grid:
     file: GridFile
     cells: tuple[Cell, ...]
 
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Dotted names of the fields that vary."""
+        return tuple(".".join(path) for path, _ in leaves(self.file.vary))
+
     def to_toml(self) -> str:
         """The grid as a file for `load_grid`."""
         return tomli_w.dumps(asdict(self.file))

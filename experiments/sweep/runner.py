@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -11,6 +12,8 @@ from experiments.sweep.folder import CellFolder, Progress
 from experiments.sweep.grid import GridFile
 
 GRACE = 60.0  # seconds for a run to save its state
+# By default, the libraries that a run uses start a thread per core, and concurrent runs would starve each other.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 RETRY = 1.0  # seconds before retrying a cell that another process holds
 
 
@@ -48,13 +51,14 @@ class Runner:
     processes never run the same cell: a second sweep, and the tasks of a job array, share the work.
     """
 
-    def __init__(self, grid: GridFile, folders: list[CellFolder], jobs: int) -> None:
+    def __init__(self, grid: GridFile, folders: list[CellFolder], jobs: int | None) -> None:
+        """jobs: number of cells to run concurrently; the number of cores if None."""
         self.folders = folders
         self.running: list[Running] = []
         self.tally = Tally()
         self.waiting: deque[CellFolder] = deque()
         self._grid = grid
-        self._jobs = jobs
+        self._jobs = jobs or len(os.sched_getaffinity(0))
         self._retry_at: dict[str, float] = {}
         for folder in folders:
             if folder.finished():
@@ -148,7 +152,7 @@ class Runner:
                 else:
                     began = folder.progress().step
                     folder.prepare()
-                    process = ChildProcess(name, self._command(folder), folder.path / "run.log", (lock,))
+                    process = ChildProcess(name, self._command(folder), folder.path / "run.log", (lock,), ONE_THREAD)
                     process.start()
                     self.running.append(Running(folder, process, began, Progress(began, 0.0)))
         except OSError as error:

@@ -29,19 +29,17 @@ def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path) -> 
     Raises:
         OSError: it can't be written; an older one is untouched then.
     """
-    import matplotlib as mpl  # noqa: PLC0415 (half a second, needed once at the end)
+    # A figure without pyplot leaves the caller's backend, a notebook's for example, as it is.
+    from matplotlib.figure import Figure  # noqa: PLC0415 (half a second, needed once at the end)
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415
-
-    figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
     axes.plot(steps, returns, ".", markersize=2, alpha=0.35, label="episode")
     axes.plot(steps, running_mean(returns), linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
     axes.set(xlabel="environment steps", ylabel="return", title=title)
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
     content = io.BytesIO()
-    figure.savefig(content, dpi=120)
-    plt.close(figure)
+    figure.savefig(content, format="png", dpi=120)
     write_atomic(path, content.getvalue())
     return path

@@ -1,0 +1,52 @@
+"""The Python API: train, load, evaluate and sweep from a script or a notebook.
+
+    run = coop.train(preset="cartpole", method="coop", seed=0, total_steps=20_000, run_dir="runs/a")
+    for row in run.metrics():
+        print(row["env_step"], row["loss"])
+    policy = coop.load("runs/a").policy()
+    print(coop.evaluate(policy, episodes=20).mean)
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from common.errors import CoopError, RunError, UsageError
+from common.settings.config import RunConfig
+from common.settings.methods import METHODS, Method
+from experiments.evaluation import Evaluation, evaluate
+from experiments.saved import SavedPolicy, SavedRun
+from experiments.sweep.run import SweepResult, sweep
+from experiments.training import TrainingRun, train
+
+__all__ = [
+    "CoopError",
+    "Evaluation",
+    "Method",
+    "RunConfig",
+    "RunError",
+    "SavedPolicy",
+    "SavedRun",
+    "SweepResult",
+    "TrainingRun",
+    "UsageError",
+    "evaluate",
+    "load",
+    "register_method",
+    "sweep",
+    "train",
+]
+
+
+def load(run_dir: str | Path) -> SavedRun:
+    """The run in a folder, whether it has ended or not; raises UsageError if there is none."""
+    return SavedRun(Path(run_dir))
+
+
+def register_method(method: Method) -> None:
+    """Add a training method in this process; raises UsageError for a name in use.
+
+    The processes of distributed runs and of sweeps know only the methods of installed packages, which add them by an
+    entry point of the group `coop.methods`.
+    """
+    METHODS.register(method)

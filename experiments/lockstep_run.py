@@ -1,0 +1,119 @@
+"""A lockstep run with its files: starts or goes on in a run directory, plays to the end, and completes the files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from common.errors import RunError
+from common.process.console import say
+from common.process.lifecycle import Stop
+from common.process.locks import RunLock
+from common.process.threads import use_threads
+from common.settings.config import RunConfig
+from experiments.lockstep import Lockstep
+from learner.records.epochs import newest_epoch
+from learner.records.run_directory import RunDirectory
+from learner.records.summary import Summary, summarise
+
+PROGRESS_EVERY = 5.0  # seconds
+
+
+class LockstepRun:
+    """A run that holds its directory's locks until `close`.
+
+    epoch: from which it goes on; None if it starts.
+    """
+
+    def __init__(self, config: RunConfig, path: Path, program: str, *, resume: bool) -> None:
+        """Prepare the run; program: named to other processes that want the directory.
+
+        Raises:
+            UsageError: the config does not fit the environment, or the directory's epoch a lockstep run.
+            RunError: another process uses the directory, or it cannot be read.
+        """
+        use_threads(config.learner.threads)
+        self.path = path
+        self._run = Lockstep(config)
+        try:
+            self._lock = RunLock(path, program, ("learner", "replay"))
+        except RunError:
+            self._run.env.close()
+            raise
+        try:
+            self.epoch = newest_epoch(path) if resume else None
+            self._sizes = None if self.epoch is None else self._run.restore(self.epoch)
+        except BaseException:
+            self.close()
+            raise
+
+    def play(self, stop: Stop, progress: Callable[[str], None] = lambda line: None) -> Summary:
+        """Play until the run is over or stopped; progress: called with a line every few seconds.
+
+        Raises:
+            RunError: there is no space for the closing epoch or the summary.
+        """
+        with RunDirectory(self.path, self._run.config, self._sizes) as directory:
+            return play_lockstep(self._run, directory, stop, progress)
+
+    @property
+    def diverged(self) -> str:
+        """How the run has diverged; empty if it has not."""
+        return self._run.trainer.diverged
+
+    def close(self) -> None:
+        """Free the emulator and the locks."""
+        self._run.env.close()
+        self._lock.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def play_lockstep(
+    run: Lockstep, directory: RunDirectory, stop: Stop, progress: Callable[[str], None] = lambda line: None
+) -> Summary:
+    """Play until the run is over or stopped, and complete its files.
+
+    Raises:
+        RunError: there is no space for the closing epoch or the summary.
+    """
+    trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
+    while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
+        for effects in run.play():
+            directory.record(effects.episodes, effects.metrics)
+        if trainer.epoch_due() and not trainer.outcome():
+            trainer.epoch_begun()
+            try:
+                run.save(directory)
+            except RunError as error:
+                say(f"{error}; the run goes on without it")
+        if time.monotonic() >= due:
+            due = time.monotonic() + PROGRESS_EVERY
+            progress(_progress(run))
+    outcome = trainer.diverged or outcome
+    try:
+        if trainer.saveable():
+            run.save(directory)
+    except RunError as error:
+        outcome = f"failed: {error}"
+        raise
+    finally:
+        summary = summarise(trainer, outcome, time.monotonic(), run.step)
+        directory.conclude(summary, f"{summary.title}, lockstep")
+    return summary
+
+
+def _progress(run: Lockstep) -> str:
+    telemetry = run.trainer.telemetry
+    returns = f"return {telemetry.return_mean:.1f}" if telemetry.episodes else "no episode has ended yet"
+    warning = telemetry.warning(run.agent)
+    return f"step {run.step:,}/{run.config.total_steps:,}  {returns}" + (f"  [{warning}]" if warning else "")

@@ -1,0 +1,136 @@
+"""A run that has been saved: its files, and the policy of its newest checkpoint."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from common.envs.make import env_spec
+from common.errors import UsageError
+from common.networks.network import FlatNetwork, q_values
+from common.settings.config import RunConfig
+from common.settings.environment import EnvSettings
+from common.settings.tables import load_tables, resolve
+from common.types import EnvSpec
+from learner.qnetwork import make_network
+from learner.records.epochs import load_learner, newest_epoch
+
+CPU = torch.device("cpu")
+NetworkChoice = Literal["mean", 1, 2]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Both networks of an epoch.
+
+    epoch: its number, in updates. acting: 0 or 1, index of the network that acted and was trained last.
+    """
+
+    epoch: int
+    networks: tuple[FlatNetwork, FlatNetwork]
+    acting: int
+
+
+@dataclass(frozen=True)
+class SavedPolicy:
+    """A greedy policy: the mean of the Q-values of one or two networks, and the action at which it is largest.
+
+    env: settings of the environment that the networks were trained in. spec: what the networks need to know of it.
+    """
+
+    env: EnvSettings
+    spec: EnvSpec
+    networks: tuple[FlatNetwork, ...]
+
+    def __call__(self, obs: ArrayLike) -> Any:  # noqa: ANN401 (depends on the observation's shape)
+        """The best action, int, for one observation; int64 [batch] for a batch. Takes what `q_values` takes."""
+        best = self.q_values(obs).argmax(-1)
+        return int(best) if best.ndim == 0 else best
+
+    def q_values(self, obs: ArrayLike) -> NDArray[np.float32]:
+        """Q-values, float32 [actions], of one stacked observation, [*obs_shape]; [batch, actions] of a batch.
+
+        Raises:
+            UsageError: the observation has another shape than those of the environment.
+        """
+        given = np.asarray(obs, self.spec.frame_dtype)
+        batch = given if given.ndim > len(self.spec.obs_shape) else given[None]
+        if batch.shape[1:] != self.spec.obs_shape:
+            shape = "x".join(map(str, self.spec.obs_shape))
+            raise UsageError(f"observation of shape {given.shape}: {self.spec.env_id} has {shape}, or a batch of these")
+        values = np.mean([q_values(network, batch, self.spec) for network in self.networks], axis=0)
+        return values[0] if batch is not given else values
+
+
+class SavedRun:
+    """The files of one run; raises UsageError if the folder holds none."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not (path / "config.toml").is_file():
+            raise UsageError(f"{path}: holds no run")
+
+    def __repr__(self) -> str:
+        return f"<run {str(self.path)!r}: {self.config.env.id}, {self.config.method}, seed {self.config.seed}>"
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """The config of the run."""
+        return resolve(load_tables(None, self.path / "config.toml"))
+
+    @property
+    def episodes(self) -> pd.DataFrame:
+        """A row for each finished episode, with the columns of episodes.csv."""
+        return pd.read_csv(self.path / "episodes.csv")
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """A row for each line of metrics.jsonl."""
+        return pd.read_json(self.path / "metrics.jsonl", lines=True, convert_dates=False)
+
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """The contents of summary.json; None if the run has not ended."""
+        file = self.path / "summary.json"
+        summary: dict[str, Any] | None = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        return summary
+
+    def checkpoint(self) -> Checkpoint:
+        """The networks of the newest epoch; raises UsageError if there is none."""
+        epoch = newest_epoch(self.path)
+        if epoch is None:
+            raise UsageError(f"{self.path}: has no complete checkpoint")
+        state = load_learner(epoch)["agent"]
+        spec = env_spec(self.config.env)
+        first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
+        for network, flat in zip((first, second), state["networks"], strict=True):
+            network.load(flat)
+        return Checkpoint(int(epoch.name), (first, second), state["acting"])
+
+    def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
+        """The greedy policy of the newest epoch.
+
+        network: 1 or 2 plays by that network's Q-values, "mean" by the mean of both. The second network of a method
+        with one network is an older copy of the first, so "mean" is the first one there.
+
+        Raises:
+            UsageError: the run has no checkpoint, or there is no such network.
+        """
+        if network not in ("mean", 1, 2):
+            raise UsageError(f"network = {network!r}: allowed: 'mean', 1, 2")
+        first, second = self.checkpoint().networks
+        both = (first, second) if self.config.two_networks else (first,)
+        chosen = both if network == "mean" else ((first, second)[network - 1],)
+        return SavedPolicy(self.config.env, env_spec(self.config.env), chosen)
+
+    def q_values(self, obs: ArrayLike, network: NetworkChoice = "mean") -> NDArray[np.float32]:
+        """Q-values of `policy(network)`, float32 [actions] or [batch, actions]; for many calls, keep the policy."""
+        return self.policy(network).q_values(obs)

@@ -1,0 +1,232 @@
+"""The Python API: training in the background, saved runs and their policies, evaluation, sweeps, registered methods."""
+
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import coop
+from common.settings.methods import METHODS
+from learner.methods.rule import Rule
+
+SMALL = {"learning_starts": 50, "capacity": 200}
+
+
+def trained(path: Path, method: str = "coop", **settings: object) -> coop.TrainingRun:
+    return coop.train(method=method, total_steps=400, run_dir=path, replay=SMALL, **settings)
+
+
+def test_a_run_in_the_background_gives_its_rows_and_its_summary(tmp_path: Path) -> None:
+    signals = threading.active_count()
+    run = trained(tmp_path / "a", seed=3, learner={"swap_every": 20})
+    assert run.directory == tmp_path / "a"
+    assert (run.config.seed, run.config.replay.capacity, run.config.learner.swap_every) == (3, 200, 20)
+    rows = list(run.metrics())
+    assert not run.running
+    assert [row["update"] for row in rows] == sorted({row["update"] for row in rows})
+    assert rows[-1]["update"] >= 200
+    assert run.summary == run.wait()
+    assert run.summary is not None
+    assert (run.summary["env_steps"], run.summary["exit"]) == (400, "complete")
+    assert list(run.metrics()) == rows
+    assert threading.active_count() == signals
+
+
+def test_training_equals_the_command_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained(tmp_path / "a", seed=1).wait()
+    flags = ["--preset=cartpole", "--method=coop", "--seed=1", "--total-steps=400", "--replay.capacity=200"]
+    from experiments import lockstep_cli
+
+    monkeypatch.setattr("sys.argv", ["coop-lockstep", *flags, "--replay.learning-starts=50", f"--run-dir={tmp_path}/b"])
+    lockstep_cli.main()
+    for name in ("config.toml", "episodes.csv"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_a_stopped_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    run = coop.train(method="dqn", total_steps=20_000, run_dir=tmp_path, replay=SMALL)
+    next(run.metrics())
+    summary = run.stop()
+    assert summary is not None
+    assert summary["exit"] == "stopped"
+    steps = summary["env_steps"]
+    assert 0 < steps < 20_000
+    with pytest.raises(coop.UsageError, match="holds a run already"):
+        coop.train(method="dqn", total_steps=20_000, run_dir=tmp_path)
+    again = coop.train(run_dir=tmp_path, resume=True)
+    assert again.config == run.config
+    summary = again.stop()
+    assert summary is not None
+    assert summary["env_steps"] >= steps
+
+
+def test_bad_settings_are_refused_before_anything_starts(tmp_path: Path) -> None:
+    for settings, text in (
+        ({"replay": {"size": 5}}, "replay.size = 5: no such field"),
+        ({"replay": 5}, "replay = 5: must be a table"),
+        ({"sede": 5}, "sede = 5: no such field"),
+        ({"preset": "x"}, "--preset x: unknown"),
+        ({"method": "dqqn"}, "perhaps dqn"),
+        ({"actors": 2}, "in distributed runs only"),
+        ({"actors": 0, "distributed": True}, "at least 1"),
+        ({"env": {"id": "Nowhere-v0"}}, "Nowhere-v0"),
+    ):
+        with pytest.raises(coop.UsageError, match=text):
+            coop.train(run_dir=tmp_path / "a", **settings)  # type: ignore[arg-type]
+    assert not (tmp_path / "a").exists()
+    with pytest.warns(UserWarning, match="edl.rate has no effect: dqn"):
+        coop.train(method="dqn", total_steps=40, run_dir=tmp_path / "b", edl={"rate": 0.5}).wait()
+
+
+def test_a_run_that_diverges_says_so_at_its_end(tmp_path: Path) -> None:
+    run = trained(tmp_path, learner={"learning_rate": 1e30})
+    with pytest.raises(coop.RunError, match="diverged: "):
+        list(run.metrics())
+    assert run.summary is not None
+    assert run.summary["exit"].startswith("diverged")
+
+
+def test_a_distributed_run(tmp_path: Path) -> None:
+    run = trained(tmp_path / "a", distributed=True, actors=2)
+    rows = list(run.metrics())
+    assert rows
+    assert run.summary is not None
+    assert (run.summary["exit"], run.summary["transitions_lost"]) == ("complete", 0)
+    assert sorted(path.name for path in (tmp_path / "a" / "logs").glob("actor-*")) == ["actor-1.log", "actor-2.log"]
+
+
+def test_a_distributed_run_that_can_t_start_says_why(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "logs").write_text("in the way")
+    with pytest.raises(coop.RunError, match="File exists"):
+        trained(tmp_path / "a", distributed=True)
+    run = trained(tmp_path / "b", distributed=True, network={"hidden": [10**7, 10**7]})
+    with pytest.raises(coop.RunError, match=r"coop-local ended .exit status 2.: .*network.hidden"):
+        run.wait()
+
+
+def test_a_saved_run_and_its_policies(tmp_path: Path) -> None:
+    trained(tmp_path).wait()
+    saved = coop.load(tmp_path)
+    assert saved.config.method == "coop"
+    assert saved.episodes["length"].sum() <= 400
+    assert saved.episodes["env_step"].is_monotonic_increasing
+    assert saved.metrics["update"].tolist() == [row["update"] for row in saved.metrics.to_dict("records")]
+    obs = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
+    one, two, mean = (saved.policy(network).q_values(obs) for network in (1, 2, "mean"))  # type: ignore[arg-type]
+    assert one.shape == two.shape == (5, 2)
+    assert np.abs(one - two).max() > 1e-3
+    np.testing.assert_allclose(mean, (one + two) / 2, rtol=1e-6)
+    np.testing.assert_array_equal(saved.q_values(obs[0], 2), saved.policy(2).q_values(obs[0]))
+    policy = saved.policy()
+    np.testing.assert_array_equal(policy(obs), mean.argmax(1))
+    assert policy(obs[2].tolist()) == mean[2].argmax()
+    assert isinstance(policy(obs[2]), int)
+    for wrong in (obs[:, :3], obs[0, :3], obs[None]):
+        with pytest.raises(coop.UsageError, match="CartPole-v0 has 4"):
+            policy(wrong)
+    with pytest.raises(coop.UsageError, match="allowed: 'mean', 1, 2"):
+        saved.policy(3)  # type: ignore[arg-type]
+
+
+def test_the_mean_of_one_network_is_that_network(tmp_path: Path) -> None:
+    trained(tmp_path, "dqn", learner={"target_update_every": 1000}).wait()
+    saved, obs = coop.load(tmp_path), np.ones(4, np.float32)
+    assert saved.q_values(obs).tolist() == saved.q_values(obs, 1).tolist() != saved.q_values(obs, 2).tolist()
+
+
+def test_folders_without_a_run_or_a_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(coop.UsageError, match="holds no run"):
+        coop.load(tmp_path)
+    run = trained(tmp_path / "a")
+    run.wait()
+    for path in (tmp_path / "a" / "checkpoints").glob("*/DONE"):
+        path.unlink()
+    with pytest.raises(coop.UsageError, match="no complete checkpoint"):
+        coop.load(tmp_path / "a").policy()
+
+
+def test_evaluation_in_the_policy_s_own_environment_and_in_others(tmp_path: Path) -> None:
+    trained(tmp_path, env={"max_episode_steps": 7}).wait()
+    policy = coop.load(tmp_path).policy()
+    assert coop.evaluate(policy, 5).returns == [7.0] * 5
+    assert max(coop.evaluate(policy, 5, env={"max_episode_steps": 6}).returns) == 6.0
+    left = coop.evaluate(lambda obs: 0, 20, env="CartPole-v0", seed=1)
+    assert 8 <= min(left.returns) <= left.mean <= max(left.returns) <= 11
+    assert left == coop.evaluate(lambda obs: [0], 20, env="CartPole-v0", seed=1)
+    assert left.sd == pytest.approx(np.std(left.returns))
+    with pytest.raises(coop.UsageError, match="env: "):
+        coop.evaluate(lambda obs: 0, 20)
+    with pytest.raises(coop.UsageError, match="episodes = 0"):
+        coop.evaluate(policy, 0)
+
+
+def test_a_sweep(tmp_path: Path) -> None:
+    grid = {
+        "methods": ["dqn", "coop"],
+        "fixed": {"total_steps": 200, "replay": {"learning_starts": 50}},
+        "vary": {"replay": {"capacity": [60, 100]}},
+    }
+    done = coop.sweep(grid, tmp_path, jobs=2)
+    assert done.failed == {}
+    assert sorted(done.runs["replay.capacity"]) == [60, 60, 100, 100]
+    assert set(done.runs["method"]) == {"dqn", "coop"}
+    assert set(done.runs["exit"]) == {"complete"}
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("summary.json")}
+    assert len(before) == 4
+    assert coop.sweep(grid, tmp_path).runs.equals(done.runs)
+    assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("summary.json")}
+    with pytest.raises(coop.UsageError, match="give another --dir"):
+        coop.sweep({**grid, "fixed": {"total_steps": 300}}, tmp_path)
+    with pytest.raises(coop.UsageError, match="jobs = 0"):
+        coop.sweep(grid, tmp_path, jobs=0)
+
+
+class Pessimist(Rule):
+    """Targets bootstrap from the worst action."""
+
+    def bootstrap(self, next_values, preferred):  # type: ignore[no-untyped-def]
+        return next_values.min(1)
+
+
+def test_a_registered_method_trains(tmp_path: Path) -> None:
+    coop.register_method(replace(METHODS.get("dqn"), name="pessimist", rule=Pessimist, colour=None))
+    with pytest.raises(coop.UsageError, match="there is one of that name already"):
+        coop.register_method(METHODS.get("dqn"))
+    run = trained(tmp_path, "pessimist", learner={"target_update_every": 10})
+    run.wait()
+    plain = trained(tmp_path / "b", "dqn", learner={"target_update_every": 10})
+    plain.wait()
+    values = [coop.load(path).metrics["q_abs_mean"].iloc[-1] for path in (tmp_path, tmp_path / "b")]
+    assert values[0] < values[1]
+
+
+@pytest.mark.parametrize("distributed", [False, True])
+def test_a_script_from_standard_input_waits_for_its_run(distributed: bool, tmp_path: Path) -> None:
+    script = (
+        f"import coop\ncoop.train(total_steps=300, run_dir={str(tmp_path / 'a')!r}, distributed={distributed})\n"
+        "print('at once')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-"], input=script, capture_output=True, text=True, timeout=100, check=True, cwd=tmp_path
+    )
+    assert (done.stdout, done.stderr) == ("at once\n", "")
+    summary = coop.load(tmp_path / "a").summary
+    assert summary is not None
+    assert summary["exit"] == "complete"
+
+
+def test_a_script_that_fails_stops_its_run(tmp_path: Path) -> None:
+    script = f"import coop\nrun = coop.train(run_dir={str(tmp_path / 'a')!r})\nnext(run.metrics())\n1 / 0\n"
+    done = subprocess.run(
+        [sys.executable, "-"], input=script, capture_output=True, text=True, timeout=100, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith("ZeroDivisionError: division by zero\n")
+    summary = coop.load(tmp_path / "a").summary
+    assert summary is not None
+    assert summary["exit"] == "stopped"
