@@ -66,8 +66,9 @@ class SavedPolicy:
         if batch.shape[1:] != self.spec.obs_shape:
             shape = "x".join(map(str, self.spec.obs_shape))
             raise UsageError(f"observation of shape {given.shape}: {self.spec.env_id} has {shape}, or a batch of these")
-        values = np.mean([q_values(network, batch, self.spec) for network in self.networks], axis=0)
-        return values[0] if batch is not given else values
+        each = [q_values(network, batch, self.spec) for network in self.networks]
+        values: NDArray[np.float32] = np.mean(each, axis=0)
+        return values if batch is given else values[0]
 
 
 class SavedRun:

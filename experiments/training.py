@@ -6,14 +6,13 @@ import atexit
 import json
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from common.errors import CoopError, RunError, UsageError
+from common.errors import RunError, UsageError
 from common.process.lifecycle import Stop
 from common.process.processes import ChildProcess, command
 from common.settings.config import RunConfig, check_distributed

@@ -11,6 +11,8 @@ import pytest
 
 import coop
 from common.settings.methods import METHODS
+from experiments import lockstep_cli
+from learner.losses import Values
 from learner.methods.rule import Rule
 
 SMALL = {"learning_starts": 50, "capacity": 200}
@@ -39,8 +41,6 @@ def test_a_run_in_the_background_gives_its_rows_and_its_summary(tmp_path: Path) 
 def test_training_equals_the_command_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained(tmp_path / "a", seed=1).wait()
     flags = ["--preset=cartpole", "--method=coop", "--seed=1", "--total-steps=400", "--replay.capacity=200"]
-    from experiments import lockstep_cli
-
     monkeypatch.setattr("sys.argv", ["coop-lockstep", *flags, "--replay.learning-starts=50", f"--run-dir={tmp_path}/b"])
     lockstep_cli.main()
     for name in ("config.toml", "episodes.csv"):
@@ -189,8 +189,9 @@ def test_a_sweep(tmp_path: Path) -> None:
 class Pessimist(Rule):
     """Targets bootstrap from the worst action."""
 
-    def bootstrap(self, next_values, preferred):  # type: ignore[no-untyped-def]
-        return next_values.min(1)
+    def bootstrap(self, next_values: Values, preferred: Values) -> Values:
+        worst: Values = next_values.min(1)
+        return worst
 
 
 def test_a_registered_method_trains(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ def run_page(page: str, folder: Path) -> int:
         if file := re.match(r"# (\w+\.py)\n", text):
             (folder / file[1]).write_text(text, encoding="utf-8")
         elif kind == "python":
-            exec(compile(text, page, "exec"), shared)  # noqa: S102
+            exec(compile(text, page, "exec"), shared)
         else:
             for line in text.replace("\\\n", "").splitlines():
                 name, *flags = shlex.split(line)
