@@ -25,7 +25,7 @@ from common.settings.config import RunConfig
 from common.settings.tables import validated
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
-from learner.edl.arrays import Array, convert_like
+from learner.edl.arrays import AnyArray, convert_like
 from learner.edl.feedback import FeedbackRule
 from learner.edl.passes import Tape
 
@@ -75,7 +75,7 @@ def settings(kind: str, method: str, double: bool) -> RunConfig:
 class SvdRule(FeedbackRule):
     """The weight-gradient feedback by an SVD of each weight gradient."""
 
-    def backward(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
+    def backward(self, tape: Tape, error: AnyArray, s: float, out: Mapping[str, AnyArray]) -> None:
         """See `FeedbackRule`."""
         super().backward(tape, error, 0.0, out)
         for gradient in out.values():

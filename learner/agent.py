@@ -30,7 +30,7 @@ from common.settings import schedules
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS
 from common.types import Array, Batch, EnvSpec
-from learner.edl.arrays import Array as Inputs
+from learner.edl.arrays import AnyArray
 from learner.losses import LOSSES, Values, output_error, td_errors
 from learner.methods.rule import Rule
 from learner.optimizers import make_optimizer
@@ -95,7 +95,7 @@ class Agent:
             first, *_ = [self._step(online, target, batch, inputs, s) for _ in range(self.rule.passes)]
         return Update(first, s, swapped=self._count())
 
-    def _step(self, online: QNetwork, target: QNetwork, batch: Batch, inputs: Inputs, s: float) -> Values:
+    def _step(self, online: QNetwork, target: QNetwork, batch: Batch, inputs: AnyArray, s: float) -> Values:
         """Make one step of the optimizer; returns the TD errors before it, float32 [batch]."""
         settings, size = self.config.learner, len(batch)
         # With `double` the acting network chooses the next actions, so one pass covers obs and next_obs.

@@ -14,7 +14,7 @@ from common.errors import UsageError
 from common.networks.network import FlatNetwork, build_network, preprocess, sample_inputs
 from common.settings.config import RunConfig
 from common.types import Batch, EnvSpec
-from learner.edl.arrays import Array, assign, convert_like
+from learner.edl.arrays import AnyArray, assign, convert_like
 from learner.edl.feedback import FeedbackRule
 from learner.edl.graph import Graph
 from learner.edl.passes import Tape, UnsupportedLayerError
@@ -66,9 +66,11 @@ class QNetwork:
         self._forward = ready(self._source.chain.forward)
         self._values = ready(self._target.values)
         self._backward = ready(rule.backward)
+        self.theta: Any
+        self.gradient: Any
         self.theta, self.gradient = self._trained.theta, self._trained.gradient
 
-    def inputs(self, batch: Batch, spec: EnvSpec) -> Array:
+    def inputs(self, batch: Batch, spec: EnvSpec) -> AnyArray:
         """The input of both networks for a batch: [2 batch, *input], obs first, then next_obs."""
         index = np.concatenate((batch.obs_index, batch.next_index)).reshape(-1)
         if self._trained.in_numpy:
@@ -78,27 +80,27 @@ class QNetwork:
         frames, places = torch.tensor(batch.frames, device=device), torch.tensor(index, device=device)
         return preprocess(frames.index_select(0, places).view(-1, *spec.obs_shape), spec)
 
-    def forward(self, inputs: Array) -> Tape:
+    def forward(self, inputs: AnyArray) -> Tape[Any]:
         """Run a forward pass and record its activations for `backward`."""
         return self._forward(self._source.cast(inputs))
 
-    def values(self, inputs: Array) -> NDArray[np.float32]:
+    def values(self, inputs: AnyArray) -> NDArray[np.float32]:
         """Q-values for the targets, float32 [batch, actions] on the CPU."""
         return on_host(self._values(self._target.cast(inputs)))
 
-    def backward(self, tape: Tape, output_error: NDArray[np.float32], s: float) -> None:
+    def backward(self, tape: Tape[Any], output_error: NDArray[np.float32], s: float) -> None:
         """Compute `gradient` from an output error, float32 [batch, actions], through the method's feedback."""
         self._backward(tape, self._source.cast(output_error), s, self._source.gradients)
         if self._source is not self._trained:
             assign(self.gradient, self._source.gradient)
 
-    def add_gradient(self, tape: Tape, output_error: NDArray[np.float32]) -> None:
+    def add_gradient(self, tape: Tape[Any], output_error: NDArray[np.float32]) -> None:
         """Add the gradient of another cost to `gradient`; s is 0 in it. Arguments as `backward`'s."""
         before = self.gradient * 1  # a copy, in either library
         self.backward(tape, output_error, 0.0)
         self.gradient += before
 
-    def decay(self, rates: Array) -> None:
+    def decay(self, rates: AnyArray) -> None:
         """Add rates * theta, rates float32 [P], to the gradient."""
         self.gradient += convert_like(rates, self.theta) * self.theta
 
@@ -145,7 +147,7 @@ def make_q_network(
     return QNetwork(make_network(config, spec, number, device), half, config, spec, rng)
 
 
-def on_host(values: Array) -> NDArray[np.float32]:
+def on_host(values: AnyArray) -> NDArray[np.float32]:
     """Convert values of either library to a float32 numpy array."""
     return values.float().cpu().numpy() if isinstance(values, Tensor) else values
 

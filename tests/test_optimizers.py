@@ -9,7 +9,7 @@ import torch
 import torch._dynamo  # which PyTorch's optimizers load at their first step
 
 from common.settings.config import LearnerSettings, OptimizerName
-from learner.edl.arrays import Array
+from learner.edl.arrays import AnyArray
 from learner.optimizers import MnihRMSProp, make_optimizer
 
 SIZE = 50
@@ -17,7 +17,7 @@ OPTIMIZERS: list[OptimizerName] = ["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 LIBRARIES = pytest.mark.parametrize("library", ["torch", "numpy"])
 
 
-def arrays(library: str, theta: torch.Tensor) -> tuple[Array, Array]:
+def arrays(library: str, theta: torch.Tensor) -> tuple[AnyArray, AnyArray]:
     """Parameters theta and a gradient of 0, in memory of their own."""
     if library == "numpy":
         return theta.numpy().copy(), np.zeros(len(theta), np.float32)

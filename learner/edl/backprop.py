@@ -14,7 +14,7 @@ from learner.edl.passes import Passes, Tape, UnsupportedLayerError
 Parametrised = nn.Linear | nn.Conv2d
 
 
-class Chain(Passes):
+class Chain(Passes[Tensor]):
     """The steps of a network, checked once, and the products of backpropagation.
 
     names: prefix of the parameters' names of each step. parametrised: indices of the Linear and Conv2d steps.
@@ -41,7 +41,7 @@ class Chain(Passes):
         """The weight [actions, n] of the last step, None if that is not Linear."""
         return self._weights[-1] if isinstance(self._steps[-1], nn.Linear) else None
 
-    def forward(self, x: Tensor) -> Tape:
+    def forward(self, x: Tensor) -> Tape[Tensor]:
         """Run the network on x, float [batch, *input]."""
         inputs: list[Tensor] = []
         if x.dim() == 4:
@@ -52,7 +52,9 @@ class Chain(Passes):
                 x = function(x)
         return Tape(x, inputs)
 
-    def walk(self, tape: Tape, cotangent: Tensor, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Tensor]]:
+    def walk(
+        self, tape: Tape[Tensor], cotangent: Tensor, dtype: torch.dtype | None = None
+    ) -> Iterator[tuple[int, Tensor]]:
         """Propagate cotangents of the output to every pre-activation: (step, [b, k, *output of step]), last first.
 
         cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
@@ -79,7 +81,7 @@ class Chain(Passes):
             else:
                 rows = rows.view(*rows.shape[:2], *h.shape[1:])
 
-    def write(self, tape: Tape, index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
+    def write(self, tape: Tape[Tensor], index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
         """Write the gradients of step `index`'s parameters, given delta [batch, *output] at its pre-activation."""
         step, bias, name = self._steps[index], self._biases[index], self.names[index]
         h = tape.inputs[index]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from common.networks.convolution import product
-from learner.edl.arrays import Array
+from common.types import Array
 from learner.edl.dense import DenseChain
 from learner.edl.passes import Tape
 
@@ -19,7 +19,9 @@ class ConvolutionChain(DenseChain):
     The convolution comes first, so nothing is propagated through it. The tape holds `ConvolutionNetwork.activations`.
     """
 
-    def walk(self, tape: Tape, cotangent: Array, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Array]]:
+    def walk(
+        self, tape: Tape[Array], cotangent: Array, dtype: torch.dtype | None = None
+    ) -> Iterator[tuple[int, Array]]:
         """As `Chain.walk`: (layer, cotangents [b, k, n] of its pre-activation), last first; in the network's dtype."""
         rows = cotangent
         for index in reversed(self.parametrised):
@@ -36,7 +38,7 @@ class ConvolutionChain(DenseChain):
                 mask = np.ascontiguousarray(h > 0).astype(h.dtype)
                 rows = (np.multiply(rows, mask, out=rows) if b == len(mask) else rows * mask).swapaxes(0, 1)
 
-    def write(self, tape: Tape, index: int, delta: Array, out: Mapping[str, Array]) -> None:
+    def write(self, tape: Tape[Array], index: int, delta: Array, out: Mapping[str, Array]) -> None:
         """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its pre-activation."""
         weight, bias = (out[self.names[index] + kind] for kind in ("weight", "bias"))
         h = tape.inputs[index]

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from common.networks.dense import Dense
-from learner.edl.arrays import Array
+from common.types import Array
 from learner.edl.passes import Passes, Tape
 
 
-class DenseChain(Passes):
+class DenseChain(Passes[Array]):
     """The products of backpropagation, like `Chain`; a step is a Linear layer with its ReLU."""
 
     def __init__(self, network: Dense) -> None:
@@ -25,12 +25,14 @@ class DenseChain(Passes):
         """The weight [actions, n] of the last layer."""
         return self._network.weights[-1]
 
-    def forward(self, x: Array) -> Tape:
+    def forward(self, x: Array) -> Tape[Array]:
         """Run the network on x, <float>[batch, *input]."""
         *inputs, output = self._network.activations(x)
         return Tape(output, inputs)
 
-    def walk(self, tape: Tape, cotangent: Array, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Array]]:
+    def walk(
+        self, tape: Tape[Array], cotangent: Array, dtype: torch.dtype | None = None
+    ) -> Iterator[tuple[int, Array]]:
         """As `Chain.walk`: (layer, cotangents [b, k, n] of its pre-activation), last first; in the network's dtype."""
         rows = cotangent
         for index in reversed(self.parametrised):
@@ -44,7 +46,7 @@ class DenseChain(Passes):
                 else:
                     rows = rows * mask
 
-    def write(self, tape: Tape, index: int, delta: Array, out: Mapping[str, Array]) -> None:
+    def write(self, tape: Tape[Array], index: int, delta: Array, out: Mapping[str, Array]) -> None:
         """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its pre-activation."""
         np.dot(delta.T, tape.inputs[index], out=out[self.names[index] + "weight"])
         np.add.reduce(delta, 0, out=out[self.names[index] + "bias"])
@@ -52,9 +54,11 @@ class DenseChain(Passes):
     @staticmethod
     def gram(t: Array) -> Array:
         """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
-        return np.vecdot(t[:, :, None], t[:, None])
+        products: Array = np.vecdot(t[:, :, None], t[:, None])
+        return products
 
     @staticmethod
     def combine(weights: Array, t: Array) -> Array:
         """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""
-        return weights @ t[0] if len(t) < len(weights) else np.matmul(weights[:, None], t)[:, 0]
+        sums: Array = weights @ t[0] if len(t) < len(weights) else np.matmul(weights[:, None], t)[:, 0]
+        return sums

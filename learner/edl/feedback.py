@@ -20,13 +20,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Generic
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from common.process.memory import keep_freed_memory
-from learner.edl.arrays import Array, convert_like
+from learner.edl.arrays import ArrayT, convert_like
 from learner.edl.layers import make_passes
 from learner.edl.passes import Passes, Tape
 from learner.edl.polar import polar, polar_of_product
@@ -35,7 +36,7 @@ from learner.edl.transforms import Transforms
 FEEDBACKS = ("none", "transform", "weight-gradient", "random")
 
 
-class FeedbackRule:
+class FeedbackRule(Generic[ArrayT]):
     """The backward pass of one network under one feedback.
 
     chain: the passes of the network, in PyTorch or in numpy; all arrays are of the same library.
@@ -47,9 +48,11 @@ class FeedbackRule:
         network's. Only for plain stacks in PyTorch.
     """
 
+    chain: Passes[ArrayT]
+
     def __init__(
         self,
-        chain: Passes,
+        chain: Passes[ArrayT],
         feedback: str = "transform",
         seed: int = 0,
         polar_dtype: torch.dtype | None = None,
@@ -63,9 +66,9 @@ class FeedbackRule:
         self._seed = seed
         self._polar_dtype = polar_dtype
         self._rng = rng or np.random.default_rng(seed)
-        self._fixed: dict[int, Array] = {}
+        self._fixed: dict[int, ArrayT] = {}
 
-    def backward(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
+    def backward(self, tape: Tape[ArrayT], error: ArrayT, s: float, out: Mapping[str, ArrayT]) -> None:
         """Write one gradient per named parameter into `out`.
 
         tape: of the chain's forward pass. error: [batch, actions], the output error e, already divided by the batch
@@ -84,7 +87,7 @@ class FeedbackRule:
                     gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index], self._rng)
         self.chain.write_rest(tape, error, out)
 
-    def _transform(self, tape: Tape, error: Array, s: float, out: Mapping[str, Array]) -> None:
+    def _transform(self, tape: Tape[ArrayT], error: ArrayT, s: float, out: Mapping[str, ArrayT]) -> None:
         """Compute sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e and the gradients of every layer."""
         transforms = Transforms(self.chain, tape, self._polar_dtype)
         if self._polar_dtype is None:
@@ -95,7 +98,7 @@ class FeedbackRule:
             for index, delta in self.chain.walk(tape, error[:, None]):
                 self.chain.write(tape, index, delta[:, 0] + polar_parts[index], out)
 
-    def _aligned(self, tape: Tape, index: int, error: Array) -> Array:
+    def _aligned(self, tape: Tape[ArrayT], index: int, error: ArrayT) -> ArrayT:
         """B(i)^T e with the fixed B(i) of layer `index`; that of a last layer is the identity, like T(d)."""
         shape = tape.output_of(index).shape
         if index == self.chain.parametrised[-1] and math.prod(shape) == math.prod(error.shape):
@@ -106,10 +109,11 @@ class FeedbackRule:
             generator = torch.Generator().manual_seed(self._seed * 1000 + layer)
             draw = torch.randn(error.shape[1], size, generator=generator, dtype=torch.float64) / math.sqrt(size)
             self._fixed[index] = convert_like(draw, error)
-        return (error @ self._fixed[index]).reshape(shape)
+        delta: ArrayT = (error @ self._fixed[index]).reshape(shape)
+        return delta
 
 
-def _polar_of_gradient(gradient: Array, delta: Array, h: Array, rng: np.random.Generator) -> Array:
+def _polar_of_gradient(gradient: ArrayT, delta: ArrayT, h: ArrayT, rng: np.random.Generator) -> ArrayT:
     """U V^T of a weight gradient [m, ...]; for a Linear layer it is delta^T h, rank-deficient in a small batch."""
     matrix = torch.as_tensor(gradient).flatten(1)
     if h.ndim == 2 and len(delta) < min(matrix.shape):

@@ -53,7 +53,7 @@ def record(run: Callable[[Tensor], Tensor], layers: Sequence[Layer], x: Tensor) 
 
 
 @dataclass(slots=True)
-class GraphTape(Tape):
+class GraphTape(Tape[Tensor]):
     """A forward pass as autograd recorded it.
 
     root: the network's output, and outputs: that of each layer, all with their graph. x: the network's input.
@@ -73,7 +73,7 @@ class GraphTape(Tape):
         return self.outputs[index]
 
 
-class Graph(Passes):
+class Graph(Passes[Tensor]):
     """The passes of a module; its steps are layers that take feedback, all other parameters are the rest."""
 
     def __init__(self, module: nn.Module, layers: Sequence[Layer] = (), *, ends: bool = False) -> None:
@@ -102,7 +102,9 @@ class Graph(Passes):
             root.detach(), [step.input.detach() for step in steps], root, [step.output for step in steps], x, self
         )
 
-    def walk(self, tape: Tape, cotangent: Tensor, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Tensor]]:
+    def walk(
+        self, tape: Tape[Tensor], cotangent: Tensor, dtype: torch.dtype | None = None
+    ) -> Iterator[tuple[int, Tensor]]:
         """As `Passes.walk`, in the network's dtype, with outputs flattened: [b, k, n]."""
         tape = _recorded(tape)
         inner = self.parametrised
@@ -120,7 +122,7 @@ class Graph(Passes):
         for index, gradient in zip(reversed(inner), reversed(found), strict=True):
             yield index, gradient.movedim(0, 1).flatten(2)
 
-    def write(self, tape: Tape, index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
+    def write(self, tape: Tape[Tensor], index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
         """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its output."""
         layer, output, name = self._layers[index].module, tape.output_of(index), self.names[index]
         if isinstance(layer, nn.Linear):  # its products cost less than autograd's calls
@@ -134,7 +136,7 @@ class Graph(Passes):
         for part, gradient in zip(parameters, found, strict=True):
             out[name + part].copy_(gradient)
 
-    def write_rest(self, tape: Tape, error: Tensor, out: Mapping[str, Tensor]) -> None:
+    def write_rest(self, tape: Tape[Tensor], error: Tensor, out: Mapping[str, Tensor]) -> None:
         """Write the ordinary gradients of all parameters outside the layers, given error [batch, actions]."""
         if self._rest:
             found = _gradients(_recorded(tape).root, list(self._rest.values()), error)
@@ -149,7 +151,7 @@ class Graph(Passes):
     combine = staticmethod(Chain.combine)
 
 
-def _recorded(tape: Tape) -> GraphTape:
+def _recorded(tape: Tape[Tensor]) -> GraphTape:
     if not isinstance(tape, GraphTape):
         raise TypeError(f"a {type(tape).__name__} holds no graph")
     return tape

@@ -19,7 +19,7 @@ _TRIALS = 3
 _SAMPLES = 8  # of an example
 
 
-def make_passes(module: nn.Module, example: Tensor | None) -> Passes:
+def make_passes(module: nn.Module, example: Tensor | None) -> Passes[Tensor]:
     """The hand-written chain for a plain stack of Linear, Conv2d, ReLU and Flatten; autograd for any other module.
 
     example: float [batch, *input], on which the module is tried; None if it is trained by ordinary gradients only.

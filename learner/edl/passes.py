@@ -5,11 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Generic
 
 import torch
 
 from common.errors import UsageError
-from learner.edl.arrays import Array
+from learner.edl.arrays import ArrayT
 
 
 class UnsupportedLayerError(UsageError, ValueError):
@@ -17,20 +18,20 @@ class UnsupportedLayerError(UsageError, ValueError):
 
 
 @dataclass(slots=True)
-class Tape:
+class Tape(Generic[ArrayT]):
     """The activations of one forward pass, for the backward passes.
 
     output: [batch, actions]. inputs: the input of each step, [batch, *shape], images channels last.
     """
 
-    output: Array
-    inputs: list[Array]
+    output: ArrayT
+    inputs: list[ArrayT]
 
-    def head(self, batch: int) -> Tape:
+    def head(self, batch: int) -> Tape[ArrayT]:
         """The tape of the first `batch` samples."""
         return Tape(self.output[:batch], [x[:batch] for x in self.inputs])
 
-    def output_of(self, index: int) -> Array:
+    def output_of(self, index: int) -> ArrayT:
         """The output of step `index`: [batch, *shape]; if a ReLU follows, only its shape and sign are valid."""
         return self.inputs[index + 1] if index + 1 < len(self.inputs) else self.output
 
@@ -48,7 +49,7 @@ class Range:
     rank: int
 
 
-class Passes(ABC):
+class Passes(ABC, Generic[ArrayT]):
     """The forward and backward passes of one network, in arrays of one library; it consists of steps, in order.
 
     names: prefix of the parameters' names of each step. parametrised: indices of the steps that feedback trains.
@@ -59,15 +60,17 @@ class Passes(ABC):
 
     @property
     @abstractmethod
-    def output_weight(self) -> Array | None:
+    def output_weight(self) -> ArrayT | None:
         """The weight [actions, n] of a Linear layer whose output is the network's; None if there is none."""
 
     @abstractmethod
-    def forward(self, x: Array) -> Tape:
+    def forward(self, x: ArrayT) -> Tape[ArrayT]:
         """Run the network on x, <float>[batch, *input]."""
 
     @abstractmethod
-    def walk(self, tape: Tape, cotangent: Array, dtype: torch.dtype | None = None) -> Iterator[tuple[int, Array]]:
+    def walk(
+        self, tape: Tape[ArrayT], cotangent: ArrayT, dtype: torch.dtype | None = None
+    ) -> Iterator[tuple[int, ArrayT]]:
         """Propagate cotangents of the output to every pre-activation: (step, [b, k, *output of step]), last first.
 
         cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
@@ -75,10 +78,10 @@ class Passes(ABC):
         """
 
     @abstractmethod
-    def write(self, tape: Tape, index: int, delta: Array, out: Mapping[str, Array]) -> None:
+    def write(self, tape: Tape[ArrayT], index: int, delta: ArrayT, out: Mapping[str, ArrayT]) -> None:
         """Write the gradients of step `index`'s parameters, given delta [batch, *output] at its pre-activation."""
 
-    def write_rest(self, tape: Tape, error: Array, out: Mapping[str, Array]) -> None:  # noqa: B027
+    def write_rest(self, tape: Tape[ArrayT], error: ArrayT, out: Mapping[str, ArrayT]) -> None:
         """Write the ordinary gradients of the parameters outside the steps; a chain has none.
 
         error: [batch, actions], at the output.
@@ -90,10 +93,10 @@ class Passes(ABC):
 
     @staticmethod
     @abstractmethod
-    def gram(t: Array) -> Array:
+    def gram(t: ArrayT) -> ArrayT:
         """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
 
     @staticmethod
     @abstractmethod
-    def combine(weights: Array, t: Array) -> Array:
+    def combine(weights: ArrayT, t: ArrayT) -> ArrayT:
         """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import Array, convert_like, namespace, widened
+from learner.edl.arrays import ArrayT, convert_like, namespace, widened
 
 _SMALL = 8  # the shorter side up to which an SVD is faster than the algebra with a Gram matrix
 
@@ -29,7 +29,7 @@ class _Limits:
 _LIMITS = {4: _Limits(1e-31, 3e2, 1e-11), 8: _Limits(1e-292, 1e6, 1e-9)}  # by bytes per number
 
 
-def whitened(gram: Array, e: Array) -> tuple[Array, Array | None]:
+def whitened(gram: ArrayT, e: ArrayT) -> tuple[ArrayT, ArrayT | None]:
     """G^(-1/2) e [..., m], and a mask bool [...] of inaccurate results, which are set to 0 (None if there are none).
 
     gram: float32 or float64 [..., m, m], Gram matrices of matrices in that dtype. e: [..., m], broadcast. For m > 2
@@ -49,7 +49,7 @@ def whitened(gram: Array, e: Array) -> tuple[Array, Array | None]:
     return white, doubtful
 
 
-def _whitened_pairs(g: Array, e: Array, limits: _Limits) -> tuple[Array, Array | None]:
+def _whitened_pairs(g: ArrayT, e: ArrayT, limits: _Limits) -> tuple[ArrayT, ArrayT | None]:
     """The closed form for 2 x 2: G^(-1/2) = ((t + d) I - G) / (d sqrt(t + 2 d)) with d^2 = det G and t = tr G.
 
     Computed in g's own dtype: rounding affects the determinant no more than the limit on inflation allows.
@@ -63,14 +63,14 @@ def _whitened_pairs(g: Array, e: Array, limits: _Limits) -> tuple[Array, Array |
     doubtful = None if float(margin.min()) > 0 else ~(margin > 0)
     d = determinant**0.5
     scale = d * (trace + 2 * d) ** 0.5
-    top = ((b + d) * first - c * second) / scale
+    top: ArrayT = ((b + d) * first - c * second) / scale
     white = namespace(g).empty((*top.shape, 2), dtype=top.dtype, device=top.device)
     white[..., 0] = top
     white[..., 1] = ((a + d) * second - c * first) / scale
     return white, doubtful
 
 
-def _whitened_by_eigh(g: Array, e: Array, limits: _Limits) -> tuple[Array, Array | None]:
+def _whitened_by_eigh(g: ArrayT, e: ArrayT, limits: _Limits) -> tuple[ArrayT, ArrayT | None]:
     xp = namespace(g)
     diagonal = xp.einsum("...ii->...i", g)
     safe = xp.isfinite(g).all((-2, -1)) & (xp.amin(diagonal, -1) > limits.square)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from common.networks.convolution import ConvolutionNetwork
 from common.networks.network import FlatNetwork
-from learner.edl.arrays import Array, convert_like
+from learner.edl.arrays import AnyArray, convert_like
 from learner.edl.convolution import ConvolutionChain
 from learner.edl.dense import DenseChain
 from learner.edl.layers import make_passes
@@ -20,20 +23,24 @@ class Trainable:
     theta, gradient: <float>[P], in the order of the network's layout, for the optimizer; of numpy for small networks.
     gradients: name -> view of `gradient` in the shape of the parameter, of the library of the passes.
     chain: the network's forward and backward passes. values: its forward pass alone.
+
+    Its users do not know the library, so the type checker does not see it here; inside the passes it does.
     """
+
+    chain: Passes[Any]
+    values: Callable[[Any], Any]
+    theta: Any
+    gradient: Any
 
     def __init__(self, network: FlatNetwork, in_numpy: bool, example: Tensor | None) -> None:
         """in_numpy: use numpy if the network has a form in numpy. example: see `make_passes`, which may raise."""
         form = network.in_numpy if in_numpy else None
         self.in_numpy = form is not None
         self.values = form or network
-        theta: Array = network.flat
-        gradient: Array = torch.zeros_like(theta)
-        arrays = (theta, gradient) if form is None else (theta.numpy(), gradient.numpy())
-        self._like, in_passes = arrays
+        theta, gradient = network.flat, torch.zeros_like(network.flat)
+        arrays: tuple[Any, Any] = (theta, gradient) if form is None else (theta.numpy(), gradient.numpy())
+        self._like, in_passes = self.theta, self.gradient = arrays
         self.gradients = network.views(in_passes)
-        self.theta, self.gradient = arrays
-        self.chain: Passes
         match form:
             case None:
                 self.chain = make_passes(network.module, example)
@@ -44,6 +51,6 @@ class Trainable:
             case _:
                 self.chain = DenseChain(form)
 
-    def cast(self, array: Array) -> Array:
+    def cast(self, array: AnyArray) -> Any:  # noqa: ANN401
         """Convert an array of either library for this network's passes."""
         return convert_like(array, self._like)

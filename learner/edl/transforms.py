@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Generic
 
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import Array, convert_like, namespace, widened
+from learner.edl.arrays import ArrayT, Namespace, convert_like, in_dtype, namespace, widened
 from learner.edl.passes import Passes, Range, Tape
 from learner.edl.polar import polar_by_svd, whitened
 
 _SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
 
 
-class Transforms:
+class Transforms(Generic[ArrayT]):
     """T(i) = d y / d a(i) of every layer with parameters, for each sample of a batch.
 
     All A cotangents of a sample pass through the network as one batch. They start from the rows of an orthogonal matrix
@@ -25,23 +26,28 @@ class Transforms:
     The polar factor of a T that lacks rank by construction (see `Range`) is the thin one, which stays in T's range.
     """
 
-    def __init__(self, chain: Passes, tape: Tape, dtype: torch.dtype | None = None) -> None:
+    _chain: Passes[ArrayT]
+    _basis: ArrayT
+    _batch: int
+    _actions: int
+    _ts: list[ArrayT]
+
+    def __init__(self, chain: Passes[ArrayT], tape: Tape[ArrayT], dtype: torch.dtype | None = None) -> None:
         """dtype: of the computation of T(i), the network's if None; the algebra on them uses at least float32."""
         self._chain = chain
         self._batch, self._actions = tape.output.shape
         self._basis = _basis(chain.output_weight, tape.output)
-        start = self._basis[None] if dtype is None else self._basis[None].to(dtype)
-        walk = chain.walk(tape, start, dtype)
+        walk = chain.walk(tape, in_dtype(self._basis[None], dtype), dtype)
         self._linear_end = next(walk)[0] if chain.output_weight is not None else None
         # The layers held, last first: step, shape of its output, and T as [batch or 1, A, n].
         self._layers: list[tuple[int, tuple[int, ...]]] = []
-        self._ts: list[Array] = []
+        self._ts = []
         for index, t in walk:
             self._layers.append((index, t.shape[2:]))
-            self._ts.append(_flat(t) if dtype is None else _flat(t).to(tape.output.dtype))
+            self._ts.append(_flat(t) if dtype is None else convert_like(_flat(t), tape.output))
         self._ranges = [chain.range_of(index) for index, _ in self._layers]
 
-    def apply_feedback(self, error: Array, s: float, polar_only: bool = False) -> Iterator[tuple[int, Array]]:
+    def apply_feedback(self, error: ArrayT, s: float, polar_only: bool = False) -> Iterator[tuple[int, ArrayT]]:
         """Yield (step, B(i)^T e) for each layer, last first: error [batch, A] -> [batch, *shape].
 
         polar_only: compute s (U V^T)^T e instead of (T(i) + s U V^T)^T e.
@@ -60,7 +66,7 @@ class Transforms:
                 sigma[where] += s * (e[where][:, None] @ self._by_svd(i, where))[:, 0]
             yield index, _shaped(sigma, shape)
 
-    def matrices(self, s: float) -> list[tuple[int, Array]]:
+    def matrices(self, s: float) -> list[tuple[int, ArrayT]]:
         """(step, B(i) = T(i) + s U V^T), last first: [batch, A, n_i], images with channels first."""
         found = []
         units = convert_like(torch.eye(self._actions), self._basis)
@@ -79,32 +85,36 @@ class Transforms:
             found.append((index, _shaped(b.reshape(-1, b.shape[-1]), shape).reshape(b.shape)))
         return found
 
-    def _grams(self) -> Array:
+    def _grams(self) -> ArrayT:
         """G(i) = T(i) T(i)^T of every layer held: [layers, batch, A, A]."""
-        xp, shape = namespace(self._basis), (self._batch, self._actions, self._actions)
+        xp: Namespace[ArrayT] = namespace(self._basis)
+        shape = (self._batch, self._actions, self._actions)
         grams = [self._gram(t, reach) for t, reach in zip(self._ts, self._ranges, strict=True)]
         whole = [gram if len(gram) == self._batch else xp.broadcast_to(gram, shape) for gram in grams]
         return xp.concatenate(whole).reshape(-1, *shape)
 
-    def _gram(self, t: Array, reach: Range | None) -> Array:
-        gram = self._chain.gram(t)
+    def _gram(self, t: ArrayT, reach: Range | None) -> ArrayT:
+        gram: ArrayT = self._chain.gram(t)
         if reach is None:
             return gram
         # The root of a sum of two matrices on orthogonal subspaces acts on T like that of G alone.
-        size = gram.diagonal(dim1=1, dim2=2).mean(1)
-        return gram + size[:, None, None] * (self._basis @ reach.outside @ self._basis.mT)
+        size = namespace(gram).einsum("...ii->...i", gram).mean(1)
+        whole: ArrayT = gram + size[:, None, None] * (self._basis @ convert_like(reach.outside, t) @ self._basis.mT)
+        return whole
 
-    def _by_svd(self, i: int, where: Array) -> Array:
+    def _by_svd(self, i: int, where: ArrayT) -> ArrayT:
         """Polar factors of those samples of the i-th T [batch or 1, A, n] for which `where` is true: [k, A, n]."""
-        t, reach = self._ts[i], self._ranges[i]
+        t: ArrayT = self._ts[i]
+        reach = self._ranges[i]
         chosen = namespace(t).broadcast_to(t, (self._batch, *t.shape[1:]))[where]
         if reach is None:
             return convert_like(polar_by_svd(torch.as_tensor(chosen)), t)
-        basis = self._basis @ reach.basis
-        return basis @ polar_by_svd(basis.mT @ chosen, reach.rank)
+        basis = self._basis @ convert_like(reach.basis, t)
+        factor: ArrayT = basis @ convert_like(polar_by_svd(torch.as_tensor(basis.mT @ chosen), reach.rank), t)
+        return factor
 
 
-def _basis(output_weight: Array | None, output: Array) -> Array:
+def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
     """An orthogonal Q [A, A] that makes the rows of Q W nearly orthogonal, for the output weight W [A, n].
 
     Without W, the first row of Q takes the mean of the actions' values.
@@ -127,14 +137,14 @@ def _reflection(size: int) -> Tensor:
     return torch.eye(size, dtype=torch.float64) - 2 * torch.outer(normal, normal) / normal.dot(normal).clamp_min(1e-300)
 
 
-def _flat(t: Array) -> Array:
+def _flat(t: ArrayT) -> ArrayT:
     """View [b, A, channels, height, width], channels last in memory, as [b, A, n]."""
-    return t.permute(0, 1, 3, 4, 2).flatten(2) if t.ndim == 5 else t
+    return t.permute(0, 1, 3, 4, 2).flatten(2) if isinstance(t, Tensor) and t.ndim == 5 else t
 
 
-def _shaped(rows: Array, shape: tuple[int, ...]) -> Array:
+def _shaped(rows: ArrayT, shape: tuple[int, ...]) -> ArrayT:
     """Reverse `_flat`: [rows, n] to [rows, *shape]."""
-    if len(shape) == 1:
+    if len(shape) == 1 or not isinstance(rows, Tensor):
         return rows
     channels, height, width = shape
     return rows.view(-1, height, width, channels).permute(0, 3, 1, 2)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from common.settings.config import RunConfig
 from common.settings.medqn import MedqnSettings
-from learner.edl.arrays import Array, convert_like, namespace
+from learner.edl.arrays import AnyArray
 from learner.methods.rule import Rule
 from learner.qnetwork import QNetwork, on_host
 
@@ -37,7 +37,7 @@ class Consolidation(Rule):
         start, end = self.settings.lambda_start, self.settings.lambda_end
         return start + (end - start) * min(1.0, update / self.config.planned_updates)
 
-    def add_cost(self, online: QNetwork, target: QNetwork, inputs: Array, update: int) -> None:
+    def add_cost(self, online: QNetwork, target: QNetwork, inputs: AnyArray, update: int) -> None:
         """See `Rule`."""
         obs = inputs[: len(inputs) // 2]
         states = obs if self.settings.states == "real" else self._draw(inputs, len(obs))
@@ -45,13 +45,14 @@ class Consolidation(Rule):
         gap = on_host(tape.output) - target.values(states)
         online.add_gradient(tape, np.float32(2 * self.strength(update) / len(states)) * gap)
 
-    def _draw(self, inputs: Array, count: int) -> Array:
+    def _draw(self, inputs: AnyArray, count: int) -> Bounds:
         """Widen the bounds by inputs [n, *input], and draw `count` states between them."""
-        library = namespace(inputs)
-        low, high = on_host(library.amin(inputs, 0)), on_host(library.amax(inputs, 0))
+        seen = on_host(inputs)
+        low, high = seen.min(0), seen.max(0)
         self.low, self.high = (np.minimum(self.low, low), np.maximum(self.high, high)) if self.low.size else (low, high)
         share = self.rng.random((count, *self.low.shape), np.float32)
-        return convert_like(self.low + share * (self.high - self.low), inputs)
+        states: Bounds = self.low + share * (self.high - self.low)
+        return states
 
     def state(self) -> dict[str, Any]:
         """See `Rule`."""

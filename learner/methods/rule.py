@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from common.settings.config import RunConfig
-from learner.edl.arrays import Array
+from learner.edl.arrays import AnyArray
 from learner.losses import Values
 from learner.qnetwork import QNetwork
 
@@ -35,7 +35,7 @@ class Rule:
         best: Values = next_values[np.arange(len(next_values)), preferred.argmax(1)]
         return best
 
-    def add_cost(self, online: QNetwork, target: QNetwork, inputs: Array, update: int) -> None:
+    def add_cost(self, online: QNetwork, target: QNetwork, inputs: AnyArray, update: int) -> None:
         """Add the gradient of the extra cost to that of the TD errors (`QNetwork.add_gradient`).
 
         inputs: <float>[2 batch, *input], the networks' input for obs and then for next_obs. update: updates done.
