@@ -12,6 +12,11 @@ def actor() -> None:
     _begin("coop-actor", "actors.cli")
 
 
+def export() -> None:
+    """`coop-export`."""
+    _begin("coop-export", "experiments.export_cli")
+
+
 def learner() -> None:
     """`coop-learner`."""
     _begin("coop-learner", "learner.cli")

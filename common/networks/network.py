@@ -111,10 +111,15 @@ def preprocess(obs: ArrayT, spec: EnvSpec) -> ArrayT:
 
 def sample_inputs(spec: EnvSpec, count: int) -> Tensor:
     """Made-up inputs of a network, always the same: float32 [count, *input]."""
+    return preprocess(sample_observations(spec, count), spec)
+
+
+def sample_observations(spec: EnvSpec, count: int) -> Tensor:
+    """Made-up observations, always the same: <frame_dtype>[count, *obs_shape]."""
     rng, shape = np.random.default_rng(0), (count, *spec.obs_shape)
     top = {"uint8": 255, "bool": 1}.get(spec.frame_dtype)
     drawn: NDArray[Any] = rng.standard_normal(shape) if top is None else rng.integers(top + 1, size=shape)
-    return preprocess(torch.from_numpy(drawn.astype(spec.frame_dtype)), spec)
+    return torch.from_numpy(drawn.astype(spec.frame_dtype))
 
 
 def layer_functions(layers: Iterable[nn.Module]) -> list[Callable[[Tensor], Tensor]]:
