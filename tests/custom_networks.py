@@ -124,6 +124,23 @@ class Doubled(nn.Sequential):
         return 2 * super().forward(x)
 
 
+class Negative(nn.Linear):
+    """A layer of a subclass, with a forward of its own."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return -super().forward(x)
+
+
+def negative(spec: EnvSpec) -> nn.Module:
+    return Negative(4, spec.num_actions)
+
+
+def negatives(spec: EnvSpec) -> nn.Module:
+    return nn.Sequential(
+        Negative(4, 8), nn.ReLU(), nn.utils.parametrizations.weight_norm(nn.Linear(8, spec.num_actions))
+    )
+
+
 def doubled(spec: EnvSpec) -> nn.Module:
     return Doubled(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, spec.num_actions))
 

@@ -30,7 +30,9 @@ def _build(name: str, seed: int = 0) -> torch.nn.Module:
     return build_network(f"custom_networks:{name}", SPEC, (), seed)
 
 
-@pytest.mark.parametrize("name", ["duel", "residual", "recurrent", "lazy", "doubled", "repeated"])
+@pytest.mark.parametrize(
+    "name", ["duel", "residual", "recurrent", "lazy", "doubled", "repeated", "negative", "negatives"]
+)
 def test_a_network_of_ones_own_is_flat_and_acts(name: str) -> None:
     state = torch.get_rng_state()
     same, other = FlatNetwork(_build(name)), FlatNetwork(_build(name, 1))

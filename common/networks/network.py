@@ -132,12 +132,14 @@ def layer_functions(layers: Iterable[nn.Module]) -> list[Callable[[Tensor], Tens
     fresh = False
     for layer in layers:
         functions.append(_function(layer, fresh))
-        fresh = isinstance(layer, nn.Linear | nn.Conv2d)
+        fresh = type(layer) in {nn.Linear, nn.Conv2d}
     return functions
 
 
 def _function(layer: nn.Module, fresh: bool) -> Callable[[Tensor], Tensor]:
     match layer:
+        case nn.Module() if type(layer) not in {nn.Linear, nn.Conv2d, nn.ReLU}:
+            return layer  # a subclass may have a forward of its own
         case nn.Linear(weight=weight, bias=bias):
             return lambda x: F.linear(x, weight, bias)
         case nn.Conv2d(weight=weight, bias=bias) if layer.padding_mode == "zeros":
