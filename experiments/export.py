@@ -10,20 +10,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import torch
 from safetensors.numpy import save
 from torch import nn
 
 from common.envs.make import env_spec
 from common.errors import RunError, UsageError
-from common.networks.network import FlatNetwork
 from common.process.files import SyncedFile, sync_folder
 from common.settings.config import RunConfig
-from common.settings.tables import load_tables, resolve
 from common.types import EnvSpec
 from experiments.export_onnx import NotExportedError, onnx_model, preparation
-from learner.qnetwork import make_network
-from learner.records.epochs import load_learner, newest_epoch
+from experiments.saved import Checkpoint, SavedRun
 
 CARD = "card.json"
 # The arguments that make a layer again, besides its bias.
@@ -56,17 +52,17 @@ def export(run_dir: Path, out: Path) -> Exported:
         UsageError: the run has no checkpoint, or `out` is no folder, or has other files.
         RunError: `out` cannot be written; an earlier export stays as it was, or loses its card.
     """
-    checkpoint = _checkpoint(run_dir)
+    run = SavedRun(run_dir)
     _check_folder(out)
-    card = _card(checkpoint)
+    checkpoint, spec = run.checkpoint(), env_spec(run.config.env)
     contents, without_onnx = {}, ""
     for number, network in enumerate(checkpoint.networks, 1):
         contents[f"network-{number}.safetensors"] = save(network.views(network.snapshot()))
         try:
-            contents[f"network-{number}.onnx"] = onnx_model(network, checkpoint.spec)
+            contents[f"network-{number}.onnx"] = onnx_model(network, spec)
         except NotExportedError as error:
             without_onnx = str(error)
-    contents[CARD] = f"{json.dumps(card, indent=2)}\n".encode()
+    contents[CARD] = f"{json.dumps(_card(run.config, spec, checkpoint), indent=2)}\n".encode()
     try:
         _write(out, contents)
     except OSError as error:
@@ -74,42 +70,10 @@ def export(run_dir: Path, out: Path) -> Exported:
     return Exported(list(contents), checkpoint.epoch, checkpoint.acting + 1, without_onnx)
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """Temporary."""
-
-    config: RunConfig
-    spec: EnvSpec
-    networks: list[FlatNetwork]
-    acting: int
-    epoch: int
-    env_steps: int
-    returns: list[float]
-
-
-def _checkpoint(run_dir: Path) -> Checkpoint:
-    if not (run_dir / "config.toml").is_file():
-        raise UsageError(f"{run_dir}: holds no run")
-    config = resolve(load_tables(None, run_dir / "config.toml"))
-    epoch = newest_epoch(run_dir)
-    if epoch is None:
-        raise UsageError(f"{run_dir}: has no complete checkpoint")
-    state, spec = load_learner(epoch), env_spec(config.env)
-    networks = [make_network(config, spec, number, torch.device("cpu")) for number in (0, 1)]
-    for network, flat in zip(networks, state["agent"]["networks"], strict=True):
-        network.load(flat)
-    steps = state["drawn"]["inserted"] if "drawn" in state else state["step"]  # of version 0.1.0
-    return Checkpoint(
-        config, spec, networks, state["agent"]["acting"], int(epoch.name), steps, state["telemetry"]["returns"]
-    )
-
-
-def _card(checkpoint: Checkpoint) -> dict[str, Any]:
+def _card(config: RunConfig, spec: EnvSpec, checkpoint: Checkpoint) -> dict[str, Any]:
     """What a reader needs to use the networks and to make them again, with the names of a run's own files."""
-    config, spec = checkpoint.config, checkpoint.spec
-    environment = asdict(config.env)
+    environment, returns = asdict(config.env), checkpoint.returns
     pictures = {name: environment.pop(name) for name in ("stack", "resize", "grayscale")}
-    returns = checkpoint.returns
     return {
         "environment": environment,
         "preprocessing": pictures | preparation(spec),

@@ -45,7 +45,7 @@ class QValues(nn.Module):
 
 
 def onnx_model(network: FlatNetwork, spec: EnvSpec) -> bytes:
-    """The model, from "observations" to "q_values", for batches of any size.
+    """The model, from "obs" to "q_values", for batches of any size.
 
     Raises:
         NotExportedError: onnx is not installed, the network has layers that ONNX lacks, or the model computes other
@@ -64,18 +64,18 @@ def onnx_model(network: FlatNetwork, spec: EnvSpec) -> bytes:
             torch.onnx.export(
                 QValues(network.module, spec),
                 (observations[:2],),
-                file,
+                file,  # type: ignore[arg-type]  # what its annotation omits
                 dynamo=False,
                 training=torch.onnx.TrainingMode.PRESERVE,
-                input_names=["observations"],
+                input_names=["obs"],
                 output_names=["q_values"],
-                dynamic_axes={"observations": {0: "batch"}, "q_values": {0: "batch"}},
+                dynamic_axes={"obs": {0: "batch"}, "q_values": {0: "batch"}},
             )
-            found = ReferenceEvaluator(file.getvalue()).run(None, {"observations": observations.numpy()})[0]
+            outputs: Any = ReferenceEvaluator(file.getvalue()).run(None, {"obs": observations.numpy()})
     except Exception as error:  # layers of users may fail in any way
         raise NotExportedError(describe(error)) from error
     with torch.inference_mode():
         expected = network(preprocess(observations, spec)).numpy()
-    if not np.allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max(), equal_nan=True):
+    if not np.allclose(outputs[0], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max(), equal_nan=True):
         raise NotExportedError("its ONNX model gives other Q-values for other observations than those that were traced")
     return file.getvalue()

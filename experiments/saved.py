@@ -32,11 +32,14 @@ class Checkpoint:
     """Both networks of an epoch.
 
     epoch: its number, in updates. acting: 0 or 1, index of the network that acted and was trained last.
+    env_steps: how many the run had done. returns: of its last episodes, at most 100.
     """
 
     epoch: int
     networks: tuple[FlatNetwork, FlatNetwork]
     acting: int
+    env_steps: int
+    returns: list[float]
 
 
 @dataclass(frozen=True)
@@ -109,12 +112,15 @@ class SavedRun:
         epoch = newest_epoch(self.path)
         if epoch is None:
             raise UsageError(f"{self.path}: has no complete checkpoint")
-        state = load_learner(epoch)["agent"]
+        state = load_learner(epoch)
         spec = env_spec(self.config.env)
         first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
-        for network, flat in zip((first, second), state["networks"], strict=True):
+        for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
             network.load(flat)
-        return Checkpoint(int(epoch.name), (first, second), state["acting"])
+        steps = state["drawn"]["inserted"] if "drawn" in state else state["step"]  # the latter in version 0.1.0
+        return Checkpoint(
+            int(epoch.name), (first, second), state["agent"]["acting"], steps, state["telemetry"]["returns"]
+        )
 
     def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
         """The greedy policy of the newest epoch.
