@@ -11,6 +11,7 @@ import pytest
 from common.errors import UsageError
 from common.registry import Registry
 from common.settings.methods import METHODS, Method
+from experiments.report.plots import OTHERS, _colour
 
 MODULE = """
 from dataclasses import dataclass
@@ -132,6 +133,14 @@ def test_a_name_belongs_to_one(package: Path, monkeypatch: pytest.MonkeyPatch) -
 
 LOCKSTEP = "from deploy.commands import lockstep; lockstep()"
 OPTIONS = "from common.settings.options import RunOptions, parse_run; parse_run(RunOptions, 'coop-local', '')"
+
+
+def test_figures_have_the_methods_colours_and_other_ones_for_the_rest() -> None:
+    taken: list[str] = []
+    for label in ("s = 0.1", "medqn", "dqn", "no method"):
+        taken.append(_colour(label, taken))
+    assert taken == [OTHERS[0], METHODS.get("medqn").colour, METHODS.get("dqn").colour, OTHERS[1]]
+    assert len({METHODS.get(name).colour for name in METHODS.names()} | {*OTHERS}) == len(METHODS.names()) + len(OTHERS)
 
 
 def python(package: Path, code: str, *flags: str) -> subprocess.CompletedProcess[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import RunError, UsageError
-from common.settings.config import RunConfig
+from common.settings.config import RunConfig, value_of
 from common.settings.medqn import MedqnSettings
 from common.settings.options import RunOptions, parse_run
 from common.settings.resuming import check_resumed
@@ -152,6 +152,13 @@ def test_a_presets_table_of_one_method_overrides_its_own_settings() -> None:
     assert (config.own, config.seed) == (MedqnSettings("real", epochs=3), 7)
     again = resolve(to_tables(resolve(to_tables(resolve(tables, "dqn")), "coop")), "medqn")
     assert again == config
+
+
+def test_values_by_name_are_those_of_the_runs_method() -> None:
+    names = ["total_steps", "replay.capacity", "medqn.epochs", "learner.target_update_every"]
+    medqn, dqn = (resolve({"medqn": {"epochs": 2}}, method) for method in ("medqn", "dqn"))
+    assert [value_of(medqn, name) for name in names] == [50_000, 5000, 2, None]
+    assert [value_of(dqn, name) for name in names] == [50_000, 5000, None, None]
 
 
 def test_what_only_processes_have_means_nothing_in_lockstep(
