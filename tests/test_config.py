@@ -128,6 +128,10 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
         (["--preset", "cartpole", "--config", "x"], ["--preset", "--config"]),
         (["--seed"], ["--seed", "needs a value"]),
         (["--network.hidden", "3", "x"], ["--network.hidden", "x", "INT"]),
+        (
+            ["--replay.sampling", "prioritized", "--replay.no-replacement"],
+            ["replay.sampling = 'prioritized': allowed: 'uniform' with replay.replacement = False"],
+        ),
         (["--replay.eviction", "lru"], ["replay.eviction = 'lru': unknown", "reservoir"]),
         (["stray"], ["stray", "unknown"]),
         (["--total-steps", "300", "--replay.learning-starts", "300"], ["total_steps", "300", "at least 301"]),

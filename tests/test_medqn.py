@@ -92,6 +92,7 @@ def test_uniform_states_lie_between_the_bounds_of_all_that_was_seen() -> None:
     td = np.array([0, 0.75, 0, 0.25])  # TD errors: 1 - 1 and 0.5 - 0
     np.testing.assert_allclose(agent.networks[0].snapshot(), np.array([1, 0, 0, 0.5]) - 0.1 * (td + near), rtol=1e-5)
     agent.update(replace(batch, frames=np.array([[1], [2], [10], [0]], np.float32)))
+    agent.update(batch)
     assert isinstance(agent.rule, Consolidation)
     assert (agent.rule.low.tolist(), agent.rule.high.tolist()) == ([-1.0], [10.0])
 

@@ -148,6 +148,7 @@ def test_estimate_covers_a_full_table() -> None:
         ({"capacity": 0}, "capacity: 0"),
         ({"eviction": "lifo"}, "replay.eviction = 'lifo': unknown; perhaps fifo; allowed: fifo, reservoir"),
         ({"sampling": "best"}, "replay.sampling = 'best': unknown; allowed: uniform, prioritized"),
+        ({"sampling": "prioritized", "replacement": False}, "sampling: 'prioritized' draws with replacement only"),
         ({"priority_exponent": -1.0}, "priority_exponent"),
         ({"importance_exponent": float("nan")}, "importance_exponent"),
     ],
