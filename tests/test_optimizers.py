@@ -114,6 +114,32 @@ def test_a_restored_optimizer_goes_on_whatever_holds_its_arrays(
     torch.testing.assert_close(torch.as_tensor(second), torch.as_tensor(first))
 
 
+@pytest.mark.parametrize(
+    ("name", "momentum", "buffers"),
+    [
+        ("sgd", 0.0, set()),
+        ("sgd", 0.8, {"velocity"}),
+        ("rmsprop", 0.0, {"square"}),
+        ("rmsprop", 0.8, {"square", "velocity"}),
+        ("rmsprop-mnih", 0.8, {"square", "mean"}),
+        ("adam", 0.8, {"square", "mean"}),
+    ],
+)
+def test_only_running_means_that_are_used_are_kept(name: OptimizerName, momentum: float, buffers: set[str]) -> None:
+    theta, gradient = arrays("torch", torch.ones(SIZE))
+    optimizer = make_optimizer(LearnerSettings(optimizer=name, momentum=momentum), theta, gradient)
+    assert set(optimizer.state()) == {"steps", *buffers}
+
+
+def test_running_means_never_become_denormal_and_other_arithmetic_may() -> None:
+    theta, gradient = arrays("torch", torch.ones(SIZE))
+    optimizer = make_optimizer(LearnerSettings(optimizer="adam", beta1=0.9), theta, gradient)
+    optimizer.buffers["mean"].fill_(1.2e-38)  # 0.9 of it is below the smallest normal number, 1.18e-38
+    optimizer.step(0.1)
+    assert not optimizer.buffers["mean"].any()
+    assert (torch.full((SIZE,), 1.2e-38) * 0.9).all()
+
+
 @pytest.mark.parametrize("momentum", [0.0, 0.8])
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_a_step_allocates_no_array(name: OptimizerName, momentum: float) -> None:

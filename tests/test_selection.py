@@ -170,11 +170,21 @@ def test_sum_tree_equals_running_sums(capacity: int, updates: list[tuple[int, fl
         assert (sums <= before[found + 1] + margin).all()
 
 
-def test_sum_tree_at_the_seams() -> None:
+@pytest.mark.parametrize("capacity", [1, 16, 17, 300, 5000])
+def test_sum_tree_finds_every_row(capacity: int) -> None:
+    tree = SumTree(capacity)
+    tree.update(np.arange(capacity), np.full(capacity, 2.0))
+    assert tree.total == 2.0 * capacity
+    for place in (0.0, 1.0, 1.5):
+        np.testing.assert_array_equal(tree.find(2.0 * np.arange(capacity) + place), np.arange(capacity))
+
+
+@pytest.mark.parametrize("largest", [1.0, 1e-6])
+def test_sum_tree_at_the_seams(largest: float) -> None:
     """Sums at the border of two values, where rounding decides, never find a value of 0 or a row that isn't there."""
     rng = np.random.default_rng(0)
     for _ in range(300):
-        values = rng.random(200) * (rng.random(200) < 0.5)
+        values = largest * rng.random(200) * (rng.random(200) < 0.5)
         tree = SumTree(200)
         tree.update(np.arange(200), values)
         seams = np.concatenate([level.cumsum(axis=-1).reshape(-1) for level in tree._levels])

@@ -15,6 +15,9 @@ from common.settings.policies import EVICTIONS, SAMPLERS, EvictionPolicy, Sampli
 Rows = NDArray[np.intp]
 Floats = NDArray[np.float64]
 
+PRIORITY_EXPONENT = 0.6
+IMPORTANCE_EXPONENT = 0.4
+
 
 @dataclass(frozen=True, slots=True)
 class TableView:
@@ -36,8 +39,8 @@ class TableView:
     rewards: NDArray[np.float32]
     terminated: NDArray[np.bool_]
     priorities: Floats
-    priority_exponent: float = 0.6
-    importance_exponent: float = 0.4
+    priority_exponent: float = PRIORITY_EXPONENT
+    importance_exponent: float = IMPORTANCE_EXPONENT
     replacement: bool = True
 
     @property

@@ -13,7 +13,7 @@ from common.settings.policies import EVICTIONS, SAMPLERS
 from common.types import Array, Batch, EnvSpec, Segment
 from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
 from replay.table.frames import FrameStore, PinnedFrames, Slots
-from replay.table.policies import TableView, make_policies
+from replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
 from replay.table.streams import StreamTails
 
 __all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
@@ -49,8 +49,8 @@ class Table:
         eviction: str = "fifo",
         sampling: str = "uniform",
         rng: np.random.Generator,
-        priority_exponent: float = 0.6,
-        importance_exponent: float = 0.4,
+        priority_exponent: float = PRIORITY_EXPONENT,
+        importance_exponent: float = IMPORTANCE_EXPONENT,
         replacement: bool = True,
     ) -> None:
         """Raise UsageError for a capacity below 1, exponents below 0 or an unknown policy."""
