@@ -40,7 +40,7 @@ def _compare(network: nn.Sequential, feedback: str, s: float, x: Array, error: A
         np.testing.assert_allclose(found[name], gradient, rtol=1e-6, atol=atol, err_msg=name)
 
 
-@settings(max_examples=60)
+@settings(max_examples=settings.default.max_examples // 2)
 @given(
     hidden=st.lists(st.integers(2, 24), max_size=3),
     actions=st.integers(2, 6),

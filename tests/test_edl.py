@@ -135,7 +135,7 @@ def test_the_equations_by_svd(kind: str, actions: int, batch: int, trained: bool
     assert _relative(single, expected) < 1e-4
 
 
-@settings(max_examples=40)
+@settings(max_examples=settings.default.max_examples // 2)
 @given(st.integers(0, 2**31), st.booleans(), st.integers(2, 18), st.integers(1, 64))
 def test_the_equations_on_any_mlp(seed: int, trained: bool, actions: int, batch: int) -> None:
     network = build_network("mlp", _spec("mlp", actions), (96, 96), seed).double()
@@ -166,7 +166,7 @@ def test_samples_without_full_rank_leave_the_others_alone(actions: int) -> None:
         assert float(torch.linalg.svdvals(matrices).min()) >= 0.4 * (1 - 1e-3)
 
 
-@settings(max_examples=60)
+@settings(max_examples=settings.default.max_examples // 2)
 @given(st.integers(0, 2**31), st.sampled_from(["dead", "duplicate", "near", "zero"]), st.integers(2, 6))
 def test_lost_rank_is_harmless(seed: int, fault: str, actions: int) -> None:
     network, x, error = _case("mlp", actions, 5, seed)

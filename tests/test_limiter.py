@@ -87,7 +87,7 @@ def check_kept(limiter: RateLimiter, inserted: int, drawn: int, longest: int) ->
     assert -slack - 1e-6 <= behind <= slack + longest * limiter.ratio + 1e-6
 
 
-@settings(max_examples=300)
+@settings(max_examples=3 * settings.default.max_examples)
 @given(limiter=limiters(), steps=st.lists(st.integers(1, 64), min_size=1), order=st.randoms(use_true_random=False))
 def test_any_run_completes_within_tolerance(limiter: RateLimiter, steps: list[int], order: Random) -> None:
     """Peers ask in any order, segments have any length; nothing is refused on both sides until the run is over."""
@@ -110,7 +110,6 @@ def test_any_run_completes_within_tolerance(limiter: RateLimiter, steps: list[in
     assert inserted == 0 or "run complete" in (limiter.why_not_sample(inserted, drawn, inserted) or "")
 
 
-@settings(max_examples=100)
 @given(
     limiter=limiters(),
     ratio=st.floats(0.01, 8),

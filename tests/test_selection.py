@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from replay.table.policies import Floats, Rows, TableView
@@ -142,7 +142,6 @@ def test_proportional_draws_once_from_each_share() -> None:
     assert len(seen) == 16  # which of the two in a share does not depend on the other shares
 
 
-@settings(max_examples=100)
 @given(
     capacity=st.sampled_from([1, 5, 16, 17, 40, 300, 5000]),
     updates=st.lists(st.tuples(st.integers(0, 4999), st.floats(0, 1e6)), min_size=1, max_size=60),

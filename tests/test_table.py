@@ -70,7 +70,7 @@ def play(case: dict[str, Any], steps: list[tuple[str, int]]) -> Iterator[tuple[T
         yield table, copies, streams
 
 
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 @given(case=cases, steps=events)
 def test_equals_a_list_of_copies(case: dict[str, Any], steps: list[tuple[str, int]]) -> None:
     for table, copies, _ in play(case, steps):
@@ -83,7 +83,7 @@ def test_equals_a_list_of_copies(case: dict[str, Any], steps: list[tuple[str, in
         assert sum(stats.reuse_held) == stats.size
 
 
-@settings(max_examples=60)
+@settings(max_examples=settings.default.max_examples // 2)
 @given(case=cases, steps=events, tail=events)
 def test_restored_table_continues_to_the_bit(
     case: dict[str, Any], steps: list[tuple[str, int]], tail: list[tuple[str, int]]
@@ -116,7 +116,7 @@ def test_restored_table_continues_to_the_bit(
     check_references(twin)
 
 
-@settings(max_examples=60)
+@settings(max_examples=settings.default.max_examples // 2)
 @given(case=cases, steps=events, tail=events)
 def test_pinned_batch_stays_while_the_table_goes_on(
     case: dict[str, Any], steps: list[tuple[str, int]], tail: list[tuple[str, int]]
@@ -142,7 +142,7 @@ def test_pinned_batch_stays_while_the_table_goes_on(
     check_references(table)
 
 
-@settings(max_examples=60)
+@settings(max_examples=settings.default.max_examples // 2)
 @given(case=cases, steps=events, tail=events)
 def test_snapshot_stays_while_the_table_goes_on(
     case: dict[str, Any], steps: list[tuple[str, int]], tail: list[tuple[str, int]]

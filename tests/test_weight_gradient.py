@@ -71,7 +71,7 @@ def test_where_the_gradient_has_full_rank_it_is_the_svd() -> None:
     assert max(ranks) > 1e-6
 
 
-@settings(max_examples=60)
+@settings(max_examples=settings.default.max_examples // 2)
 @given(st.integers(0, 2**31), st.integers(1, 40), st.integers(1, 40), st.integers(0, 40))
 def test_any_matrix(seed: int, rows: int, columns: int, rank: int) -> None:
     generator = torch.Generator().manual_seed(seed)
