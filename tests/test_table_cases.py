@@ -11,7 +11,7 @@ from table_reference import Copies, Stream, check_references, make_spec, whole_s
 
 from common.errors import UsageError
 from common.settings.capacity import estimated_bytes
-from common.types import EnvSpec, Segment
+from common.types import Batch, EnvSpec, Segment
 from replay.stats import reuse_histogram
 from replay.table import streams
 from replay.table.table import Table
@@ -99,6 +99,9 @@ def test_reuse_histograms() -> None:
     assert table.stats().reuse_evicted[int(draws[0]).bit_length()] == 1
     table.insert(stream.segment(2))
     assert table.stats().evicted_unsampled == 1
+    table.sample(3)
+    stats = table.stats()
+    assert (stats.batches, stats.sampled) == (2, 10)
 
 
 def test_the_last_bucket_is_open() -> None:
@@ -158,6 +161,16 @@ def test_bad_settings_are_refused(settings: dict[str, Any], words: str) -> None:
         Table(make_spec(1), **{"capacity": 10, "rng": np.random.default_rng(0), **settings})
 
 
+def test_exponents_of_0_make_priorities_irrelevant() -> None:
+    settings = {"sampling": "prioritized", "priority_exponent": 0.0, "importance_exponent": 0.0}
+    table = Table(make_spec(1), 2, rng=np.random.default_rng(0), **settings)  # type: ignore[arg-type]
+    table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(2))
+    table.update_priorities(np.array([0, 1]), np.array([0.0, 1e6]))
+    batch = table.sample(10)
+    assert np.bincount(batch.ids).tolist() == [5, 5]
+    assert batch.weights.tolist() == [1.0] * 10
+
+
 def test_misuse_is_refused() -> None:
     table = Table(make_spec(1), 10, sampling="prioritized", rng=np.random.default_rng(0))
     with pytest.raises(ValueError, match="empty"):
@@ -171,8 +184,63 @@ def test_misuse_is_refused() -> None:
     meta, arrays = whole_state(table)
     with pytest.raises(ValueError, match="new table"):
         table.load_state(meta, arrays)
-    with pytest.raises(UsageError, match="capacity: 11, but the saved table had 10"):
-        Table(make_spec(1), 11, sampling="prioritized", rng=np.random.default_rng(0)).load_state(meta, arrays)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"capacity": 11}, "capacity: 11, but the saved table had 10"),
+        ({"eviction": "reservoir"}, "eviction: 'reservoir', but the saved table had 'fifo'"),
+        ({"sampling": "uniform"}, "sampling: 'uniform', but the saved table had 'prioritized'"),
+        ({"priority_exponent": 0.5}, "priority_exponent: 0.5, but the saved table had 0.6"),
+        ({"importance_exponent": 0.5}, "importance_exponent: 0.5, but the saved table had 0.4"),
+        ({"spec": make_spec(2)}, r"spec: \['test', .*2, 5\], but the saved table had \['test', .*1, 5\]"),
+    ],
+)
+def test_a_table_of_other_settings_is_not_restored(change: dict[str, Any], words: str) -> None:
+    settings: dict[str, Any] = {"spec": make_spec(1), "capacity": 10, "sampling": "prioritized"}
+    state = whole_state(Table(**settings, rng=np.random.default_rng(0)))
+    with pytest.raises(UsageError, match=f"^{words}$"):
+        Table(**{**settings, **change}, rng=np.random.default_rng(0)).load_state(*state)
+
+
+def test_a_state_of_many_frames_and_without_spans() -> None:
+    table = Table(make_spec(2), 3000, rng=np.random.default_rng(0))
+    stream = Stream(make_spec(2), 0, np.random.default_rng(0), 50)
+    for _ in range(30):
+        table.insert(stream.segment(100))
+    meta, arrays = whole_state(table)
+    assert len(arrays["frames"]) > 3000
+    del arrays["span"]  # as before n-step returns
+    twin = Table(make_spec(2), 3000, rng=np.random.default_rng(1))
+    twin.load_state(meta, arrays)
+    check_references(twin)
+    one, other = table.sample(500), twin.sample(500)
+    for index in ("obs_index", "next_index"):
+        np.testing.assert_array_equal(one.frames[getattr(one, index)], other.frames[getattr(other, index)])
+    assert (other.span == 1).all()
+
+
+def test_types_of_a_batch() -> None:
+    table = Table(make_spec(1), 10, rng=np.random.default_rng(0))
+    table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(4))
+    batch = table.sample(3)
+    types = {name: getattr(batch, name).dtype.name for name in Batch.__slots__}
+    assert types == {
+        **{"frames": "float32", "obs_index": "int32", "next_index": "int32", "actions": "int32", "rewards": "float32"},
+        **{"terminated": "bool", "span": "uint8", "weights": "float32", "ids": "int64", "param_version": "int64"},
+        **{"age": "int64", "reuse": "int32"},
+    }
+
+
+@pytest.mark.parametrize(("sampling", "row"), [("uniform", 38), ("prioritized", 46)])
+def test_bytes_of_transitions(sampling: str, row: int) -> None:
+    """Two slots, action, reward, end, span, version, number and draws: 8 + 4 + 4 + 1 + 1 + 8 + 8 + 4; 8 a priority."""
+    table = Table(make_spec(1), 10, sampling=sampling, rng=np.random.default_rng(0))
+    empty = table.stats()
+    assert (empty.size, empty.bytes_held, empty.reuse_mean) == (0, table._frames.bytes_held, 0.0)
+    table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(4))
+    assert table.stats().bytes_held == table._frames.bytes_held + 4 * row
 
 
 def test_what_has_come_in_twice_is_counted() -> None:
