@@ -208,3 +208,24 @@ def test_a_polar_part_in_bfloat16_leaves_the_rest_exact(kind: str, actions: int)
 def test_a_plain_stack_has_no_other_layer() -> None:
     with pytest.raises(UnsupportedLayerError, match="layer '1' is a Tanh"):
         Chain(nn.Sequential(nn.Linear(2, 2), nn.Tanh()))
+
+
+def _random_feedback(network: nn.Sequential, x: Tensor, s: float, **seed: int) -> dict[str, Tensor]:
+    """The fixed B(i) [actions, n] of each layer: the gradient of its bias, for an error of 1 of each action in turn."""
+    units = torch.eye(3, dtype=x.dtype)
+    rows = [edl_gradients(network, x, e[None], s, "random", **seed) for e in units]
+    return {name: torch.stack([row[f"{name}.bias"] for row in rows]) for name in ("fc1", "fc2", "out")}
+
+
+def test_random_feedback_is_fixed() -> None:
+    """A row of B(i) is a draw of its own of length about 1 (sd 0.035); B of the last layer is the identity."""
+    network = build_network("mlp", _spec("mlp", 3), (400, 400), 0).double()
+    first, second = torch.randn(2, 1, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    fixed = _random_feedback(network, first, 0.0)
+    for again in (_random_feedback(network, second, 0.7), _random_feedback(network, first, 0.0, seed=0)):
+        for name, matrix in fixed.items():
+            torch.testing.assert_close(again[name], matrix)
+    other = _random_feedback(network, first, 0.0, seed=1)
+    assert torch.equal(fixed["out"], torch.eye(3, dtype=torch.float64))
+    rows = torch.cat([fixed["fc1"], fixed["fc2"], other["fc1"], other["fc2"]])
+    torch.testing.assert_close(rows @ rows.T, torch.eye(12, dtype=torch.float64), atol=0.25, rtol=0)

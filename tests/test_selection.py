@@ -169,13 +169,15 @@ def test_sum_tree_equals_running_sums(capacity: int, updates: list[tuple[int, fl
         assert (sums <= before[found + 1] + margin).all()
 
 
+@pytest.mark.parametrize("value", [2.0, 2.0**-20])
 @pytest.mark.parametrize("capacity", [1, 16, 17, 300, 5000])
-def test_sum_tree_finds_every_row(capacity: int) -> None:
+def test_sum_tree_finds_every_row(capacity: int, value: float) -> None:
     tree = SumTree(capacity)
-    tree.update(np.arange(capacity), np.full(capacity, 2.0))
-    assert tree.total == 2.0 * capacity
-    for place in (0.0, 1.0, 1.5):
-        np.testing.assert_array_equal(tree.find(2.0 * np.arange(capacity) + place), np.arange(capacity))
+    tree.update(np.arange(capacity), np.full(capacity, value))
+    assert tree.total == value * capacity
+    for share in (0.0, 0.5, 0.75):
+        np.testing.assert_array_equal(tree.find(value * (np.arange(capacity) + share)), np.arange(capacity))
+    assert tree.find(np.array([tree.total])).tolist() == [capacity - 1]  # to which a share below 1 may be rounded
 
 
 @pytest.mark.parametrize("largest", [1.0, 1e-6])

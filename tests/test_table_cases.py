@@ -221,6 +221,12 @@ def test_a_state_of_many_frames_and_without_spans() -> None:
     assert (other.span == 1).all()
 
 
+def test_a_table_of_one_transition() -> None:
+    table = Table(make_spec(1), 1, rng=np.random.default_rng(0))
+    table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(3))
+    assert table.sample(2).ids.tolist() == [2, 2]
+
+
 def test_types_of_a_batch() -> None:
     table = Table(make_spec(1), 10, rng=np.random.default_rng(0))
     table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(4))

@@ -44,28 +44,27 @@ class LowestPriority(Eviction):
 
     def __init__(self, table: TableView) -> None:
         super().__init__(table)
-        self._capacity, self._ids, self._priorities = table.capacity, table.ids, table.priorities
         self._heap: list[tuple[float, int, int]] = []
 
     def place(self, first: int, count: int) -> tuple[Rows, slice]:
         """Assign unused rows, then those of the lowest priorities; new transitions are evicted last."""
-        size = min(first, self._capacity)
-        skipped = max(0, count - self._capacity)
-        unused = min(self._capacity - size, count)
+        size = min(first, self.table.capacity)
+        skipped = max(0, count - self.table.capacity)
+        unused = min(self.table.capacity - size, count)
         rows = dict.fromkeys(range(size, size + unused))
         while len(rows) < count - skipped:
             priority, number, row = heapq.heappop(self._heap)
-            if self._ids[row] == number and self._priorities[row] == priority:
+            if self.table.ids[row] == number and self.table.priorities[row] == priority:
                 rows.setdefault(row)
-        return np.array(list(rows), np.intp), slice(skipped, count)
+        return np.array(list(rows)), slice(skipped, count)
 
     def prioritise(self, rows: Rows) -> None:
         """Add the rows to the heap with their new priorities."""
-        if len(self._heap) + len(rows) > 2 * self._capacity + 1024:
+        if len(self._heap) + len(rows) > 2 * self.table.capacity + 1024:
             held = {row for *_, row in self._heap}
-            rows = np.array(list(held.union(rows.tolist())), np.intp)
+            rows = np.array(list(held.union(rows.tolist())))
             self._heap.clear()
-        entries = zip(self._priorities[rows].tolist(), self._ids[rows].tolist(), rows.tolist(), strict=True)
+        entries = zip(self.table.priorities[rows].tolist(), self.table.ids[rows].tolist(), rows.tolist(), strict=True)
         for entry in entries:
             heapq.heappush(self._heap, entry)
 
