@@ -113,6 +113,7 @@ class SegmentAssembler:
                 self._carried[stream] = kept[stream]
             self._waiting[stream] = waiting[stream]
         self._episodes = {}
-        for column in (self._actions, self._rewards, self._terminated, self._ends, self._versions):
-            column[:history] = column[steps:end].copy()
+        if history:
+            for column in (self._actions, self._rewards, self._terminated, self._ends, self._versions):
+                column[:history] = column[steps:end].copy()
         return segments

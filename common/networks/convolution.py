@@ -8,6 +8,7 @@ numpy's for these sizes; everything else costs less to call in numpy.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -16,10 +17,15 @@ from torch import nn
 from common.networks.dense import DTYPES, Dense
 from common.types import Array
 
+_SMALL = 2**18  # multiplications below which numpy's product is the faster one, with its shorter call
 
-def product(a: Array, b: Array) -> Array:
-    """The matrix product of a [m, k] and b [k, n]."""
-    result: Array = torch.mm(torch.from_numpy(a), torch.from_numpy(b)).numpy()
+
+def product(a: Array, b: Array, out: Array | None = None) -> Array:
+    """The matrix product of a [m, k] and b [k, n], in `out` [m, n] if that is given."""
+    if a.size * b.shape[1] < _SMALL:
+        return np.dot(a, b, out)
+    place = None if out is None else torch.from_numpy(out)
+    result: Array = torch.mm(torch.from_numpy(a), torch.from_numpy(b), out=place).numpy()
     return result
 
 
@@ -35,6 +41,7 @@ class ConvolutionNetwork(Dense):
         convolution = next(module.children())
         assert isinstance(convolution, nn.Conv2d)
         self._kernel, self._stride = convolution.kernel_size, convolution.stride
+        self._geometry = lru_cache(maxsize=16)(self._geometry_of)
 
     @staticmethod
     def fits(module: nn.Module) -> bool:
@@ -82,15 +89,19 @@ class ConvolutionNetwork(Dense):
     def _windows(self, x: Array) -> Array:
         """What the kernel sees at each place of pictures x, and a one: [inputs + 1, places, batch]."""
         pictures = np.ascontiguousarray(x.transpose(1, 2, 3, 0), dtype=self.weights[0].dtype)
-        (channels, *sides, batch), (plane, row, column, sample) = pictures.shape, pictures.strides
-        (down, right), geometry = self._stride, zip(sides, self._kernel, self._stride, strict=True)
-        places = [(side - kernel) // stride + 1 for side, kernel, stride in geometry]
-        view = np.ndarray(
-            (channels, *self._kernel, *places, batch), pictures.dtype, pictures, 0,
-            (plane, row, column, row * down, column * right, sample),
-        )  # fmt: skip
         inputs = self.weights[0].shape[1]
-        windows = np.empty((inputs + 1, places[0] * places[1], batch), pictures.dtype)
-        windows[:inputs].reshape(view.shape)[...] = view
+        shape, strides = self._geometry(pictures.shape, pictures.strides)
+        windows = np.empty((inputs + 1, shape[3] * shape[4], shape[5]), pictures.dtype)
+        windows[:inputs].reshape(shape)[...] = np.ndarray(shape, pictures.dtype, pictures, 0, strides)
         windows[inputs] = 1
         return windows
+
+    def _geometry_of(self, shape: tuple[int, ...], strides: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The shape [channels, *kernel, *places, batch] of the view of all windows of pictures, and its strides."""
+        (channels, *sides, batch), (plane, row, column, sample) = shape, strides
+        (down, right), steps = self._stride, zip(sides, self._kernel, self._stride, strict=True)
+        places = [(side - kernel) // stride + 1 for side, kernel, stride in steps]
+        return (
+            (channels, *self._kernel, *places, batch),
+            (plane, row, column, row * down, column * right, sample),
+        )

@@ -43,7 +43,7 @@ class ConvolutionChain(DenseChain):
         weight, bias = (out[self.names[index] + kind] for kind in ("weight", "bias"))
         h = tape.inputs[index]
         if index:
-            torch.mm(torch.from_numpy(delta.T), torch.from_numpy(h), out=torch.from_numpy(weight))
+            product(delta.T, h, weight)
             np.add.reduce(delta, 0, out=bias)
         else:
             inputs = h.shape[2]
