@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from typing import Generic
 
 import torch
@@ -117,12 +118,12 @@ class Transforms(Generic[ArrayT]):
 def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
     """An orthogonal Q [A, A] that makes the rows of Q W nearly orthogonal, for the output weight W [A, n].
 
-    Without W, the first row of Q takes the mean of the actions' values.
+    For few actions, and without W, the first row of Q takes the mean of the actions' values.
     """
     actions = output.shape[1]
     if actions == 2:
         return convert_like(_SUM_AND_DIFFERENCE, output)
-    if output_weight is None:
+    if actions == 3 or output_weight is None:
         return convert_like(_reflection(actions), output)
     xp, w = namespace(output), widened(output_weight)
     gram = w @ w.T
@@ -130,6 +131,7 @@ def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
     return convert_like(vectors.T, output)
 
 
+@cache
 def _reflection(size: int) -> Tensor:
     """float64 [size, size]: the Householder reflection that swaps the first axis and the diagonal of all axes."""
     normal = torch.full((size,), size**-0.5, dtype=torch.float64)
