@@ -250,6 +250,17 @@ def test_an_export_that_fails_leaves_the_earlier_one(small_disk: Path, tmp_path:
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
+def test_no_card_stands_beside_networks_that_are_not_its_own(tmp_path: Path) -> None:
+    saved(tmp_path / "run")
+    out = tmp_path / "exported"
+    export(tmp_path / "run", out)
+    (out / "network-2.safetensors").unlink()
+    (out / "network-2.safetensors").mkdir()
+    with pytest.raises(RunError, match="Is a directory"):
+        export(tmp_path / "run", out)
+    assert [path.name for path in out.iterdir() if path.name == "card.json" or path.suffix == ".part"] == []
+
+
 def test_the_command_is_installed() -> None:
     command = [Path(sysconfig.get_path("scripts")) / "coop-export", "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True).stdout
