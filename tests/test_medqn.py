@@ -140,3 +140,10 @@ def test_pictures_are_drawn_too() -> None:
     agent.update(replace(batch_of_two(), frames=frames, obs_index=index, next_index=index + 1))
     assert isinstance(agent.rule, Consolidation)
     np.testing.assert_allclose(agent.rule.high, frames[[[0, 1], [1, 2], [2, 3]]].max(0) / 255, rtol=1e-6)
+
+
+def test_without_an_input_there_are_no_bounds() -> None:
+    state = Agent(config(MedqnSettings("uniform")), ONE).rule.state()
+    assert {name: (bound.shape, bound.dtype) for name, bound in state.items()} == {
+        "low": ((0,), torch.float32), "high": ((0,), torch.float32)
+    }  # fmt: skip

@@ -59,6 +59,6 @@ class DenseChain(Passes[Array]):
 
     @staticmethod
     def combine(weights: Array, t: Array) -> Array:
-        """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""
-        sums: Array = weights @ t[0] if len(t) < len(weights) else np.matmul(weights[:, None], t)[:, 0]
+        """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch, A, n] -> [batch, n]."""
+        sums: Array = np.matmul(weights[:, None], t)[:, 0]
         return sums

@@ -122,7 +122,7 @@ class Table:
         replaced = rows if size == self.capacity else rows[rows < size]
         self._reuse_evicted += reuse_histogram(self._reuse[replaced])
         self._reuse_evicted[0] += segment.steps - len(rows)
-        old = self._slots.take(replaced, axis=0).reshape(-1)
+        old = self._slots.take(replaced, axis=0).ravel()
         if self._row_of is not None:
             for number in self._ids[replaced].tolist():
                 del self._row_of[number]
@@ -231,7 +231,7 @@ class Table:
         tail_slots = self._tails.slots()
         stored = tail_slots >= 0
         slots = self._slots[:size]
-        distinct, index = self._frames.unique(np.concatenate((slots.reshape(-1), tail_slots[stored])))
+        distinct, index = self._frames.unique(np.concatenate((slots.ravel(), tail_slots[stored])))
         tail_index = np.full(len(tail_slots), -1, np.int32)
         tail_index[stored] = index[slots.size :]
         meta = {
@@ -261,7 +261,7 @@ class Table:
                 raise UsageError(f"{name}: {value!r}, but the saved table had {meta['settings'][name]!r}")
         tails = arrays["tails"].astype(np.intp)
         frames = arrays["frames"]
-        references = np.bincount(np.concatenate((arrays["slots"].reshape(-1), tails[tails >= 0])))
+        references = np.bincount(np.concatenate((arrays["slots"].ravel(), tails[tails >= 0])))
         parts = [slice(start, start + 1024) for start in range(0, len(frames), 1024)]
         slots = np.concatenate(
             [np.empty(0, np.intp), *(self._frames.add(frames[part], references[part]) for part in parts)]
