@@ -1,0 +1,76 @@
+"""G^(-1/2) e against an eigenvalue decomposition, and the limits beyond which its results are called inaccurate."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from common.types import Array
+from learner.edl.polar import whitened
+
+LIBRARIES = pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
+
+
+def _pair(cosine: float, scale: float = 1.0) -> Array:
+    return scale * np.array([[1.0, cosine], [cosine, 1.0]])
+
+
+def _triple(cosine: float) -> Array:
+    """Two rows of this cosine, and a third orthogonal to both."""
+    return np.block([[_pair(cosine), np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+
+
+@LIBRARIES
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("size", [2, 3, 5])
+def test_whitened(size: int, dtype: type, library: Any) -> None:
+    rng = np.random.default_rng(0)
+    rows = rng.standard_normal((7, size, 20))
+    e = rng.standard_normal((7, size))
+    values, vectors = np.linalg.eigh(rows @ rows.swapaxes(1, 2))
+    expected = (vectors / values[:, None] ** 0.5 @ vectors.swapaxes(1, 2) @ e[:, :, None])[..., 0]
+    gram = library((rows @ rows.swapaxes(1, 2)).astype(dtype))
+    white, doubtful = whitened(gram, library(e.astype(dtype)))
+    assert doubtful is None
+    assert white.dtype == gram.dtype
+    np.testing.assert_allclose(white, expected, rtol=1e-4 if dtype is np.float32 else 1e-10, atol=1e-6)
+
+
+@LIBRARIES
+@pytest.mark.parametrize(
+    ("gram", "accurate"),
+    [
+        # Nearly parallel rows of any length: the inflation factors, 2 / (1 - cos^2) in all, may reach 300 ...
+        *((_pair((1 - 0.0075) ** 0.5, scale), True) for scale in (0.25, 1.0, 4.0)),
+        *((_pair((1 - 0.0060) ** 0.5, scale), False) for scale in (0.25, 1.0, 4.0)),
+        # ... and one is that of a row orthogonal to all others.
+        (_triple((1 - 0.0072) ** 0.5), True),
+        (_triple((1 - 0.0064) ** 0.5), False),
+        # The squared length of the shortest row must be above 1e-31 ...
+        (np.diag([1.0, 1.2e-31]), True),
+        (np.diag([1.2e-31, 1.0]), True),
+        (np.diag([1.0, 0.8e-31]), False),
+        (np.diag([0.8e-31, 1.0]), False),
+        (1.2e-31 * np.eye(3), True),
+        (0.8e-31 * np.eye(3), False),
+        # ... and with three rows, 1e-11 of the longest one's.
+        (np.diag([1.0, 1.2e-11, 1.0]), True),
+        (np.diag([1.0, 0.8e-11, 1.0]), False),
+        (np.full((2, 2), np.nan), False),
+        (np.full((3, 3), np.nan), False),
+    ],
+)
+def test_what_float32_is_too_coarse_for_is_named_and_left_at_0(gram: Array, accurate: bool, library: Any) -> None:
+    sound = np.stack([2 * np.eye(len(gram)), gram, 3 * np.eye(len(gram))]).astype(np.float32)
+    e = np.ones((3, len(gram)), np.float32)
+    with np.errstate(invalid="ignore"):
+        white, doubtful = whitened(library(sound), library(e))
+    if accurate:
+        assert doubtful is None
+        assert (np.asarray(white[1]) != 0).any()
+    else:
+        assert np.asarray(doubtful).tolist() == [False, True, False]
+        assert (np.asarray(white[1]) == 0).all()
+    np.testing.assert_allclose(white[0], e[0] / 2**0.5, rtol=1e-6)
+    np.testing.assert_allclose(white[2], e[0] / 3**0.5, rtol=1e-6)
