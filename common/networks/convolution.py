@@ -17,6 +17,7 @@ from torch import nn
 from common.networks.dense import DTYPES, Dense
 from common.types import Array
 
+_CACHED = 2**14  # numbers that the windows of one picture may hold to stay in the cache with those of a batch
 _SMALL = 2**18  # multiplications below which numpy's product is the faster one, with its shorter call
 
 
@@ -47,11 +48,17 @@ class ConvolutionNetwork(Dense):
     def fits(module: nn.Module) -> bool:
         """Whether a network is Conv2d, ReLU, Flatten, Linear, ReLU, Linear, ..., Linear in a float on the CPU.
 
-        All layers must have biases, and the convolution neither padding, dilation nor groups. Later convolutions are
-        faster in PyTorch.
+        All layers must have biases, and the convolution neither padding, dilation nor groups. PyTorch is faster for
+        large pictures and for later convolutions.
         """
         match list(module) if type(module) is nn.Sequential else []:
-            case [nn.Conv2d() as convolution, nn.ReLU(), nn.Flatten(start_dim=1, end_dim=-1), *behind]:
+            case [
+                nn.Conv2d() as convolution,
+                nn.ReLU(),
+                nn.Flatten(start_dim=1, end_dim=-1),
+                nn.Linear() as linear,
+                *rest,
+            ]:
                 return (
                     type(convolution) is nn.Conv2d
                     and convolution.padding == (0, 0)
@@ -59,7 +66,8 @@ class ConvolutionNetwork(Dense):
                     and convolution.groups == 1
                     and convolution.bias is not None
                     and all(p.device.type == "cpu" and p.dtype in DTYPES for p in convolution.parameters())
-                    and Dense.fits(nn.Sequential(*behind))
+                    and Dense.fits(nn.Sequential(linear, *rest))
+                    and convolution.weight[0].numel() * linear.in_features <= _CACHED * convolution.out_channels
                 )
         return False
 
