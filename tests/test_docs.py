@@ -37,6 +37,8 @@ def run_page(page: str, folder: Path) -> int:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    for name in [name for name in sys.modules if name.startswith("my_")]:  # other tests have modules of these names
+        monkeypatch.delitem(sys.modules, name)
     return tmp_path
 
 

@@ -173,7 +173,7 @@ def test_pictures_change_on_request() -> None:
         ({"id": "test/Gray-v0", "kwargs": {"shape": [70_000]}}, ["70,000 values on a side", "at most 65,536"]),
         ({"id": "CartPole-v1", "kwargs": {"sid": 12}}, ["env.kwargs = {'sid': 12}", "unexpected keyword argument"]),
         ({"id": "no_such_module:Room-v0"}, ["env.id: cannot import 'no_such_module'"]),
-        ({"id": "json:Room-v0"}, ["the module json does not register Room-v0"]),
+        ({"id": "json:Nowhere-v0"}, ["the module json does not register Nowhere-v0"]),
         ({"id": "NoSuchSpace/Room-v0"}, ["unknown environment 'NoSuchSpace/Room-v0'"]),
     ],
 )

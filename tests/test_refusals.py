@@ -14,8 +14,8 @@ LOCAL = Path(sysconfig.get_path("scripts")) / "coop-local"
     ("flags", "words"),
     [
         ("--env.id brekout", ["env.id", "unknown game 'brekout'", "breakout"]),
-        ("--env.id Blackjack-v1", ["env.id", "observation space Tuple", "allowed is a one-dimensional Box"]),
-        ("--env.id CartPole-v0", ["'nature' needs frames [height, width], CartPole-v0 has (4,)"]),
+        ("--env.id Blackjack-v1", ["env.id", "observation space Tuple", "allowed is a Box"]),
+        ("--env.id CartPole-v0", ["network.kind = 'nature': needs pictures; CartPole-v0 has frames [4]"]),
         (
             "--replay.capacity 1000000000 --total-steps 1000000000",
             ["replay.capacity = 1,000,000,000: needs up to 6640.3 GiB, this machine has"],
