@@ -204,6 +204,14 @@ class Adam(Optimizer[ArrayT]):
 
     def _step(self, rate: float) -> None:
         beta1, beta2 = self.betas
+        if isinstance(self.theta, Tensor):
+            # One pass over the memory; it takes a third of the time of the operations one by one.
+            count = torch.tensor(float(self.steps), device=self.theta.device)
+            torch._fused_adam_(
+                [self.theta], [self.gradient], [self.buffers["mean"]], [self.buffers["square"]], [], [count],
+                lr=rate, beta1=beta1, beta2=beta2, weight_decay=0.0, eps=self.eps, amsgrad=False, maximize=False,
+            )  # fmt: skip
+            return
         mean: ArrayT = self._average("mean", beta1)
         correction = (1 - beta2**self.steps) ** 0.5
         root: ArrayT = self._root(self._average_square(beta2))
