@@ -51,26 +51,30 @@ def test_whitened(size: int, dtype: type, library: Any) -> None:
         (np.diag([1.0, 1.2e-31]), True),
         (np.diag([1.2e-31, 1.0]), True),
         (np.diag([1.0, 0.8e-31]), False),
+        (np.diag([4.0, 0.8e-31]), False),
         (np.diag([0.8e-31, 1.0]), False),
         (1.2e-31 * np.eye(3), True),
         (0.8e-31 * np.eye(3), False),
         # ... and with three rows, 1e-11 of the longest one's.
         (np.diag([1.0, 1.2e-11, 1.0]), True),
         (np.diag([1.0, 0.8e-11, 1.0]), False),
+        (np.diag([0.8e-11, 0.8e-11, 1.0]), False),
         (np.full((2, 2), np.nan), False),
         (np.full((3, 3), np.nan), False),
     ],
 )
 def test_what_float32_is_too_coarse_for_is_named_and_left_at_0(gram: Array, accurate: bool, library: Any) -> None:
-    sound = np.stack([2 * np.eye(len(gram)), gram, 3 * np.eye(len(gram))]).astype(np.float32)
+    half, three = 0.5 * np.eye(len(gram)), 3 * np.eye(len(gram))
+    grams = np.array([[half, gram, three], [half, half, three]], np.float32)  # of two layers
     e = np.ones((3, len(gram)), np.float32)
     with np.errstate(invalid="ignore"):
-        white, doubtful = whitened(library(sound), library(e))
+        white, doubtful = whitened(library(grams), library(e))
     if accurate:
         assert doubtful is None
-        assert (np.asarray(white[1]) != 0).any()
+        assert (np.asarray(white[0, 1]) != 0).any()
     else:
-        assert np.asarray(doubtful).tolist() == [False, True, False]
-        assert (np.asarray(white[1]) == 0).all()
-    np.testing.assert_allclose(white[0], e[0] / 2**0.5, rtol=1e-6)
-    np.testing.assert_allclose(white[2], e[0] / 3**0.5, rtol=1e-6)
+        assert np.asarray(doubtful).tolist() == [[False, True, False], [False] * 3]
+        assert (np.asarray(white[0, 1]) == 0).all()
+    for layer in (0, 1):
+        np.testing.assert_allclose(white[layer, 0], e[0] * 2**0.5, rtol=1e-6)
+        np.testing.assert_allclose(white[layer, 2], e[0] / 3**0.5, rtol=1e-6)

@@ -122,6 +122,17 @@ def test_priorities_of_evicted_transitions_are_ignored(eviction: str) -> None:
     assert table._priorities.tolist() == [1.0] * 4
 
 
+def test_priorities_find_a_transition_in_whatever_row_it_is() -> None:
+    table = Table(make_spec(1), 2, eviction="prioritized", rng=np.random.default_rng(0))
+    stream = Stream(make_spec(1), 0, np.random.default_rng(0), 50)
+    table.insert(stream.segment(2))
+    table.update_priorities(np.array([0, 1]), np.array([9.0, 0.1]))
+    table.insert(stream.segment(1))  # in the place of 1
+    table.update_priorities(np.array([2]), np.array([0.5]))
+    table.insert(stream.segment(1))
+    assert set(table.sample(100).ids.tolist()) == {0, 3}
+
+
 def test_frames_survive_growth() -> None:
     """More frames than the store begins with: those written before it grew are still the same."""
     table = Table(make_spec(2), 3000, rng=np.random.default_rng(0))
