@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from common.types import Array
-from learner.edl.polar import whitened
+from learner.edl.polar import polar, polar_of_product, whitened
 
 LIBRARIES = pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
 
@@ -78,3 +78,19 @@ def test_what_float32_is_too_coarse_for_is_named_and_left_at_0(gram: Array, accu
     for layer in (0, 1):
         np.testing.assert_allclose(white[layer, 0], e[0] * 2**0.5, rtol=1e-6)
         np.testing.assert_allclose(white[layer, 2], e[0] / 3**0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(3, 5), (5, 3), (12, 20), (20, 12)])
+def test_polar_factors_keep_shape_and_dtype_and_what_is_not_finite(shape: tuple[int, int], dtype: torch.dtype) -> None:
+    rng = np.random.default_rng(0)
+    matrix = torch.from_numpy(rng.standard_normal(shape)).to(dtype)
+    left, right = (torch.from_numpy(rng.standard_normal((2, n))).to(dtype) for n in shape)
+    for factor in (polar(matrix, rng), polar_of_product(left, right, rng)):
+        assert (factor.shape, factor.dtype) == (shape, dtype)
+        units = torch.linalg.svdvals(factor.double())
+        torch.testing.assert_close(units, torch.ones_like(units), rtol=1e-5, atol=1e-5)
+    matrix[1, 2], left[0, 1] = torch.inf, torch.nan
+    for factor in (polar(matrix, rng), polar_of_product(left, right, rng)):
+        assert (factor.shape, factor.dtype) == (shape, dtype)
+        assert factor.isnan().all()

@@ -102,6 +102,7 @@ def test_reuse_histograms() -> None:
     table.sample(3)
     stats = table.stats()
     assert (stats.batches, stats.sampled) == (2, 10)
+    assert {type(count) for count in stats.reuse_evicted} == {int}
 
 
 def test_the_last_bucket_is_open() -> None:

@@ -119,7 +119,7 @@ class Table:
         rows, kept = self._eviction.place(first, segment.steps)
         index = np.concatenate((segment.obs_index[kept], segment.next_index[kept]), axis=1)
         slots, dropped = self._tails.store(segment, index)
-        replaced = rows if size == self.capacity else rows[rows < size]
+        replaced = rows[rows < size]
         self._reuse_evicted += reuse_histogram(self._reuse[replaced])
         self._reuse_evicted[0] += segment.steps - len(rows)
         old = self._slots.take(replaced, axis=0).ravel()
