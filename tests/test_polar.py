@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from common.types import Array
-from learner.edl.polar import polar, polar_of_product, whitened
+from learner.edl.polar import polar, polar_by_svd, polar_of_product, whitened
 
 LIBRARIES = pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
 
@@ -94,3 +94,18 @@ def test_polar_factors_keep_shape_and_dtype_and_what_is_not_finite(shape: tuple[
     for factor in (polar(matrix, rng), polar_of_product(left, right, rng)):
         assert (factor.shape, factor.dtype) == (shape, dtype)
         assert factor.isnan().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("rank", [None, 1])
+def test_polar_factors_by_svd(rank: int | None, dtype: torch.dtype) -> None:
+    matrices = torch.from_numpy(np.random.default_rng(0).standard_normal((3, 2, 4))).to(dtype)
+    u, _, vh = torch.linalg.svd(matrices.double(), full_matrices=False)
+    expected = (u[..., :rank] @ vh[..., :rank, :]).to(dtype)
+    factors = polar_by_svd(matrices, rank)
+    assert factors.dtype == dtype
+    torch.testing.assert_close(factors, expected)
+    matrices[1, 0, 2] = torch.inf
+    broken = polar_by_svd(matrices, rank)
+    assert broken[1].isnan().all()
+    torch.testing.assert_close(broken[[0, 2]], expected[[0, 2]])
