@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from samples import make_segment
 from table_reference import Copies, Stream, check_references, make_spec, whole_state
 
@@ -129,6 +130,7 @@ def test_priorities_find_a_transition_in_whatever_row_it_is() -> None:
     table.insert(stream.segment(2))
     table.update_priorities(np.array([0, 1]), np.array([9.0, 0.1]))
     table.insert(stream.segment(1))  # in the place of 1
+    table.update_priorities(np.empty(0, np.int64), np.empty(0, np.float32))
     table.update_priorities(np.array([2]), np.array([0.5]))
     table.insert(stream.segment(1))
     assert set(table.sample(100).ids.tolist()) == {0, 3}
@@ -241,12 +243,14 @@ def test_a_table_of_one_transition() -> None:
 
 def test_a_state_tells_which_frames_the_next_segment_may_repeat() -> None:
     table = Table(make_spec(2), 5, rng=np.random.default_rng(0))
-    table.insert(Stream(make_spec(2), 0, np.random.default_rng(0), 50).segment(1))
+    segment = Stream(make_spec(2), 0, np.random.default_rng(0), 50).segment(1)
+    table.insert(replace(segment, span=np.full(1, 3, np.uint8)))
     meta, arrays = whole_state(table)
     assert (arrays["tails"].tolist(), arrays["tails"].dtype) == ([0, 1], np.int32)
     twin = Table(make_spec(2), 5, rng=np.random.default_rng(0))
     twin.load_state(meta, arrays)
     check_references(twin)
+    assert twin.sample(1).span.tolist() == [3]
     few = Table(make_spec(1), 1, eviction="reservoir", rng=np.random.default_rng(0))
     few.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(40))
     _, arrays = whole_state(few)
