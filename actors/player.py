@@ -42,7 +42,7 @@ class Player:
         self._policy = policy
         self._epsilon = epsilon
         self._returns = np.zeros(env.num_envs)
-        self._lengths = np.zeros(env.num_envs)
+        self._lengths = np.zeros(env.num_envs, np.int64)
         self._obs: Array
         self._chosen: tuple[NDArray[np.int32], float, int]
 

@@ -12,6 +12,7 @@ from common.messaging.messages.weights import Current, Role, Weights
 from common.messaging.transport import NoAnswer, Node
 from common.messaging.wire import Message
 
+UNKNOWN = -1  # a version: no weights, or no role, received yet
 GRACE = 0.5  # seconds to wait for a broadcast before asking for the weights
 ANSWER_TIMEOUT = 2.0  # seconds to wait for each answer
 
@@ -26,8 +27,8 @@ class WeightsFollower:
         self._node = node
         self._policy = policy
         self._size = policy.networks[0].flat.numel()
-        self._held = [-1, -1]
-        self._told = [-1, -1]
+        self._held = [UNKNOWN, UNKNOWN]
+        self._told = [UNKNOWN, UNKNOWN]
         self._ask_at = math.inf  # monotonic time; inf while nothing is missing
         self._keys = [weights_key(node, 1), weights_key(node, 2)]
         self._weights = [node.latest(key) for key in self._keys]
@@ -41,7 +42,7 @@ class WeightsFollower:
     @property
     def ready(self) -> bool:
         """True once both networks have been received."""
-        return min(self._held) >= 0
+        return UNKNOWN not in self._held
 
     def refresh(self) -> None:
         """Load new broadcasts; ask the learner for weights whose broadcast did not arrive."""

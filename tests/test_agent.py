@@ -166,6 +166,14 @@ def test_a_restored_agent_goes_on_to_the_bit() -> None:
     assert first.acting == second.acting
 
 
+@pytest.mark.parametrize("part", ["networks", "optimizers"])
+def test_a_state_of_fewer_networks_is_refused(part: str) -> None:
+    agent = Agent(_config("coop"), SPEC)
+    state = agent.state()
+    with pytest.raises(ValueError, match="shorter"):
+        agent.load_state({**state, part: state[part][:1]})
+
+
 def test_a_device_that_is_not_there() -> None:
     with pytest.raises(UsageError, match=r"learner\.device"):
         Agent(_config("dqn", device="nonsense"), SPEC)

@@ -90,6 +90,20 @@ def test_a_broadcast_that_was_lost_is_asked_for(nodes: tuple[Node, Node], spec: 
     assert_equal(policy, agent)
 
 
+def test_an_actor_that_has_everything_asks_for_nothing(
+    nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner, actor = nodes
+    Broadcaster(learner, Agent(CONFIG, spec))
+    follower = WeightsFollower(actor, make_policy(spec))
+    refresh_until(follower, 0)
+    monkeypatch.setattr("actors.weights.GRACE", 0.02)
+    monkeypatch.setattr(follower, "fetch", lambda: pytest.fail("asked"))
+    end = time.monotonic() + 0.06
+    while time.monotonic() < end:
+        follower.refresh()
+
+
 def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
     learner, actor = nodes
     agent = Agent(CONFIG, spec)
@@ -131,6 +145,8 @@ def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
     mute.undeclare()
     assert policy.acting == 0
     assert follower.version == 4
+    follower.refresh()
+    assert follower.ready == (silent == "role")
 
 
 def test_a_layout_that_differs_is_refused(spec: EnvSpec) -> None:

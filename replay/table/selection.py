@@ -56,13 +56,13 @@ class LowestPriority(Eviction):
             priority, number, row = heapq.heappop(self._heap)
             if self.table.ids[row] == number and self.table.priorities[row] == priority:
                 rows.setdefault(row)
-        return np.array(list(rows)), slice(skipped, count)
+        return np.fromiter(rows, np.intp), slice(skipped, count)
 
     def prioritise(self, rows: Rows) -> None:
         """Add the rows to the heap with their new priorities."""
         if len(self._heap) + len(rows) > 2 * self.table.capacity + 1024:
             held = {row for *_, row in self._heap}
-            rows = np.array(list(held.union(rows.tolist())))
+            rows = np.fromiter(held.union(rows.tolist()), np.intp)
             self._heap.clear()
         entries = zip(self.table.priorities[rows].tolist(), self.table.ids[rows].tolist(), rows.tolist(), strict=True)
         for entry in entries:
