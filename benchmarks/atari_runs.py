@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from common.process.processes import command
+from common.process.summaries import read_summary
 from common.settings.tables import load_tables, resolve, shortened
 from common.types import Array
 
@@ -53,7 +54,7 @@ def play(preset: str, method: str, steps: int, actors: int, folder: Path) -> tup
 
 def report(preset: str, steps: int, folder: Path, memory: Array) -> None:
     """Print the results of a finished run."""
-    summary = json.loads((folder / "summary.json").read_text())
+    summary = read_summary(folder)
     lost, twice = summary["transitions_lost"], summary["duplicates_refused"]
     print(f"  lost {lost}, duplicates refused {twice}, transitions {summary['transitions_accepted']:,}")
     replay = resolve(shortened(load_tables(preset, None), steps)).replay

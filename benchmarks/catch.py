@@ -7,13 +7,13 @@ mean return of its last 100 episodes, played with the run's own epsilon, reaches
 from __future__ import annotations
 
 import argparse
-import json
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 from common.process.processes import command
+from common.process.summaries import read_summary
 
 TARGET, LIMIT = 0.9, 600.0  # return; seconds
 
@@ -30,7 +30,7 @@ def main() -> None:
                 flags = ["--method", method, "--seed", str(seed), "--target-return", str(TARGET), "--run-dir", folder]
                 local = command("coop-local", "--preset", "catch", "--actors", "1", *flags)
                 subprocess.run(local, stdout=subprocess.DEVNULL, check=True)
-                summary = json.loads((Path(folder) / "summary.json").read_text())
+                summary = read_summary(Path(folder))
             reached, seconds = summary["return_mean_100"], summary["wall_seconds"]
             failed += reached < TARGET or seconds > LIMIT
             print(

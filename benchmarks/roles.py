@@ -17,6 +17,7 @@ from common.messaging.keys import replay_key
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.transport import Node
 from common.process.processes import ChildProcess, command
+from common.process.summaries import read_summary
 
 GRACE = 60.0  # seconds for a role to end
 
@@ -75,8 +76,7 @@ class Roles:
             process.end(GRACE)
             if process.exit_status() and not process.was_interrupted():
                 raise RunError(process.why())
-        summary: dict[str, Any] = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
-        return summary
+        return read_summary(self.folder)
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import re
@@ -17,6 +16,7 @@ from common.messaging.transport import new_incarnation
 from common.process import cli
 from common.process.lifecycle import run_main
 from common.process.processes import ChildProcess, command, free_endpoint
+from common.process.summaries import read_summary
 from deploy.status import RunStatus
 
 TICK = 0.05  # seconds
@@ -163,7 +163,7 @@ def _run() -> None:
     proof = subprocess.run(command("coop-reexecute", str(options.run_dir)), capture_output=True, text=True, check=False)
     if proof.returncode:
         raise RunError(proof.stderr.strip())
-    summary = json.loads((options.run_dir / "summary.json").read_text(encoding="utf-8"))
+    summary = read_summary(options.run_dir)
     killed = ", ".join(f"{count} {name.removeprefix('coop-')}" for name, count in monkey.kills.items())
     restarts = log.read_text(encoding="utf-8").count("starting it again")
     for name, value in {

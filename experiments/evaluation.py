@@ -103,6 +103,6 @@ def evaluate_checkpoint(run_dir: Path, episodes: int, seed: int) -> CheckpointEv
     checkpoint = run.checkpoint()
     number = checkpoint.acting + 1
     emulator = np.random.SeedSequence([run.config.seed, 4, seed]).generate_state(1)
-    policy = SavedPolicy(run.config.env, run.policy(1).spec, (checkpoint.networks[checkpoint.acting],))
+    policy = SavedPolicy(run.config.env, checkpoint.spec, (checkpoint.networks[checkpoint.acting],))
     returns = play(policy, run.config.env, episodes, int(emulator[0]))
     return CheckpointEvaluation(returns, checkpoint.epoch, number)

@@ -13,11 +13,9 @@ import numpy as np
 from safetensors.numpy import save
 from torch import nn
 
-from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.process.files import SyncedFile, sync_folder
 from common.settings.config import RunConfig
-from common.types import EnvSpec
 from experiments.export_onnx import NotExportedError, onnx_model, preparation
 from experiments.saved import Checkpoint, SavedRun
 
@@ -54,15 +52,15 @@ def export(run_dir: Path, out: Path) -> Exported:
     """
     run = SavedRun(run_dir)
     _check_folder(out)
-    checkpoint, spec = run.checkpoint(), env_spec(run.config.env)
+    checkpoint = run.checkpoint()
     contents, without_onnx = {}, ""
     for number, network in enumerate(checkpoint.networks, 1):
         contents[f"network-{number}.safetensors"] = save(network.views(network.snapshot()))
         try:
-            contents[f"network-{number}.onnx"] = onnx_model(network, spec)
+            contents[f"network-{number}.onnx"] = onnx_model(network, checkpoint.spec)
         except NotExportedError as error:
             without_onnx = str(error)
-    contents[CARD] = f"{json.dumps(_card(run.config, spec, checkpoint), indent=2)}\n".encode()
+    contents[CARD] = f"{json.dumps(_card(run.config, checkpoint), indent=2)}\n".encode()
     try:
         _write(out, contents)
     except OSError as error:
@@ -70,9 +68,9 @@ def export(run_dir: Path, out: Path) -> Exported:
     return Exported(list(contents), checkpoint.epoch, checkpoint.acting + 1, without_onnx)
 
 
-def _card(config: RunConfig, spec: EnvSpec, checkpoint: Checkpoint) -> dict[str, Any]:
+def _card(config: RunConfig, checkpoint: Checkpoint) -> dict[str, Any]:
     """What a reader needs to use the networks and to make them again, with the names of a run's own files."""
-    environment, returns = asdict(config.env), checkpoint.returns
+    environment, spec, returns = asdict(config.env), checkpoint.spec, checkpoint.returns
     pictures = {name: environment.pop(name) for name in ("stack", "resize", "grayscale")}
     return {
         "environment": environment,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 
 from common.errors import RunError
 from common.process.console import say
@@ -23,7 +24,7 @@ def _run() -> None:
     path = options.directory()
     stop = Stop()
     stop.on_signals()
-    with LockstepRun(config, path, "coop-lockstep", resume=options.resume) as run:
+    with closing(LockstepRun(config, path, "coop-lockstep", resume=options.resume)) as run:
         if options.resume:
             print(beginning(path) if run.epoch is None else f"goes on from epoch {run.epoch.name}", flush=True)
         summary = run.play(stop, lambda line: say(line, end="\r" if sys.stdout.isatty() else "\n"))

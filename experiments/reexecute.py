@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.messaging.messages.sample import DrawRequest
 from common.process.run_ids import read_run_id
+from common.process.summaries import read_summary
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve
@@ -76,9 +76,8 @@ def reexecute(run_dir: Path) -> Outcome:
         raise RunError(f"{folder}: lacks batch {agent.updates} of {expected['updates']}")
     if problem := _difference(agent.state(), expected, "agent"):
         raise RunError(f"{problem} differs from {final}")
-    summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
-    if summary["transitions_accepted"] != core.table.inserted:
-        accepted = summary["transitions_accepted"]
+    accepted = read_summary(run_dir).get("transitions_accepted")
+    if accepted != core.table.inserted:
         raise RunError(f"{folder}: {core.table.inserted:,} transitions, but the run accepted {accepted:,}")
     digest = hashlib.sha256(b"".join(network.snapshot().tobytes() for network in agent.networks)).hexdigest()
     closing = ReplayCore(config, core.table.spec)

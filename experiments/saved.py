@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from common.envs.make import env_spec
 from common.errors import UsageError
 from common.networks.network import FlatNetwork, q_values
+from common.process.summaries import read_summary
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
 from common.settings.tables import load_tables, resolve
@@ -31,11 +31,12 @@ NetworkChoice = Literal["mean", 1, 2]
 class Checkpoint:
     """Both networks of an epoch.
 
-    epoch: its number, in updates. acting: 0 or 1, index of the network that acted and was trained last.
-    env_steps: how many the run had done. returns: of its last episodes, at most 100.
+    epoch: its number, in updates. spec: what the networks know of the environment. acting: 0 or 1, index of the network
+    that acted and was trained last. env_steps: how many the run had done. returns: of its last episodes, at most 100.
     """
 
     epoch: int
+    spec: EnvSpec
     networks: tuple[FlatNetwork, FlatNetwork]
     acting: int
     env_steps: int
@@ -103,9 +104,7 @@ class SavedRun:
     @property
     def summary(self) -> dict[str, Any] | None:
         """The contents of summary.json; None if the run has not ended."""
-        file = self.path / "summary.json"
-        summary: dict[str, Any] | None = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
-        return summary
+        return read_summary(self.path) or None
 
     def checkpoint(self) -> Checkpoint:
         """The networks of the newest epoch; raises UsageError if there is none."""
@@ -118,9 +117,8 @@ class SavedRun:
         for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
             network.load(flat)
         steps = state["drawn"]["inserted"] if "drawn" in state else state["step"]  # the latter in version 0.1.0
-        return Checkpoint(
-            int(epoch.name), (first, second), state["agent"]["acting"], steps, state["telemetry"]["returns"]
-        )
+        returns = state["telemetry"]["returns"]
+        return Checkpoint(int(epoch.name), spec, (first, second), state["agent"]["acting"], steps, returns)
 
     def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
         """The greedy policy of the newest epoch.
@@ -133,10 +131,11 @@ class SavedRun:
         """
         if network not in ("mean", 1, 2):
             raise UsageError(f"network = {network!r}: allowed: 'mean', 1, 2")
-        first, second = self.checkpoint().networks
+        checkpoint = self.checkpoint()
+        first, second = checkpoint.networks
         both = (first, second) if self.config.two_networks else (first,)
         chosen = both if network == "mean" else ((first, second)[network - 1],)
-        return SavedPolicy(self.config.env, env_spec(self.config.env), chosen)
+        return SavedPolicy(self.config.env, checkpoint.spec, chosen)
 
     def q_values(self, obs: ArrayLike, network: NetworkChoice = "mean") -> NDArray[np.float32]:
         """Q-values of `policy(network)`, float32 [actions] or [batch, actions]; for many calls, keep the policy."""

@@ -8,6 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from typing import Any
 from common.errors import RunError, UsageError
 from common.process.lifecycle import Stop
 from common.process.processes import ChildProcess, command
+from common.process.summaries import read_summary
 from common.settings.config import RunConfig, check_distributed
 from common.settings.effects import without_effect
 from common.settings.options import RunOptions
 from common.settings.overrides import leaves, merged
-from common.settings.tables import load_tables, resolve, shortened, to_tables, to_toml, validated
+from common.settings.sources import chosen_config
+from common.settings.tables import to_tables, to_toml, validated
 from experiments.lockstep_run import LockstepRun
 
 POLL = 0.1  # seconds
@@ -55,11 +58,7 @@ class TrainingRun:
     @property
     def summary(self) -> dict[str, Any] | None:
         """The contents of summary.json; None while the run goes on, or if it failed before it wrote one."""
-        file = self.directory / "summary.json"
-        if self.running or not file.exists():
-            return None
-        summary: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        return summary
+        return None if self.running else read_summary(self.directory) or None
 
     def metrics(self) -> Iterator[dict[str, Any]]:
         """Yield the rows of metrics.jsonl, from the first one on, as they are written; ends with the run.
@@ -175,19 +174,22 @@ def _options(
     """The options that the same flags give on a command line."""
     if preset is not None and file is not None:
         raise UsageError("preset and config: give one of them")
-    saved = None if run_dir is None else Path(run_dir, "config.toml")
-    if resume and preset is None and file is None and saved is not None and saved.exists():
-        file = saved
-    tables = load_tables(None if file else preset or "cartpole", Path(file) if file else None)
-    if not file and isinstance(settings.get("total_steps"), int):
-        tables = shortened(tables, settings["total_steps"])
-    chosen = validated(merged(to_tables(resolve(tables, method)), settings))
+    directory = None if run_dir is None else Path(run_dir)
+    steps = settings.get("total_steps")
+    base = chosen_config(
+        preset,
+        None if file is None else Path(file),
+        method,
+        steps if isinstance(steps, int) else None,
+        directory if resume else None,
+    )
+    chosen = validated(merged(to_tables(base), settings))
     values = {field.name: getattr(chosen, field.name) for field in fields(RunConfig)}
-    return RunOptions(**values, run_dir=None if run_dir is None else Path(run_dir), resume=resume)
+    return RunOptions(**values, run_dir=directory, resume=resume)
 
 
 def _play(run: LockstepRun, stop: Stop) -> None:
-    with run:
+    with closing(run):
         run.play(stop)
         if run.diverged:
             raise RunError(run.diverged)

@@ -225,3 +225,18 @@ def repeated(spec: EnvSpec) -> nn.Module:
     """A stack in which a Linear and a ReLU stand twice."""
     layer, relu = nn.Linear(4, 4), nn.ReLU()
     return nn.Sequential(layer, relu, layer, relu, nn.Linear(4, spec.num_actions))
+
+
+class Scaled(nn.Linear):
+    """Has a parameter of another dtype."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs)
+        self.scale = nn.Parameter(torch.ones(1, dtype=torch.float64))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x) * self.scale.float()
+
+
+def mixed(spec: EnvSpec) -> nn.Module:
+    return Scaled(4, spec.num_actions)

@@ -210,7 +210,7 @@ def _frozen() -> nn.Module:
         (nn.Sequential(nn.Linear(5, 4), nn.BatchNorm1d(4), nn.Linear(4, 3)),
          "layer '1' is a BatchNorm1d, in which the samples of a batch meet"),
         (nn.Sequential(nn.Linear(5, 4), nn.InstanceNorm1d(4, track_running_stats=True), nn.Linear(4, 3)),
-         "layer '1' (InstanceNorm1d) has a buffer, 'running_mean'; only parameters are trained"),
+         "layer '1' (InstanceNorm1d) has a buffer, 'running_mean'; only parameters are trained and saved"),
         (nn.Sequential(nn.Unflatten(0, (-1, 2)), nn.Linear(5, 3), nn.Flatten(0, 1)),
          "layer '1' (Linear) gives [3, 2, 3] for a batch of 6; its first axis must be the batch"),
         (_frozen(), "parameter '0.bias' does not require a gradient"),

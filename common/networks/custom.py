@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor, nn
@@ -45,30 +45,30 @@ def _problems(module: object, spec: EnvSpec, inputs: Tensor) -> Iterator[str]:
         given = f"{values.dtype} {list(values.shape)}".removeprefix("torch.") if tensor else type(values).__name__
         yield f"its output is {given} for inputs {list(inputs.shape)}; it must be float32 {expected}"
         return
-    yield from _problems_of_layers(module)
-    yield from _problems_of_parameters(dict(module.named_parameters()))
+    yield from state_problems(module)
+    for name, layer in module.named_modules():
+        if isinstance(layer, nn.modules.dropout._DropoutNd) and layer.training and layer.p > 0:
+            yield f"layer {name!r} is a {type(layer).__name__}; random layers are not supported"
+    for name, parameter in module.named_parameters():
+        if parameter.dtype != torch.float32:
+            yield f"parameter {name!r} is {parameter.dtype}; it must be torch.float32"
+    count, most = sum(parameter.numel() for parameter in module.parameters()), MAX_PAYLOAD // 4 - 2**18
+    if not 0 < count <= most:
+        yield f"it has {count:,} parameters; allowed: 1 to {most:,}, what a message carries"
     if not torch.equal(module(inputs), values):
         yield "its values differ between two calls; random layers are not supported"
     if not torch.allclose(module(inputs[:1]), values[:1], rtol=1e-3, atol=1e-5, equal_nan=True):
         yield "its values of one observation depend on the others in the batch"
 
 
-def _problems_of_layers(module: nn.Module) -> Iterator[str]:
-    """Only parameters are trained, published and saved, so other state would be lost."""
+def state_problems(module: nn.Module) -> Iterator[str]:
+    """What makes a sample's values depend on more than the sample and the parameters that are trained and saved."""
     for name, layer in module.named_modules():
         kind = type(layer).__name__
         if isinstance(layer, nn.modules.batchnorm._BatchNorm):
             yield f"layer {name!r} is a {kind}, in which the samples of a batch meet"
         for buffer, _ in layer.named_buffers(recurse=False):
-            yield f"layer {name!r} ({kind}) has a buffer, {buffer!r}; only parameters are published and saved"
-        if isinstance(layer, nn.modules.dropout._DropoutNd) and layer.training and layer.p > 0:
-            yield f"layer {name!r} is a {kind}; random layers are not supported"
-
-
-def _problems_of_parameters(parameters: Mapping[str, nn.Parameter]) -> Iterator[str]:
-    for name, parameter in parameters.items():
-        if parameter.dtype != torch.float32 or not parameter.requires_grad:
-            yield f"parameter {name!r}: must be float32 and require a gradient"
-    count, most = sum(parameter.numel() for parameter in parameters.values()), MAX_PAYLOAD // 4 - 2**18
-    if not 0 < count <= most:
-        yield f"it has {count:,} parameters; allowed: 1 to {most:,}, what a message carries"
+            yield f"layer {name!r} ({kind}) has a buffer, {buffer!r}; only parameters are trained and saved"
+    for name, parameter in module.named_parameters():
+        if not parameter.requires_grad:
+            yield f"parameter {name!r} does not require a gradient"

@@ -34,15 +34,24 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
         raise UsageError(str(error)) from error
     if known.preset and known.config:
         raise UsageError("--preset and --config: give one of them")
-    preset, file = known.preset, known.config
-    if known.resume and known.run_dir and not (preset or file):
-        saved = known.run_dir / "config.toml"
-        file = saved if saved.exists() else None
-    if not file:
-        preset = preset or "cartpole"
-    tables = load_tables(preset, file)
-    if preset and known.total_steps is not None:
-        tables = shortened(tables, known.total_steps)
-    if file and known.method and "methods" not in tables and known.method != tables.get("method", known.method):
-        warn(f"{file} has no settings for single methods: {known.method} gets those of {tables['method']}")
-    return resolve(tables, known.method)
+    resumed = known.run_dir if known.resume else None
+    return chosen_config(known.preset, known.config, known.method, known.total_steps, resumed)
+
+
+def chosen_config(
+    preset: str | None, file: Path | None, method: str | None, total_steps: int | None, resumed: Path | None
+) -> RunConfig:
+    """The config of a preset or a file; of neither, that of the run in the folder `resumed`, or of the preset cartpole.
+
+    Raises:
+        UsageError: an unknown preset or method, or a bad file.
+    """
+    saved = resumed and not (preset or file) and resumed / "config.toml"
+    if saved and saved.exists():
+        file = saved
+    tables = load_tables(None if file else preset or "cartpole", file)
+    if file is None and total_steps is not None:
+        tables = shortened(tables, total_steps)
+    if file and method and "methods" not in tables and method != tables.get("method", method):
+        warn(f"{file} has no settings for single methods: {method} gets those of {tables['method']}")
+    return resolve(tables, method)

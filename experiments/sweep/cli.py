@@ -14,7 +14,7 @@ from common.process.cli import parse
 from common.process.lifecycle import Stop, run_main
 from experiments.sweep import slurm
 from experiments.sweep.display import SweepDisplay
-from experiments.sweep.folder import CellFolder, claim_folder
+from experiments.sweep.folder import CellFolder, claim_folder, default_folder
 from experiments.sweep.grid import Grid, load_grid
 from experiments.sweep.runner import Runner
 
@@ -38,11 +38,6 @@ class SweepOptions:
     slurm: bool = False
     """Submit the cells as Slurm job arrays instead of running them on this machine."""
 
-    def folder(self) -> Path:
-        """The sweep's folder."""
-        named = Path(self.grid).stem + ("-quick" if self.quick else "")
-        return self.dir or Path("runs") / "sweeps" / named
-
 
 def main() -> None:
     """Entry point."""
@@ -54,7 +49,7 @@ def _run() -> None:
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: must be at least 1")
     grid = load_grid(options.grid, options.quick)
-    folder = options.folder()
+    folder = options.dir or default_folder(options.grid, options.quick)
     cells = _chosen(options, grid, folder)
     claim_folder(grid, cells, folder)
     if options.slurm:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import json
 import os
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -14,6 +13,7 @@ from pathlib import Path
 
 from common.errors import UsageError
 from common.process.locks import FileLock
+from common.process.summaries import read_summary
 from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, resolve, to_toml
 from experiments.sweep.grid import Cell, Grid
@@ -58,10 +58,7 @@ class CellFolder:
 
     def outcome(self) -> str:
         """How its run ended, from summary.json; empty if that does not exist."""
-        try:
-            return str(json.loads((self.path / "summary.json").read_text(encoding="utf-8"))["exit"])
-        except FileNotFoundError:
-            return ""
+        return str(read_summary(self.path).get("exit", ""))
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[int | None]:
@@ -93,6 +90,11 @@ class CellFolder:
         if not rows:
             return Progress(0, 0.0)
         return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
+
+
+def default_folder(grid: str | Path, quick: bool) -> Path:
+    """The folder of a sweep that names none."""
+    return Path("runs") / "sweeps" / (Path(grid).stem + ("-quick" if quick else ""))
 
 
 def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:

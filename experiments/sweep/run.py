@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,8 +12,9 @@ import pandas as pd
 import tomli_w
 
 from common.errors import UsageError
+from common.process.summaries import read_summary
 from common.settings.config import value_of
-from experiments.sweep.folder import CellFolder, claim_folder
+from experiments.sweep.folder import CellFolder, claim_folder, default_folder
 from experiments.sweep.grid import load_grid, parse_grid
 from experiments.sweep.runner import Runner
 
@@ -59,7 +59,7 @@ def sweep(
         checked, path = parse_grid(tomli_w.dumps(grid), str(folder), quick), Path(folder)
     else:
         checked = load_grid(str(grid), quick)
-        path = Path(folder or Path("runs") / "sweeps" / (Path(grid).stem + ("-quick" if quick else "")))
+        path = Path(folder or default_folder(grid, quick))
     cells = [CellFolder(path, cell) for cell in checked.cells]
     claim_folder(checked, cells, path)
     runner = Runner(checked.file, cells, jobs)
@@ -74,5 +74,4 @@ def sweep(
 
 
 def _row(cell: CellFolder, varied: tuple[str, ...]) -> dict[str, Any]:
-    summary: dict[str, Any] = json.loads((cell.path / "summary.json").read_text(encoding="utf-8"))
-    return {**{name: value_of(cell.cell.config, name) for name in varied}, **summary}
+    return {**{name: value_of(cell.cell.config, name) for name in varied}, **read_summary(cell.path)}

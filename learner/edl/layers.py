@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from common.networks.custom import state_problems
 from learner.edl.backprop import Chain
 from learner.edl.graph import Call, Graph, Layer, record
 from learner.edl.passes import Passes, Range, UnsupportedLayerError
@@ -35,7 +36,8 @@ def make_passes(module: nn.Module, example: Tensor | None) -> Passes[Tensor]:
 
 def _examined(module: nn.Module, x: Tensor) -> Graph:
     """The passes with feedback for each Linear and Conv2d that the output depends on."""
-    _check_state(module)
+    if problem := next(state_problems(module), None):
+        raise UnsupportedLayerError(problem)
     candidates = list(_candidates(module))
     _check_sharing(module, candidates)
     # Random weights show what a module does; at the initial ones, some of which may be 0, T may be 0 too.
@@ -56,21 +58,6 @@ def _candidates(module: nn.Module) -> Iterator[Layer]:
         own = {part for part, _ in layer.named_parameters()}
         if kind is not None and type(layer).forward is kind.forward and own in ({"weight"}, {"weight", "bias"}):
             yield Layer(name, layer)
-
-
-def _check_state(module: nn.Module) -> None:
-    """Refuse what makes the values of a sample depend on more than the sample and the parameters."""
-    for name, layer in module.named_modules():
-        kind, buffer = type(layer).__name__, next(iter(dict(layer.named_buffers(recurse=False))), None)
-        if isinstance(layer, nn.modules.batchnorm._BatchNorm):
-            raise UnsupportedLayerError(f"layer {name!r} is a {kind}, in which the samples of a batch meet")
-        if buffer is not None:
-            raise UnsupportedLayerError(
-                f"layer {name!r} ({kind}) has a buffer, {buffer!r}; only parameters are trained"
-            )
-    for name, parameter in module.named_parameters():
-        if not parameter.requires_grad:
-            raise UnsupportedLayerError(f"parameter {name!r} does not require a gradient")
 
 
 def _check_sharing(module: nn.Module, layers: list[Layer]) -> None:

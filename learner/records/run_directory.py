@@ -15,6 +15,7 @@ from common.errors import RunError
 from common.process.console import say
 from common.process.files import LineFile, truncate, write_atomic
 from common.process.run_ids import draw_run_id, read_run_id
+from common.process.summaries import SUMMARY
 from common.settings.config import RunConfig
 from common.settings.tables import to_toml
 from learner.records.curve import draw_learning_curve
@@ -83,7 +84,7 @@ class RunDirectory:
         try:
             for file in (self._episodes, self._metrics):
                 file.finish()
-            write_atomic(self.path / "summary.json", f"{json.dumps(asdict(summary), indent=2)}\n".encode())
+            write_atomic(self.path / SUMMARY, f"{json.dumps(asdict(summary), indent=2)}\n".encode())
         except OSError as error:
             # The message must also say how the run ended.
             raise RunError(f"{self.path}: {error.strerror or error}; how the run ended: {summary.exit}") from error
