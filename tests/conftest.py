@@ -46,15 +46,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _children() -> set[int]:
-    """Processes whose parent is this one."""
+    """Processes whose parent is this one, without those of multiprocessing, which end with it."""
     found = set()
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:
                 parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+                own = b"multiprocessing." in (entry / "cmdline").read_bytes()
             except OSError:
                 continue
-            if parent == os.getpid():
+            if parent == os.getpid() and not own:
                 found.add(int(entry.name))
     return found
 

@@ -5,12 +5,11 @@
 """
 
 import json
-import subprocess
-import sys
 import tarfile
 from pathlib import Path
 
 import pytest
+from commands import run_command
 
 from experiments.evaluation import evaluate_checkpoint
 from experiments.report.study import load_study
@@ -34,15 +33,7 @@ def test_it_is_evaluated_and_reported(earlier: Path) -> None:
 
 
 def test_it_goes_on_and_one_line_says_the_new_names(earlier: Path) -> None:
-    command = [
-        Path(sys.executable).with_name("coop-lockstep"),
-        "--resume",
-        "--run-dir",
-        earlier,
-        "--total-steps",
-        "300",
-    ]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    result = run_command("coop-lockstep", "--resume", "--run-dir", earlier, "--total-steps", "300", check=True)
     (line,) = result.stderr.splitlines()
     assert line.startswith("note: replay.start is now replay.learning_starts, ")
     assert "learner.squared_decay is now learner.beta2, learner.denominator is now learner.eps" in line

@@ -12,6 +12,7 @@ import msgpack
 import numpy as np
 import pytest
 import torch
+from commands import run_command
 from table_reference import whole_state
 
 from common.settings.methods import METHODS
@@ -49,8 +50,8 @@ def test_the_same_bytes_for_a_seed(method: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("method", ["coop", "medqn"])
 def test_killed_and_resumed_to_the_byte(method: str, tmp_path: Path) -> None:
     flags = ["--method", method, "--total-steps", "1500", "--checkpoint-every", "300", "--seed", "4"]
-    whole = subprocess.run([COMMAND, *flags, "--run-dir", str(tmp_path / "a")], capture_output=True, check=True)
-    assert b"complete: 1,500 steps" in whole.stdout
+    whole = run_command("coop-lockstep", *flags, "--run-dir", tmp_path / "a", check=True)
+    assert "complete: 1,500 steps" in whole.stdout
     torn = [COMMAND, *flags, "--run-dir", str(tmp_path / "b")]
     with subprocess.Popen(torn, stdout=subprocess.DEVNULL) as process:
         while not (tmp_path / "b" / "checkpoints" / "600" / "DONE").exists():
@@ -58,23 +59,21 @@ def test_killed_and_resumed_to_the_byte(method: str, tmp_path: Path) -> None:
             time.sleep(0.01)
         process.kill()
     assert not (tmp_path / "b" / "summary.json").exists()
-    resumed = [COMMAND, "--resume", "--run-dir", str(tmp_path / "b")]  # the rest it finds there
-    subprocess.run(resumed, capture_output=True, check=True)
+    run_command("coop-lockstep", "--resume", "--run-dir", tmp_path / "b", check=True)  # the rest it finds there
     episodes = [(tmp_path / name / "episodes.csv").read_bytes() for name in "ab"]
     assert episodes[0] == episodes[1]
 
 
 def test_a_run_without_an_ended_episode_says_so(tmp_path: Path) -> None:
-    flags = ["--total-steps", "5", "--replay.learning_starts", "4", "--run-dir", str(tmp_path / "run")]
-    done = subprocess.run([COMMAND, *flags], capture_output=True, text=True, check=True)
+    flags = ["--total-steps", "5", "--replay.learning_starts", "4", "--run-dir", tmp_path / "run"]
+    done = run_command("coop-lockstep", *flags, check=True)
     assert "updates, no episode ended, " in done.stdout
     assert not (tmp_path / "run" / "learning_curve.png").exists()
 
 
 def test_resume_starts_goes_on_or_refuses(tmp_path: Path) -> None:
     def resume(*flags: str) -> tuple[int, str, str]:
-        command = [COMMAND, "--resume", "--run-dir", str(tmp_path / "a"), *flags]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = run_command("coop-lockstep", "--resume", "--run-dir", tmp_path / "a", *flags)
         return done.returncode, done.stdout, done.stderr
 
     short = ("--total-steps", "300", "--replay.learning-starts", "40")
@@ -116,8 +115,7 @@ def test_roles_swap_by_steps_and_start_anew_with_each_episode(tmp_path: Path) ->
 @pytest.mark.parametrize("flags", [["--learner.swap-unit", "steps"], ["--learner.reset-role-at-episode"]])
 @pytest.mark.parametrize("name", ["coop-learner", "coop-local"])
 def test_roles_in_processes_have_no_plays(name: str, flags: list[str], tmp_path: Path) -> None:
-    command = [Path(COMMAND).with_name(name), *flags, "--run-dir", tmp_path / "run"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    result = run_command(name, *flags, "--run-dir", tmp_path / "run")
     assert result.returncode == 2
     assert "in lockstep runs only" in result.stderr
     assert not (tmp_path / "run").exists()
@@ -132,8 +130,8 @@ def test_roles_in_processes_have_no_plays(name: str, flags: list[str], tmp_path:
     ],
 )
 def test_a_target_ends_the_run(flags: list[str], column: str, value: int, tmp_path: Path) -> None:
-    command = [COMMAND, "--method", "dqn", "--total-steps", "4000", *flags, "--run-dir", tmp_path / "run"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    method = ["--method", "dqn", "--total-steps", "4000"]
+    result = run_command("coop-lockstep", *method, *flags, "--run-dir", tmp_path / "run", check=True)
     name = flags[0].removeprefix("--").replace("-", "_")
     assert result.stdout.rstrip().splitlines()[-1].startswith(f"complete: {name} reached")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -144,8 +142,7 @@ def test_a_target_ends_the_run(flags: list[str], column: str, value: int, tmp_pa
 @pytest.mark.parametrize("program", ["coop-lockstep", "coop-local"])
 def test_a_run_that_diverges_ends_and_says_so(program: str, tmp_path: Path) -> None:
     flags = ["--total-steps", "2000", "--checkpoint-every", "100", "--learner.learning-rate", "1e30"]
-    command = [Path(COMMAND).with_name(program), *flags, "--run-dir", tmp_path / "run"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = run_command(program, *flags, "--run-dir", tmp_path / "run")
     assert done.returncode == 1
     assert "diverged: " in done.stderr
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -206,13 +203,10 @@ def test_steps_that_wait_for_their_return_come_back_with_a_resumed_run(tmp_path:
 
 
 def test_processes_do_not_go_on_with_a_lockstep_run(tmp_path: Path) -> None:
-    flags = ["--total-steps", "300", "--run-dir", str(tmp_path / "run")]
-    learner, lockstep = (Path(sysconfig.get_path("scripts"), name) for name in ("coop-learner", "coop-lockstep"))
-    subprocess.run([lockstep, *flags], check=True, capture_output=True, timeout=60)
+    flags = ["--total-steps", "300", "--run-dir", tmp_path / "run"]
+    run_command("coop-lockstep", *flags, check=True)
     before = {path: path.read_bytes() for path in tmp_path.rglob("[!.]*") if path.is_file()}
-    done = subprocess.run(
-        [learner, *flags, "--resume"], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
-    )
+    done = run_command("coop-learner", *flags, "--resume", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("coop-learner: error: ")
     assert done.stderr.endswith("saved by a lockstep run; coop-lockstep --resume goes on with it\n")

@@ -2,13 +2,13 @@
 
 import json
 import subprocess
-import sysconfig
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from commands import run_command
 
 from actors.policy import Policy
 from common.errors import UsageError
@@ -157,9 +157,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def _command(folder: Path, name: str) -> subprocess.CompletedProcess[str]:
-    flags = ["--network.kind", "my_nets:make", "--total-steps", "200", "--run-dir", name]
-    command = [str(Path(sysconfig.get_path("scripts")) / name), *flags]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=110)
+    return run_command(name, "--network.kind", "my_nets:make", "--total-steps", "200", "--run-dir", name, cwd=folder)
 
 
 @pytest.mark.parametrize("name", ["coop-lockstep", "coop-local"])

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 import my_envs
 import pytest
+from commands import run_command
 
 from common.errors import RunError
 from common.process.processes import free_endpoint
@@ -39,9 +40,7 @@ def folder(tmp_path: Path) -> Path:
 
 def run(folder: Path, name: str, *flags: str) -> subprocess.CompletedProcess[str]:
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    return subprocess.run(
-        [SCRIPTS / name, *flags], cwd=folder, env=environment, capture_output=True, text=True, timeout=280, check=False
-    )
+    return run_command(name, *flags, cwd=folder, environment=environment, timeout=280)
 
 
 @pytest.mark.parametrize(("env_id", "network"), [("Room", "nips2013"), ("Planes", "minatar")])

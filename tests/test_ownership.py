@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from commands import run_command
 from samples import make_segment
 from test_epochs import CONFIG, save
 
@@ -146,8 +147,7 @@ def test_a_supervisor_s_locks_are_its_children_s_too(tmp_path: Path) -> None:
 def test_commands_respect_the_lock(name: str, flags: list[str], tmp_path: Path) -> None:
     with RunLock(tmp_path, "coop-learner", ("learner",)):
         before = contents(tmp_path)
-        command = [str(SCRIPTS / name), "--run-dir", str(tmp_path), "--resume", *flags]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+        done = run_command(name, "--run-dir", tmp_path, "--resume", *flags)
         place = f"coop-learner on {os.uname().nodename} (pid {os.getpid()})"
         assert done.stderr == f"{name}: error: run directory {tmp_path}: in use by {place}\n"
         assert done.returncode == 1

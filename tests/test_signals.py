@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from commands import run_command
 from test_topology import lines, running, wait_for
 
 from common.errors import PeerLost
@@ -51,7 +52,7 @@ def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
     assert (run.returncode, err) == (143, "")
     assert out.splitlines()[-1].startswith("interrupted: ")
     assert json.loads((path / "summary.json").read_text())["exit"] == "interrupted"
-    done = subprocess.run([SCRIPTS / "coop-lockstep", *flags], capture_output=True, text=True, timeout=90, check=False)
+    done = run_command("coop-lockstep", *flags)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("goes on from epoch ")
 
