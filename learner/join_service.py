@@ -90,6 +90,10 @@ class JoinService:
         for key in {join_key(node, role) for role in JOINING}:  # each with its own thread
             node.serve(key, partial(self._answer, key))
 
+    def connected(self) -> dict[str, int]:
+        """Number of connected processes by role; a replay service that was not admitted does not count."""
+        return {**self._node.presence.counts(), "replay": int(self._roster.serving in self._replays_there())}
+
     def _answer(self, key: str, message: Message) -> bytearray:
         if message.kind == Leave.kind:
             return self._leave(key, Leave.decode(message).incarnation)
@@ -123,10 +127,12 @@ class JoinService:
 
     def _admit(self, request: Join) -> int:
         """Admit a replay service, and send actors to it; return its number. Raises as `Roster.replay`."""
-        there = {int(incarnation, 16) for incarnation in self._node.presence.members("replay")}
-        index = self._roster.replay(request, time.monotonic(), there)
+        index = self._roster.replay(request, time.monotonic(), self._replays_there())
         self._replay_endpoints, self._replay = request.endpoints, request.origin
         return index
+
+    def _replays_there(self) -> set[int]:
+        return {int(incarnation, 16) for incarnation in self._node.presence.members("replay")}
 
     def _leave(self, key: str, incarnation: int) -> bytearray:
         if incarnation == self._roster.serving:

@@ -137,7 +137,7 @@ class LearnerService:
 
     def _members(self) -> dict[str, Any]:
         return {
-            "connected": self._node.presence.counts(),
+            "connected": self._join_service.connected(),
             "missing": self._join_service.members.missing(time.monotonic()),
             "events": self._console.recent(),
         }

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from common.errors import RunError, UsageError
-from common.messaging.endpoints import unknown_hosts
+from common.messaging.endpoints import check_endpoints, unknown_hosts
 from common.messaging.joining import join
 from common.messaging.messages.join import Join
 from common.messaging.transport import Node, open_session
@@ -56,4 +56,6 @@ def test_who_can_t_join_is_told_of_a_host_that_is_not_known() -> None:
 
 
 def test_addresses_and_files_are_known_hosts() -> None:
-    assert unknown_hosts(["tcp/127.0.0.1:1", "tls/[::1]:7447", "unixsock-stream//tmp/x", "tcp/localhost:1?x=1"]) == []
+    known = ["tcp/127.0.0.1:1", "tls/[::1]:7447", "unixsock-stream//tmp/x", "tcp/localhost:1?x=a:b", "tcp/[::1]:1#x=1"]
+    check_endpoints(known)
+    assert unknown_hosts(known) == []

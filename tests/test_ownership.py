@@ -87,22 +87,26 @@ def test_a_new_folder_is_the_run_s_from_its_first_write(tmp_path: Path) -> None:
         assert read_run_id(folder.path) == 5
         with pytest.raises(RunError, match=rf"in use by coop-replay on .* \(pid {os.getpid()}\)"):
             folder.lock()
+    other = ReplayFolder(folder.path, 6)
     with pytest.raises(RunError, match="belongs to another run"):
-        ReplayFolder(folder.path, 6).lock()
+        other.check(resume=True)
+    with pytest.raises(RunError, match="belongs to another run"):
+        other.lock()
 
 
 HOLD = """
-import sys, time
+import sys
 from pathlib import Path
 from common.process.locks import RunLock
 with RunLock(Path(sys.argv[1]), "coop-lockstep", ("learner", "replay")):
     print("held", flush=True)
-    time.sleep(600)
+    sys.stdin.read()
 """
 
 
 def test_a_live_run_directory_is_locked_and_free_at_death(tmp_path: Path) -> None:
-    with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
+    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
         before = contents(tmp_path)
@@ -124,15 +128,14 @@ def test_a_live_run_directory_is_locked_and_free_at_death(tmp_path: Path) -> Non
 
 
 def test_a_supervisor_s_locks_are_its_children_s_too(tmp_path: Path) -> None:
-    code = HOLD.replace("time.sleep(600)", "")
     with RunLock(tmp_path, "coop-local", ("learner", "replay")) as lock:
-        command = [sys.executable, "-c", code, str(tmp_path)]
+        command = [sys.executable, "-c", HOLD, str(tmp_path)]
         told = {**os.environ, INHERITED: ",".join(map(str, lock.descriptors))}
         child = subprocess.run(
-            command, pass_fds=lock.descriptors, env=told, capture_output=True, text=True, check=False
+            command, pass_fds=lock.descriptors, env=told, input="", capture_output=True, text=True, check=False
         )
         assert (child.returncode, child.stdout) == (0, "held\n"), child.stderr
-        stranger = subprocess.run(command, capture_output=True, text=True, check=False)
+        stranger = subprocess.run(command, input="", capture_output=True, text=True, check=False)
         assert f"in use by coop-local on {os.uname().nodename} (pid {os.getpid()})" in stranger.stderr
 
 

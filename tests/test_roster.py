@@ -56,6 +56,9 @@ def test_a_learner_that_comes_back_knows_who_serves(tmp_path: Path) -> None:
     with pytest.raises(AlreadyServed, match="host2"):
         again.replay(replay(3), 20.1, {3})
     assert again.replay(replay(2, index=1), 20.2, {2}) == 1
+    again.dismiss(1)
+    with pytest.raises(AlreadyServed):
+        again.replay(replay(3), 20.3, {3})
     again.dismiss(2)
     with pytest.raises(AlreadyServed):
         again.replay(replay(3), 20.3, {2, 3})

@@ -6,17 +6,20 @@ import signal
 import socket
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+import zenoh
 from samples import await_service, make_segment
 from test_topology import lines, running, wait_for
 
 from common.messaging.clients import InsertClient
-from common.messaging.keys import replay_key
+from common.messaging.keys import replay_key, status_key
 from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import DrawRequest
+from common.messaging.messages.status import LearnerStatus
 from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.process.lifecycle import Stop
@@ -60,8 +63,13 @@ def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_
         ReplayService(node, core, ReplayEpochs(tmp_path, 5)).start()
         return node
 
+    def open_route(endpoints: Sequence[str]) -> zenoh.Session:
+        opened.append(endpoints)
+        return open_session((), endpoints)
+
+    opened: list[Sequence[str]] = []
     first = serve(at[0])
-    with ReplayRoute("test", 7, lambda endpoints: open_session((), endpoints), at[:1]) as route:
+    with ReplayRoute("test", 7, open_route, at[:1]) as route:
         wait_for("the first", lambda: route.is_up)
         stop = Stop()
         inserts = InsertClient(route, stop, window=1)
@@ -75,11 +83,13 @@ def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_
         with serve(at[1]):
             route.follow([])  # as long as the learner knows of no other
             assert not route.is_up
-            route.follow(at[1:])
+            for _ in range(2):
+                route.follow(at[1:])
             found = inserts.drain()
             given_up.cancel()
             assert found
             assert route.is_up
+            assert opened == [at[:1], at[1:]]
     assert core.table.inserted == 8
 
 
@@ -94,8 +104,17 @@ def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path
         running("coop-actor", *joining) as actor,
     ):
         wait_for("the first metrics", lambda: lines(metrics) >= 1, 120)
-        with running("coop-replay", *joining, "--run-dir", str(tmp_path / "second")) as second:
+        serving: list[int] = []
+        with (
+            Node(open_session((), (endpoint,)), "hand", "watch", new_incarnation()) as watcher,
+            running("coop-replay", *joining, "--run-dir", str(tmp_path / "second")) as second,
+        ):
+            watcher.session.declare_subscriber(
+                status_key(watcher, "learner"),
+                lambda sample: serving.append(LearnerStatus.decode(watcher.read(sample.payload)).connected["replay"]),
+            )
             _, err = second.communicate(timeout=60)
+        assert set(serving) == {1}, "the second does not count"
         assert second.returncode == 1
         host = socket.gethostname()
         assert f"run 'hand': the replay service on {host} (pid {first.pid}) serves this run\n" in err

@@ -24,8 +24,8 @@ def encode_status(run: str, status: dict[str, Any]) -> bytearray:
 class LearnerStatus(msgspec.Struct, frozen=True):
     """The part of the learner's status that displays need.
 
-    connected: number of processes by role. missing: lost processes. events: the newest lines of its console, with
-    increasing numbers. origin: its host and process id.
+    connected: number of processes by role, of the replay services only the one that serves. missing: lost processes.
+    events: the newest lines of its console, with increasing numbers. origin: its host and process id.
     """
 
     env_steps: Counter
