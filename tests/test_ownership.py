@@ -128,15 +128,23 @@ def test_a_live_run_directory_is_locked_and_free_at_death(tmp_path: Path) -> Non
 
 
 def test_a_supervisor_s_locks_are_its_children_s_too(tmp_path: Path) -> None:
-    with RunLock(tmp_path, "coop-local", ("learner", "replay")) as lock:
-        command = [sys.executable, "-c", HOLD, str(tmp_path)]
-        told = {**os.environ, INHERITED: ",".join(map(str, lock.descriptors))}
-        child = subprocess.run(
-            command, pass_fds=lock.descriptors, env=told, input="", capture_output=True, text=True, check=False
-        )
-        assert (child.returncode, child.stdout) == (0, "held\n"), child.stderr
-        stranger = subprocess.run(command, input="", capture_output=True, text=True, check=False)
-        assert f"in use by coop-local on {os.uname().nodename} (pid {os.getpid()})" in stranger.stderr
+    command = [sys.executable, "-c", HOLD, str(tmp_path / "run")]
+    refused = f"in use by coop-local on {os.uname().nodename} (pid {os.getpid()})"
+    with (
+        RunLock(tmp_path / "run", "coop-local", ("learner", "replay")) as lock,
+        RunLock(tmp_path / "other", "coop-local", ("learner", "replay")) as other,
+    ):
+        for held, out, problem in (
+            (lock.descriptors, "held\n", ""),
+            (other.descriptors, "", refused),
+            ((), "", refused),
+        ):
+            told = {**os.environ, INHERITED: ",".join(map(str, held))}
+            child = subprocess.run(
+                command, pass_fds=held, env=told, input="", capture_output=True, text=True, check=False
+            )
+            assert child.stdout == out, child.stderr
+            assert problem in child.stderr
 
 
 @pytest.mark.parametrize(
