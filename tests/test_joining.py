@@ -131,8 +131,10 @@ def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, m
     leave_run(actor, Join("actor", 3, []))
     with pytest.raises(JoinError, match=r"the replay service on rep \(pid 8\) has taken over from this one"):
         join(actor, Stop(), replace(service, index=0), (), 5)
+    payload = Leave(6).encode("test")
+    assert actor.ask(join_key(actor, "replay"), payload).kind == "retry", "another one's departure was granted"
     join_service.departure.end()
-    leave_run(actor, other)
+    assert actor.ask(join_key(actor, "replay"), payload).kind == "farewell"
     assert events == [
         "replay service on rep (pid 7) joined; it listens on tcp/rep:1",
         "replay service on rep (pid 8) joined; it listens on tcp/rep:1",
@@ -163,6 +165,7 @@ def test_restarts_are_bounded_and_slow_down() -> None:
     policy, now, pauses = RestartPolicy(), 100.0, []
     while policy.ended(now):
         assert policy.at is not None
+        assert len(pauses) < RESTARTS
         assert not policy.due(policy.at - 0.01)
         pauses.append(policy.at - now)
         now = policy.at

@@ -31,6 +31,8 @@ from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
 from replay.service import ReplayService
 
+pytestmark = pytest.mark.timeout(300)  # processes that start one after the other, also on a busy machine
+
 
 def test_a_service_that_is_not_confirmed_neither_acknowledges_nor_draws(
     nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path
