@@ -26,11 +26,11 @@ class FrameBlock:
         self._allocate()
         # Row numbers, in `_free` and `_pushed`, count through all streams: stream * capacity + row.
         self._free = self._first.copy()
-        self._pushed = np.empty((max_steps, num_envs), np.int64)
+        # The stacks at the start of the round, then the row that each step pushed.
+        self._pushed = np.zeros((spec.stack + max_steps, num_envs), np.int64)
         self._windows = np.arange(max_steps + 1)[:, None] + np.arange(spec.stack)
         self._steps = 0
         self._most = 0  # upper bound of the rows of any stream, kept without reading arrays
-        self._current: Rows = np.zeros((spec.stack, num_envs), np.int32)  # stacks at the start of the round
         self._past: Rows = np.zeros((num_envs, history, spec.stack), np.int32)  # stacks of the steps before the round
         self._restarts: list[tuple[int, int, list[int]]] = []  # steps before it, stream, rows of the new stack
 
@@ -39,7 +39,7 @@ class FrameBlock:
         if self._most == self._capacity:
             self._reserve(1)
         self._flat[self._free] = obs[:, -1] if self._spec.stack > 1 else obs
-        self._pushed[self._steps] = self._free
+        self._pushed[self._spec.stack + self._steps] = self._free
         self._free += 1
         self._most += 1
         self._steps += 1
@@ -76,16 +76,18 @@ class FrameBlock:
         """
         of_round, next_index = self._indices()
         obs_index = np.concatenate((self._past, of_round), axis=1) if self._history else of_round
-        used = self._free - self._first
-        frames = [frames[:count] for frames, count in zip(self._frames, used.tolist(), strict=True)]
         current = obs_index.shape[1] - 1
-        first = obs_index[np.arange(self._num_envs), current - np.array(waiting), 0]
-        kept: list[int] = (used - first).tolist()
+        first = [int(rows[current - count, 0]) for rows, count in zip(obs_index, waiting, strict=True)]
+        used: list[int] = (self._free - self._first).tolist()
+        kept = [count - row for count, row in zip(used, first, strict=True)]
+        frames = [frames[:count] for frames, count in zip(self._frames, used, strict=True)]
         self._allocate()
         for stream, count in enumerate(kept):
             self._frames[stream, :count] = frames[stream][-count:]
-        self._current = (obs_index[:, -1] - first[:, None]).T
-        self._past = obs_index[:, current - self._history : current] - first[:, None, None]
+        moved = self._first - first
+        self._pushed[: self._spec.stack] = obs_index[:, -1].T + moved
+        if self._history:
+            self._past = obs_index[:, current - self._history : current] - np.array(first, np.int32)[:, None, None]
         self._free = self._first + kept
         self._most = max(kept)
         self._steps = 0
@@ -95,10 +97,9 @@ class FrameBlock:
     def _indices(self) -> tuple[Rows, Rows]:
         """Rows of obs, int32 [envs, steps + 1, stack] (last: the next step's), and next_obs, [envs, steps, stack]."""
         stack = self._spec.stack
-        pushed = self._pushed[: self._steps] - self._first
-        rows = np.concatenate([self._current, pushed.astype(np.int32)])
-        windows = rows.T.take(self._windows[: self._steps + 1], axis=1)
-        obs_index, next_index = windows, windows[:, 1:].copy()
+        rows = (self._pushed[: stack + self._steps] - self._first).astype(np.int32)
+        obs_index = rows.T.take(self._windows[: self._steps + 1], axis=1)
+        next_index = obs_index[:, 1:].copy() if self._restarts else obs_index[:, 1:]
         for steps, stream, stacked in self._restarts:
             # `later` steps after the restart, the stack still begins with the new stack's frames from `later` on.
             for later in range(min(stack, self._steps + 1 - steps)):
@@ -117,7 +118,7 @@ class FrameBlock:
         self._frames[:, :before] = old
         shift = self._first - first
         self._free += shift
-        self._pushed[: self._steps] += shift
+        self._pushed[: self._spec.stack + self._steps] += shift
 
     def _allocate(self) -> None:
         self._first = np.arange(self._num_envs) * self._capacity  # row of each stream's first frame

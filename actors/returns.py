@@ -27,7 +27,7 @@ def n_step_returns(
     """
     steps = np.arange(len(rewards))[:, None]
     if n == 1:
-        return np.broadcast_to(steps, rewards.shape), rewards
+        return steps.repeat(rewards.shape[1], axis=1), rewards
     following = np.where(ends, steps, len(rewards) + n)[::-1]  # the step that ends the episode, if there is one
     last = np.minimum(steps + n - 1, np.minimum.accumulate(following)[::-1])
     returns: Array = rewards.astype(np.float64)

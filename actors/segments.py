@@ -45,6 +45,7 @@ class SegmentAssembler:
         self._terminated = np.zeros(shape, np.bool_)
         self._ends = np.ones(shape, np.bool_)  # no transition waits before the first step
         self._versions = np.zeros(shape[0], np.int64)
+        self._before = np.arange(-1, shape[0] - 1)  # the step before each row's
         self._episodes: dict[int, list[EpisodeEnd]] = {}
         self._waiting = [0] * num_envs  # number of each stream's earlier steps whose transitions are not complete
         self._carried = [0] * num_envs
@@ -85,11 +86,12 @@ class SegmentAssembler:
             return []
         history, end = self._history, self._history + steps
         last, returns = n_step_returns(self._rewards[:end], self._ends[:end], self._n_step, self._gamma)
-        waiting: list[int] = (last >= end).sum(axis=0).tolist()
+        stops = [int(spanned.searchsorted(end)) for spanned in last.T]  # `last` never decreases
+        waiting = [end - stop for stop in stops]
         frames, obs_index, next_index, kept = self._frames.cut(waiting)
         segments = []
-        for stream in range(self._num_envs):
-            first, stop = history - self._waiting[stream], end - waiting[stream]
+        for stream, stop in enumerate(stops):
+            first = history - self._waiting[stream]
             if first < stop:
                 final = last[first:stop, stream]
                 segments.append(
@@ -99,19 +101,19 @@ class SegmentAssembler:
                         sequence=self._sequences[stream],
                         frames=frames[stream],
                         obs_index=obs_index[stream, first:stop],
-                        next_index=next_index[stream, final - history],
+                        next_index=next_index[stream].take(final - history, axis=0),
                         actions=self._actions[first:stop, stream].copy(),
                         rewards=returns[first:stop, stream].copy(),
-                        terminated=self._terminated[final, stream],
+                        terminated=self._terminated[:, stream].take(final),
                         param_version=self._versions[first:stop].copy(),
-                        span=(final - np.arange(first - 1, stop - 1)).astype(np.uint8),
+                        span=(final - self._before[first:stop]).astype(np.uint8),
                         carried=self._carried[stream],
                         episodes=tuple(self._episodes.get(stream, ())),
                     )
                 )
                 self._sequences[stream] += 1
                 self._carried[stream] = kept[stream]
-            self._waiting[stream] = waiting[stream]
+        self._waiting = waiting
         self._episodes = {}
         if history:
             for column in (self._actions, self._rewards, self._terminated, self._ends, self._versions):

@@ -12,6 +12,7 @@ from common.types import Array
 from replay.table.frames import PinnedFrames
 
 REUSE_BUCKETS = 16
+_BUCKETS = 2 ** np.arange(REUSE_BUCKETS - 1, dtype=np.int32)  # the fewest draws of each bucket but the first
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,5 +52,4 @@ class TableSnapshot(NamedTuple):
 
 def reuse_histogram(reuse: NDArray[np.int32]) -> NDArray[np.intp]:
     """Transitions by the bit length of their draws: int [REUSE_BUCKETS], the last entry open-ended."""
-    bit_length = np.frexp(reuse.astype(np.float64))[1]
-    return np.bincount(np.minimum(bit_length, REUSE_BUCKETS - 1), minlength=REUSE_BUCKETS)
+    return np.bincount(_BUCKETS.searchsorted(reuse, "right"), minlength=REUSE_BUCKETS)

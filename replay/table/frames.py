@@ -72,11 +72,11 @@ class FrameStore:
 
     def hold(self, slots: Slots, references: NDArray[np.intp] | int = 1) -> None:
         """Add references to distinct slots that are already held."""
-        self._references[slots] += np.asarray(references, np.int32)
+        self._references[slots] += references
 
     def drop(self, slots: Slots) -> None:
         """Remove one reference for each occurrence of a slot; slots without references become free."""
-        np.subtract.at(self._references, slots, np.int32(1))
+        np.subtract.at(self._references, slots, 1)
         gone = slots[self._references[slots] == 0]
         if len(gone):
             if len(gone) > 1:

@@ -40,12 +40,13 @@ class StreamTails:
         shared = min(segment.carried, len(previous)) if sequence == segment.sequence - 1 else 0
         slots[segment.carried - shared : segment.carried] = previous[len(previous) - shared :]
         known = slots >= 0
-        tail = max(0, count - max(self._stack, segment.carried))
-        references[tail:] += known[tail:] | (references[tail:] > 0)
         wanted = references > 0
+        tail = max(0, count - max(self._stack, segment.carried))
+        wanted[tail:] |= known[tail:]
+        references[tail:] += wanted[tail:]
         again = (wanted & known).nonzero()[0]
         self._frames.hold(slots[again], references[again])
-        new = (wanted & ~known).nonzero()[0]
+        new = (wanted > known).nonzero()[0]
         slots[new] = self._frames.add(segment.frames[as_slice(new)], references[new])
         self._tails[stream] = segment.sequence, slots[tail:].copy()
         if len(self._tails) > MAX_STREAMS:
