@@ -78,6 +78,7 @@ class Lockstep:
             size=len(table),
             evicted=table.evicted,
             evicted_unsampled=table.evicted_unsampled,
+            terminal=table.terminal,
         )
         for _ in range(self._updates_due()):
             batch = table.sample(learner.batch_size)

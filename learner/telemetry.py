@@ -73,6 +73,7 @@ class Telemetry:
             "updates_per_s": (agent.updates - updates) / seconds,
             "env_steps_per_s": (drawn.inserted - steps) / seconds,
             "replay_size": drawn.size,
+            "terminal_share": drawn.terminal / max(1, drawn.size),
             "sample_age_mean": float(age.mean()),
             "sample_age_p95": float(np.percentile(age, 95)),
             "reuse_mean": float(reuse.mean()),

@@ -180,6 +180,7 @@ class ReplayCore:
             first_episode=first,
             episodes=episodes,
             planned=self.limiter.draws_total or 0,
+            terminal=table.terminal,
         )
         self._forget([request.sequence])
         self._replies[request.sequence] = reply = Reply(batch, drawn)

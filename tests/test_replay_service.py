@@ -55,7 +55,7 @@ def test_receipts_duplicates_and_reasons(nodes: tuple[Node, Node], spec: EnvSpec
     assert 0.5 < time.monotonic() - began < 4
     assert Retry.decode(reply).reason == "waiting for 8 transitions, have 0"
 
-    first = encode_segment("test", make_segment(spec, 0))
+    first = encode_segment("test", make_segment(spec, 0, terminated=np.arange(4) == 3))
     assert Ack.decode(client.ask(key, first)).inserted == 4
     assert Ack.decode(client.ask(key, first)).inserted == 4, "a retry is acknowledged and not taken twice"
     for sequence in range(1, 5):
@@ -67,6 +67,7 @@ def test_receipts_duplicates_and_reasons(nodes: tuple[Node, Node], spec: EnvSpec
     again = client.ask(replay_key(client, "sample"), sample)
     for name in ("ids", "frames", "obs_index"):
         np.testing.assert_array_equal(drawn.arrays[name], again.arrays[name])
+    assert (drawn.fields["size"], drawn.fields["terminal"]) == (20, 1)
     stats = service.stats()
     assert (stats.inserted, stats.drawn, stats.duplicates, stats.lost, stats.episodes) == (20, 1, 1, 0, 5)
     question = StatsQuestion().encode("test")

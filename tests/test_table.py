@@ -81,6 +81,7 @@ def test_equals_a_list_of_copies(case: dict[str, Any], steps: list[tuple[str, in
         assert stats.evicted_unsampled == copies.evicted_unsampled
         assert stats.evicted == stats.inserted - stats.size == sum(stats.reuse_evicted)
         assert sum(stats.reuse_held) == stats.size
+        assert table.terminal == sum(bool(terminated) for *_, terminated, _ in copies.held.values())
 
 
 @settings(max_examples=settings.default.max_examples // 2)
@@ -113,6 +114,7 @@ def test_restored_table_continues_to_the_bit(
             for one in (table, twin):
                 one.update_priorities(batch.ids, batch.rewards)
         assert held_ids(table) == held_ids(twin)
+        assert table.terminal == twin.terminal
     check_references(twin)
 
 

@@ -18,6 +18,19 @@ from replay.table import streams
 from replay.table.table import Table
 
 
+def test_terminal_transitions_are_counted_as_they_come_and_go(spec: EnvSpec) -> None:
+    """Two segments wrap around a table of five; a third is longer than the table, which keeps its last five."""
+    table = Table(spec, 5, rng=np.random.default_rng(0))
+    counts = []
+    for sequence, ends in enumerate(([1, 0, 1], [0, 1, 1], [0, 0, 1, 0, 0, 0, 1])):
+        table.insert(make_segment(spec, sequence, len(ends), terminated=np.array(ends, np.bool_), carried=0))
+        counts.append(table.terminal)
+    assert counts == [2, 3, 2]  # of 101, 01011 and 10001
+    restored = Table(spec, 5, rng=np.random.default_rng(0))
+    restored.load_state(*whole_state(table))
+    assert restored.terminal == 2
+
+
 @pytest.mark.parametrize("stack", [1, 4])
 def test_each_frame_is_held_once(stack: int) -> None:
     """Through segment borders and eviction, with every segment delivered, only frames in use are held."""

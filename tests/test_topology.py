@@ -24,8 +24,9 @@ SCRIPTS = Path(sysconfig.get_path("scripts"))
 EPISODES = "episode,env_step,update,actor,stream,return,length,epsilon,s,q1_mean,q2_mean,param_version"
 METRICS = [
     *("time", "env_step", "update", "acting", "td_error", "loss", "s", "epsilon", "q_gap", "q1_mean", "q2_mean"),
-    *("q_abs_mean", "q_bound", "updates_per_s", "env_steps_per_s", "replay_size", "sample_age_mean", "sample_age_p95"),
-    *("reuse_mean", "reuse_histogram", "distinct_share", "evicted_unsampled", "weight_lag_mean"),
+    *("q_abs_mean", "q_bound", "updates_per_s", "env_steps_per_s", "replay_size", "terminal_share"),
+    *("sample_age_mean", "sample_age_p95", "reuse_mean", "reuse_histogram", "distinct_share"),
+    *("evicted_unsampled", "weight_lag_mean"),
 ]
 SILENT = r"(?m)^\d\d:\d\d:\d\d replay service on \S+ \(pid \d+\) does not answer$"
 SUMMARY = [

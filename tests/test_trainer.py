@@ -39,7 +39,7 @@ def drawn(inserted: int = 200, *returns: float, planned: int = 9_000) -> Drawn:
     """The counters that come with a batch, and episodes of these returns."""
     ends = [EpisodeEnd(0, value, 9, 0.1, 0.2, 0.3, 5) for value in returns]
     records = tuple(EpisodeRecord(inserted - 1, 77, 0, end) for end in ends)
-    return Drawn(0, inserted, 80, 20, 5, 0, records, planned)
+    return Drawn(0, inserted, 80, 20, 5, 0, records, planned, terminal=8)
 
 
 def train(trainer: Trainer, updates: int) -> list[Effects]:
@@ -82,6 +82,7 @@ def test_a_row_of_metrics_every_200_updates() -> None:
     assert row["epsilon"] == pytest.approx(actor.epsilon_final + fallen)
     assert row["evicted_unsampled"] == 5 / 20
     assert row["replay_size"] == 80
+    assert row["terminal_share"] == 8 / 80
 
 
 def test_q1_and_q2_are_compared_on_the_first_256_states() -> None:

@@ -10,6 +10,7 @@ import io
 import shutil
 import threading
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ import numpy as np
 from common.errors import BadMessage
 from common.messaging import wire
 from common.messaging.messages.sample import BatchReader, EpisodeRecord, encode_batch
+from common.messaging.wire import Message
 from common.process.files import PIECE, SyncedFile, measure, sync_folder, write_atomic
 from common.process.run_ids import check_owner
 from common.types import Array, EpisodeEnd
@@ -107,13 +109,19 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int) -> Mark:
     arrays = {name: _read_array(path / f"{name}.npy", tuple(written)) for name, written in state["files"].items()}
     read = BatchReader(core.table.spec)
     try:
-        replies = [read(wire.decode(payload, wire.ON_DISK)) for payload in state["replies"]]
+        replies = [read(_reply(payload)) for payload in state["replies"]]
     except BadMessage as error:
         raise TornSnapshot(f"{path / STATE}: {error}") from error
     listed = state["episodes"] if "episodes" in state else state["books"]["episodes"]  # where older versions saved them
     episodes = [EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in listed]
     core.restore(state["books"], episodes, state["table"], arrays, replies)
     return Mark(*state["mark"])
+
+
+def _reply(payload: bytes) -> Message:
+    """Decode the answer to a draw; before protocol 4 it did not count terminal transitions."""
+    message = wire.decode(payload, wire.ON_DISK)
+    return replace(message, fields={"terminal": 0, **message.fields})
 
 
 def read_mark(path: Path) -> Mark | None:

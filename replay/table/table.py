@@ -39,6 +39,9 @@ class Table:
 
     Deterministic: all random numbers come from `rng` (a Generator over PCG64, which the table's state includes).
     Not thread-safe: one owner makes all calls.
+
+    inserted, batches: transitions inserted and sample calls so far. terminal: transitions held that end in a terminal
+    state.
     """
 
     def __init__(
@@ -63,6 +66,7 @@ class Table:
         self.capacity = capacity
         self.inserted = 0
         self.batches = 0
+        self.terminal = 0
         self._settings = {
             "spec": [spec.env_id, list(spec.frame_shape), spec.frame_dtype, spec.stack, spec.num_actions],
             "capacity": capacity,
@@ -129,7 +133,9 @@ class Table:
         self._slots[rows] = slots[index]
         self._actions[rows] = segment.actions[kept]
         self._rewards[rows] = segment.rewards[kept]
-        self._terminated[rows] = segment.terminated[kept]
+        terminated = segment.terminated[kept]
+        self.terminal += int(np.count_nonzero(terminated)) - int(np.count_nonzero(self._terminated[replaced]))
+        self._terminated[rows] = terminated
         self._span[rows] = segment.span[kept]
         self._param_version[rows] = segment.param_version[kept]
         self._ids[rows] = np.arange(first, first + segment.steps)[kept]
@@ -272,6 +278,7 @@ class Table:
             if name in arrays or name != "span":  # older states lack it: each transition spans one step
                 self._column(name)[:size] = arrays[name]
         self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
+        self.terminal = int(np.count_nonzero(self._terminated[:size]))
         self.inserted = meta["inserted"]
         self.batches = meta["batches"]
         self._sampled = meta["sampled"]

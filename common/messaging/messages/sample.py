@@ -37,7 +37,7 @@ class EpisodeRecord(Struct, frozen=True, array_like=True, forbid_unknown_fields=
 class Drawn(Struct, frozen=True):
     """The data that accompany a batch: the table's counters, and the episodes from number `first_episode` on.
 
-    planned: draws of the complete run.
+    planned: draws of the complete run. terminal: transitions held that end in a terminal state.
     """
 
     sequence: Counter
@@ -48,6 +48,7 @@ class Drawn(Struct, frozen=True):
     first_episode: Counter
     episodes: Annotated[tuple[EpisodeRecord, ...], Meta(max_length=MAX_EPISODES)]
     planned: Counter = 0
+    terminal: Counter = 0
 
 
 class DrawRequest(Body, frozen=True):
