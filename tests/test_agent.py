@@ -11,7 +11,8 @@ from samples import make_segment
 from common.errors import UsageError
 from common.settings.config import EdlSettings, LearnerSettings, NetworkSettings, RunConfig
 from common.types import Batch, EnvSpec
-from learner.agent import Agent
+from learner.agent import Agent, _decay_vector
+from learner.qnetwork import make_network
 from replay.table.table import Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
@@ -37,6 +38,9 @@ def batches(count: int) -> list[Batch]:
 @pytest.mark.parametrize("method", ["g-coop", "coop"])
 def test_roles_swap_every_c_updates(method: str) -> None:
     agent = Agent(_config(method), SPEC)
+    assert len(agent.optimizers) == 2
+    assert agent.versions == [0, 0]
+    assert (agent.exploration_rate() == 0) == (method == "g-coop")
     assert not torch.equal(agent.networks[0].flat, agent.networks[1].flat)
     for number, batch in enumerate(batches(35)):
         before = [network.snapshot() for network in agent.networks]
@@ -60,6 +64,8 @@ def test_the_target_is_a_copy_every_c_updates(method: str) -> None:
         if number % 10 == 0:
             copy = agent.networks[0].snapshot()
     np.testing.assert_array_equal(agent.networks[1].snapshot(), copy)
+    assert agent.versions == [25, 20]
+    assert len(agent.optimizers) == 1
 
 
 def test_coop_without_s_is_g_coop() -> None:
@@ -116,8 +122,20 @@ def test_weight_decay_by_layer() -> None:
     for name, p in plain.networks[0].module.named_parameters():
         expected = p - (1e-3 * 0.5 * before[name] if name.startswith("fc2") else 0)
         torch.testing.assert_close(other[name], expected)
+    uniform = Agent(_config("dqn", optimizer="sgd", weight_decay=(0.5,)), SPEC)
+    uniform.update(batch)
+    for name, p in uniform.networks[0].module.named_parameters():
+        torch.testing.assert_close(p, dict(plain.networks[0].module.named_parameters())[name] - 5e-4 * before[name])
     with pytest.raises(UsageError, match="3 layers"):
         Agent(_config("dqn", weight_decay=(0.1, 0.1)), SPEC)
+
+
+def test_weight_decay_of_nested_layers() -> None:
+    """Each Linear of a nested stack is a layer of its own."""
+    layout = [("trunk.weight", (2, 3)), ("trunk.bias", (2,)), ("head.0.weight", (1, 2)), ("head.2.weight", (2, 1))]
+    rates = _decay_vector((0.1, 0.2, 0.3), layout)
+    assert rates is not None
+    torch.testing.assert_close(rates, torch.tensor([0.1] * 8 + [0.2] * 2 + [0.3] * 2))
 
 
 @pytest.mark.parametrize("gradient_alpha", [0.0, 0.9])
@@ -151,8 +169,9 @@ def test_the_learning_rate_falls_over_the_run() -> None:
         np.testing.assert_allclose(moved, expected, rtol=1e-3, atol=1e-7)
 
 
-def test_a_restored_agent_goes_on_to_the_bit() -> None:
-    config = replace(_config("coop"), edl=EdlSettings(noise="normal"))
+@pytest.mark.parametrize("edl", [EdlSettings(noise="normal"), EdlSettings(feedback="weight-gradient")])
+def test_a_restored_agent_goes_on_to_the_bit(edl: EdlSettings) -> None:
+    config = replace(_config("coop"), edl=edl)
     seen = batches(40)
     first, second = Agent(config, SPEC), Agent(replace(config, seed=0), SPEC)
     for batch in seen[:17]:
@@ -174,9 +193,28 @@ def test_a_state_of_fewer_networks_is_refused(part: str) -> None:
         agent.load_state({**state, part: state[part][:1]})
 
 
-def test_a_device_that_is_not_there() -> None:
+@pytest.mark.parametrize("device", ["nonsense", "cuda:99"])
+def test_a_device_that_is_not_there(device: str) -> None:
     with pytest.raises(UsageError, match=r"learner\.device"):
-        Agent(_config("dqn", device="nonsense"), SPEC)
+        Agent(_config("dqn", device=device), SPEC)
+
+
+def test_values_are_finite_where_only_their_sum_is_not() -> None:
+    agent = Agent(_config("coop"), SPEC)
+    agent.networks[1].flat.fill_(3e38)
+    assert agent.finite()
+    agent.networks[1].flat[-1] = torch.nan
+    assert not agent.finite()
+
+
+def test_the_second_network_is_the_runs_second() -> None:
+    config = _config("coop")
+    cpu = torch.device("cpu")
+    agent, obs = Agent(config, SPEC), np.ones((3, 4), np.float32)
+    for number, (network, values) in enumerate(zip(agent.networks, agent.q_values(obs), strict=True)):
+        expected = make_network(config, SPEC, number, cpu)
+        assert torch.equal(network.flat, expected.flat)
+        torch.testing.assert_close(values, expected(torch.from_numpy(obs)).detach())
 
 
 @pytest.mark.parametrize("method", ["dqn", "g-coop", "edql", "coop"])
