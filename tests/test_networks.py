@@ -13,14 +13,13 @@ from commands import run_command
 from actors.policy import Policy
 from common.errors import UsageError
 from common.networks.network import FlatNetwork, build_network
-from common.settings.config import EdlSettings, LearnerSettings, NetworkSettings, RunConfig
+from common.settings.config import NetworkSettings, RunConfig
 from common.settings.sources import base_config
 from common.settings.tables import validated
 from common.types import EnvSpec
 from experiments.evaluation import evaluate_checkpoint
 from experiments.lockstep import Lockstep
 from learner.edl.graph import Graph
-from learner.qnetwork import make_q_network
 from learner.records.run_directory import RunDirectory
 
 SPEC = EnvSpec("made-up", (4,), "float32", 1, 3)
@@ -76,32 +75,6 @@ def test_what_is_no_network_is_refused_in_one_line(name: str, text: str) -> None
 def test_an_unknown_kind_is_refused_with_those_that_exist() -> None:
     with pytest.raises(UsageError, match=r"network.kind = 'nature3': allowed: mlp, .*minatar, or module:function$"):
         validated(RunConfig(network=NetworkSettings(kind="nature3")))
-
-
-def _q_network(config: RunConfig) -> object:
-    return make_q_network(config, SPEC, 0, torch.device("cpu"), np.random.default_rng(0))
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"learner": LearnerSettings(compile=True)}, "learner.compile = True: allowed: False with "),
-        ({"edl": EdlSettings(polar_dtype="bfloat16")}, "edl.polar_dtype = 'bfloat16': allowed: 'float32' with "),
-        ({"network": NetworkSettings("custom_networks:duel", dtype="bfloat16")},
-         "network.dtype = 'bfloat16': allowed: 'float32' with "),
-        ({"network": NetworkSettings("custom_networks:twice")},
-         "network.kind = 'custom_networks:twice': layer 'inner' (Linear) is used twice in a forward pass"),
-    ],
-)  # fmt: skip
-def test_what_has_no_meaning_for_a_network_is_refused(changes: dict[str, object], text: str) -> None:
-    config = replace(RunConfig(network=NetworkSettings("custom_networks:duel")), **changes)
-    with pytest.raises(UsageError) as refused:
-        _q_network(config)
-    assert str(refused.value).startswith(text)
-
-
-def test_gradient_methods_train_a_layer_that_is_used_twice() -> None:
-    _q_network(RunConfig(method="dqn", network=NetworkSettings("custom_networks:twice")))
 
 
 def _lockstep(method: str, name: str) -> Lockstep:
