@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from common.networks.network import build_network
 from common.types import EnvSpec
 from learner.edl.backprop import Chain
-from learner.edl.feedback import edl_gradients, feedback_matrices
-from learner.edl.passes import UnsupportedLayerError
+from learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
+from learner.edl.transforms import Transforms, _basis
 
 
 def _spec(kind: str, actions: int) -> EnvSpec:
@@ -61,14 +61,15 @@ def _relative(got: dict[str, Tensor], want: dict[str, Tensor]) -> float:
     return float(difference.norm() / torch.cat([g.flatten() for g in want.values()]).norm())
 
 
-def test_one_update_by_hand() -> None:
+@pytest.mark.parametrize("s", [0.0, 0.5, 1.0, -0.25])
+def test_one_update_by_hand(s: float) -> None:
     """A network 2-3-2 whose third hidden unit is dead.
 
     x = (1, 2);  a1 = W1 x = (1, 2, -1), h = (1, 2, 0);  y = W2 h = (4, -3).
-    T(2) = I, so B(2) = (1 + s) I;  sigma(2) = 1.5 (1, 2) = (1.5, 3).
+    T(2) = I, so B(2) = (1 + s) I;  sigma(2) = (1 + s) (1, 2).
     T(1) = W2 with the dead unit's column out = [[0, 2, 0], [-3, 0, 0]]: singular values 3 and 2, polar factor
-    U V^T = [[0, 1, 0], [-1, 0, 0]];  B(1) = T(1) + 0.5 U V^T = [[0, 2.5, 0], [-3.5, 0, 0]];
-    sigma(1) = B(1)^T (1, 2) = (-7, 2.5, 0).  Gradients: sigma(2) h^T, sigma(2), sigma(1) x^T, sigma(1).
+    U V^T = [[0, 1, 0], [-1, 0, 0]];  B(1) = T(1) + s U V^T = [[0, 2 + s, 0], [-3 - s, 0, 0]];
+    sigma(1) = B(1)^T (1, 2) = (-6 - 2 s, 2 + s, 0).  Gradients: sigma(2) h^T, sigma(2), sigma(1) x^T, sigma(1).
     """
     network = nn.Sequential(nn.Linear(2, 3), nn.ReLU(), nn.Linear(3, 2))
     with torch.no_grad():
@@ -78,18 +79,19 @@ def test_one_update_by_hand() -> None:
         network[2].bias.zero_()
     x, error = torch.tensor([[1.0, 2]]), torch.tensor([[1.0, 2]])
     expected = {
-        "0.weight": [[-7, -14], [2.5, 5], [0, 0]],
-        "0.bias": [-7, 2.5, 0],
-        "2.weight": [[1.5, 3, 0], [3, 6, 0]],
-        "2.bias": [1.5, 3],
+        "0.weight": [[-6 - 2 * s, -12 - 4 * s], [2 + s, 4 + 2 * s], [0, 0]],
+        "0.bias": [-6 - 2 * s, 2 + s, 0],
+        "2.weight": [[1 + s, 2 + 2 * s, 0], [2 + 2 * s, 4 + 4 * s, 0]],
+        "2.bias": [1 + s, 2 + 2 * s],
     }
-    gradients = edl_gradients(network, x, error, 0.5)
+    gradients = edl_gradients(network, x, error, s)
     assert gradients.keys() == expected.keys()
     for name, numbers in expected.items():
         torch.testing.assert_close(gradients[name], torch.tensor(numbers, dtype=torch.float32))
-    b = feedback_matrices(network, x, 0.5)
-    torch.testing.assert_close(b["0"][0], torch.tensor([[0.0, 2.5, 0], [-3.5, 0, 0]]))
-    torch.testing.assert_close(b["2"][0], 1.5 * torch.eye(2))
+    b = feedback_matrices(network, x, s)
+    assert list(b) == ["0", "2"]
+    torch.testing.assert_close(b["0"][0], torch.tensor([[0.0, 2 + s, 0], [-3 - s, 0, 0]]))
+    torch.testing.assert_close(b["2"][0], (1 + s) * torch.eye(2))
 
 
 @pytest.mark.parametrize("kind", ["mlp", "nature", "nips2013"])
@@ -162,8 +164,11 @@ def test_samples_without_full_rank_leave_the_others_alone(actions: int) -> None:
     got = edl_gradients(network, x, error, 0.4)
     dead = edl_gradients(network, x[::3], error[::3], 0.4)
     assert _relative({name: got[name] - dead[name] for name in got}, expected) < 1e-6
-    for matrices in b.values():
-        assert float(torch.linalg.svdvals(matrices).min()) >= 0.4 * (1 - 1e-3)
+    for name, t in feedback_matrices(network, x, 0.0).items():
+        torch.testing.assert_close(torch.linalg.svdvals(b[name]), torch.linalg.svdvals(t) + 0.4, rtol=1e-6, atol=1e-6)
+    for name, matrices in b.items():  # the gradient of a bias is B^T e, summed over the batch
+        sigma = torch.einsum("ba,ban->n", error, matrices)
+        torch.testing.assert_close(got[f"{name}.bias"], sigma, rtol=1e-6, atol=1e-9)
 
 
 @settings(max_examples=settings.default.max_examples // 2)
@@ -205,11 +210,6 @@ def test_a_polar_part_in_bfloat16_leaves_the_rest_exact(kind: str, actions: int)
     assert _relative(tiny, plain) < 1e-6
 
 
-def test_a_plain_stack_has_no_other_layer() -> None:
-    with pytest.raises(UnsupportedLayerError, match="layer '1' is a Tanh"):
-        Chain(nn.Sequential(nn.Linear(2, 2), nn.Tanh()))
-
-
 def _random_feedback(network: nn.Sequential, x: Tensor, s: float, **seed: int) -> dict[str, Tensor]:
     """The fixed B(i) [actions, n] of each layer: the gradient of its bias, for an error of 1 of each action in turn."""
     units = torch.eye(3, dtype=x.dtype)
@@ -229,3 +229,44 @@ def test_random_feedback_is_fixed() -> None:
     assert torch.equal(fixed["out"], torch.eye(3, dtype=torch.float64))
     rows = torch.cat([fixed["fc1"], fixed["fc2"], other["fc1"], other["fc2"]])
     torch.testing.assert_close(rows @ rows.T, torch.eye(12, dtype=torch.float64), atol=0.25, rtol=0)
+    rule, zero = (FeedbackRule(Chain(network), "random", **seed) for seed in ({}, {"seed": 0}))
+    tape, error = rule.chain.forward(first), torch.eye(3, dtype=torch.float64)[:1]
+    for index in rule.chain.parametrised:
+        assert torch.equal(rule._aligned(tape, index, error), zero._aligned(tape, index, error))
+
+
+def test_random_feedback_is_the_identity_at_the_end_alone() -> None:
+    """Also where hidden layers are as wide as there are actions."""
+    network = build_network("mlp", _spec("mlp", 3), (3, 3), 0).double()
+    fixed = _random_feedback(network, torch.ones(1, 4, dtype=torch.float64), 0.5)
+    units = torch.eye(3, dtype=torch.float64)
+    assert torch.equal(fixed["out"], units)
+    assert not torch.allclose(fixed["fc1"], units)
+    assert not torch.allclose(fixed["fc2"], units)
+
+
+@pytest.mark.parametrize("actions", [2, 3, 4, 6])
+def test_the_basis_is_orthogonal_and_parts_the_common_value(actions: int) -> None:
+    """Its first row is the mean's, for few actions and without output weights; else it makes rows of Q W orthogonal."""
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.randn(actions, 9, generator=generator) + 3
+    output = torch.zeros(5, actions)
+    for one in (None, weight, weight * torch.nan):
+        q = _basis(one, output)
+        assert q.dtype == torch.float32
+        torch.testing.assert_close(q @ q.T, torch.eye(actions), atol=1e-6, rtol=0)
+        if one is None or actions <= 3:
+            torch.testing.assert_close(q[0], torch.full((actions,), actions**-0.5))
+        elif one is weight:
+            gram = q @ weight @ weight.T @ q.T
+            torch.testing.assert_close(gram, torch.diag(gram.diagonal()), atol=1e-3, rtol=0)
+
+
+def test_transforms_start_from_the_basis_of_the_output_weight() -> None:
+    network, x, _ = _case("mlp", 6, 3)
+    chain = Chain(network)
+    with torch.no_grad():
+        q = Transforms(chain, chain.forward(x))._basis
+        rows = q @ network.get_parameter("out.weight")
+    gram = rows @ rows.T
+    torch.testing.assert_close(gram, torch.diag(gram.diagonal()))

@@ -55,19 +55,20 @@ def test_each_weight_gradient_gets_a_polar_factor(kind: str, actions: int, batch
             assert _is_polar_factor((fed[name] - gradient).flatten(1) / S, gradient.flatten(1), 1e-6)
 
 
-def test_where_the_gradient_has_full_rank_it_is_the_svd() -> None:
+@pytest.mark.parametrize("s", [S, 1.0])
+def test_where_the_gradient_has_full_rank_it_is_the_svd(s: float) -> None:
     network, shape = _network("mlp", 6)
     generator = torch.Generator().manual_seed(1)
     x = torch.randn(256, *shape, generator=generator, dtype=torch.float64)
     e = torch.randn(256, 6, generator=generator, dtype=torch.float64) / 256
-    plain, fed = edl_gradients(network, x, e, 0.0), edl_gradients(network, x, e, S, "weight-gradient")
+    plain, fed = edl_gradients(network, x, e, 0.0), edl_gradients(network, x, e, s, "weight-gradient")
     ranks = []
     for name, gradient in plain.items():
         if name.endswith("weight"):
             u, values, vt = torch.linalg.svd(gradient, full_matrices=False)
             ranks.append(float(values[-1] / values[0]))
             if ranks[-1] > 1e-6:
-                torch.testing.assert_close(fed[name], u @ torch.diag(values + S) @ vt, rtol=1e-6, atol=1e-8)
+                torch.testing.assert_close(fed[name], u @ torch.diag(values + s) @ vt, rtol=1e-6, atol=1e-8)
     assert max(ranks) > 1e-6
 
 

@@ -9,6 +9,7 @@ import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself use
 from torch import Tensor, nn
 
 from common.networks.network import layer_functions
+from learner.edl.arrays import in_dtype
 from learner.edl.passes import Passes, Tape, UnsupportedLayerError
 
 Parametrised = nn.Linear | nn.Conv2d
@@ -24,7 +25,7 @@ class Chain(Passes[Tensor]):
         """Raise UnsupportedLayerError for any other layer, and for unsupported options of a known one."""
         leaves = list(_leaves(network, ""))
         for name, step in leaves:
-            _check(name.rstrip("."), step)
+            _check(name.removesuffix("."), step)
         self.names = [name for name, _ in leaves]
         self._steps = [step for _, step in leaves]
         self._functions = layer_functions(self._steps)
@@ -63,13 +64,13 @@ class Chain(Passes[Tensor]):
         rows = cotangent
         fresh = False  # whether `rows` may be overwritten
         first = self.parametrised[0]
-        for index in range(len(self._steps) - 1, first - 1, -1):
+        for index in reversed(range(len(self._steps))):
             step, weight, h = self._steps[index], self._weights[index], tape.inputs[index]
             if weight is not None:
                 yield index, rows
                 if index == first:
                     return
-                weight = weight if dtype is None else weight.to(dtype)
+                weight = in_dtype(weight, dtype)
                 rows = _transposed(step, rows, weight, h) if isinstance(step, nn.Conv2d) else rows @ weight
                 fresh = True
             elif isinstance(step, nn.ReLU):
@@ -119,8 +120,7 @@ def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:
     if rows.shape[1] == 1:
         masked: Tensor = torch.ops.aten.threshold_backward(rows, activation.unsqueeze(1), 0)
         return masked
-    mask = activation.sign().unsqueeze(1)  # a ReLU's output is never negative
-    mask = mask if mask.dtype == rows.dtype else mask.to(rows.dtype)
+    mask = activation.sign().to(rows.dtype).unsqueeze(1)  # a ReLU's output is never negative
     return rows.mul_(mask) if in_place and rows.shape[0] == mask.shape[0] else rows * mask
 
 

@@ -154,4 +154,4 @@ def feedback_matrices(network: nn.Module, obs: Tensor, s: float) -> dict[str, Te
     chain = make_passes(network, obs)
     with torch.no_grad():
         found = Transforms(chain, chain.forward(obs)).matrices(s)
-    return {chain.names[index].rstrip("."): b for index, b in reversed(found)}
+    return {chain.names[index].removesuffix("."): b for index, b in reversed(found)}

@@ -131,17 +131,13 @@ class Graph(Passes[Tensor]):
             if layer.bias is not None:
                 torch.sum(rows, 0, out=out[name + "bias"])
             return
-        parameters = dict(layer.named_parameters())
-        found = _gradients(output, list(parameters.values()), delta.reshape(output.shape))
-        for part, gradient in zip(parameters, found, strict=True):
-            out[name + part].copy_(gradient)
+        own = {name + part: parameter for part, parameter in layer.named_parameters()}
+        _write_gradients(output, own, delta.reshape(output.shape), out)
 
     def write_rest(self, tape: Tape[Tensor], error: Tensor, out: Mapping[str, Tensor]) -> None:
         """Write the ordinary gradients of all parameters outside the layers, given error [batch, actions]."""
         if self._rest:
-            found = _gradients(_recorded(tape).root, list(self._rest.values()), error)
-            for name, gradient in zip(self._rest, found, strict=True):
-                out[name].copy_(gradient)
+            _write_gradients(_recorded(tape).root, self._rest, error, out)
 
     def range_of(self, index: int) -> Range | None:
         """The range of T of layer `index`."""
@@ -155,6 +151,14 @@ def _recorded(tape: Tape[Tensor]) -> GraphTape:
     if not isinstance(tape, GraphTape):
         raise TypeError(f"a {type(tape).__name__} holds no graph")
     return tape
+
+
+def _write_gradients(
+    root: Tensor, parameters: Mapping[str, Tensor], cotangent: Tensor, out: Mapping[str, Tensor]
+) -> None:
+    """Overwrite out[name] with the gradient of each named parameter, given root's cotangent [*root]."""
+    for name, gradient in zip(parameters, _gradients(root, list(parameters.values()), cotangent), strict=True):
+        out[name].copy_(gradient)
 
 
 def _gradients(root: Tensor, inputs: list[Tensor], cotangent: Tensor, batched: bool = False) -> list[Tensor]:

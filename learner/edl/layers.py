@@ -110,8 +110,7 @@ class _Trial:
     def _depends_on(self, layer: Layer) -> bool:
         """Whether the output depends on the layer; raises unless its parameters act through its own output alone."""
         output = self._calls[layer.name].output
-        error = torch.linspace(-1, 1, self._root.numel(), dtype=output.dtype, device=output.device)
-        error = error.view_as(self._root)
+        error = torch.linspace(-1, 1, self._root.numel()).view(self._root.shape).to(self._root)
         first = error.clone()
         first[1:] = 0
         if (delta := torch.autograd.grad(self._root, output, error, retain_graph=True, allow_unused=True)[0]) is None:
@@ -129,7 +128,7 @@ class _Trial:
 
     def transforms(self, layer: Layer) -> Tensor:
         """T of the layer for each sample: float64 [batch, A, n]."""
-        units = torch.eye(self._root.shape[1], dtype=self._root.dtype, device=self._root.device)[:, None]
+        units = torch.eye(self._root.shape[1]).to(self._root)[:, None]
         cotangents = units.expand(-1, self._batch, -1)
         output = self._calls[layer.name].output
         (rows,) = torch.autograd.grad(self._root, output, cotangents, retain_graph=True, is_grads_batched=True)
@@ -147,7 +146,7 @@ def _range(trials: Sequence[_Trial], layer: Layer) -> Range | None:
     rank, (actions, width) = int(ranks.max()), ts.shape[1:]
     if basis.shape[1] == actions and rank == min(actions, width):
         return None
-    outside = torch.eye(actions, dtype=basis.dtype, device=basis.device) - basis @ basis.mT
+    outside = torch.eye(actions).to(basis) - basis @ basis.mT
     return Range(basis.to(layer.module.weight), outside.to(layer.module.weight), rank)
 
 

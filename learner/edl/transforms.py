@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from learner.edl.arrays import ArrayT, Namespace, convert_like, in_dtype, namespace, widened
-from learner.edl.passes import Passes, Range, Tape
+from learner.edl.passes import Passes, Tape
 from learner.edl.polar import polar_by_svd, whitened
 
 _SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
@@ -60,8 +60,8 @@ class Transforms(Generic[ArrayT]):
         e = error @ self._basis.T
         white, doubtful = whitened(self._grams(), e)
         weights = s * white if polar_only else e + s * white
-        for i, ((index, shape), t) in enumerate(zip(self._layers, self._ts, strict=True)):
-            sigma = self._chain.combine(weights[i], t)
+        for i, (index, shape) in enumerate(self._layers):
+            sigma = self._chain.combine(weights[i], self._ts[i])
             if doubtful is not None and doubtful[i].any():
                 where = doubtful[i]
                 sigma[where] += s * (e[where][:, None] @ self._by_svd(i, where))[:, 0]
@@ -77,8 +77,8 @@ class Transforms(Generic[ArrayT]):
         if not self._ts:
             return found
         roots, doubtful = whitened(self._grams()[:, :, None], units)
-        for i, ((index, shape), t) in enumerate(zip(self._layers, self._ts, strict=True)):
-            b = t + s * (roots[i] @ t)
+        for i, (index, shape) in enumerate(self._layers):
+            b = self._ts[i] + s * (roots[i] @ self._ts[i])
             if doubtful is not None:
                 where = doubtful[i, :, 0]
                 b[where] += s * self._by_svd(i, where)
@@ -90,11 +90,14 @@ class Transforms(Generic[ArrayT]):
         """G(i) = T(i) T(i)^T of every layer held: [layers, batch, A, A]."""
         xp: Namespace[ArrayT] = namespace(self._basis)
         shape = (self._batch, self._actions, self._actions)
-        grams = [self._gram(t, reach) for t, reach in zip(self._ts, self._ranges, strict=True)]
+        grams = [self._gram(i) for i in range(len(self._ts))]
         whole = [gram if len(gram) == self._batch else xp.broadcast_to(gram, shape) for gram in grams]
         return xp.concatenate(whole).reshape(-1, *shape)
 
-    def _gram(self, t: ArrayT, reach: Range | None) -> ArrayT:
+    def _gram(self, i: int) -> ArrayT:
+        """G of the i-th layer held, made non-singular outside a known range: [batch or 1, A, A]."""
+        t: ArrayT = self._ts[i]
+        reach = self._ranges[i]
         gram: ArrayT = self._chain.gram(t)
         if reach is None:
             return gram
