@@ -83,7 +83,7 @@ class Transforms(Generic[ArrayT]):
                 where = doubtful[i, :, 0]
                 b[where] += s * self._by_svd(i, where)
             b = self._basis.mT @ b
-            found.append((index, _shaped(b.reshape(-1, b.shape[-1]), shape).reshape(b.shape)))
+            found.append((index, _shaped(b, shape).reshape(b.shape)))
         return found
 
     def _grams(self) -> ArrayT:
@@ -148,7 +148,7 @@ def _flat(t: ArrayT) -> ArrayT:
 
 
 def _shaped(rows: ArrayT, shape: tuple[int, ...]) -> ArrayT:
-    """Reverse `_flat`: [rows, n] to [rows, *shape]."""
+    """Reverse `_flat`: [..., n] to [rows, *shape] if `shape` is a picture's."""
     if len(shape) == 1 or not isinstance(rows, Tensor):
         return rows
     channels, height, width = shape
