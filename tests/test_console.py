@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join
-from common.process.console import STALL_AFTER, Console, PeerMonitor, StallDetector, counted, progress_line
+from common.process.console import RECENT, STALL_AFTER, Console, PeerMonitor, StallDetector, counted, progress_line
 from learner.members import FORGOTTEN, MemberTracker
 
 STATUS = {
@@ -79,8 +79,8 @@ def test_members_come_and_go() -> None:
     members.token(2, True, 2.0)
     assert told() == ["actor 0 on act (pid 8) is back"]
     assert members.missing(2.0) == []
-    members.token(2, False, 3.0)
     members.token(1, False, 3.0)
+    members.token(2, False, 3.0)
     told()
     members.joined(replace(actor, incarnation=3, origin=Origin("act", 9)), "actor 1")
     assert members.missing(3.0) == ["replay service on rep (pid 7)"], "another one has taken the actor's place"
@@ -104,6 +104,7 @@ def test_a_standstill_is_told_once() -> None:
     assert look(STALL_AFTER + 9, 5, "because of another reason") == ""
     assert look(STALL_AFTER + 10, 6, "") == "goes on"
     assert look(STALL_AFTER + 10, 7, "") == ""
+    assert look(2 * STALL_AFTER + 9.9, 7, "again") == ""
     assert look(2 * STALL_AFTER + 10, 7, "again") == "waiting: again"
 
 
@@ -115,6 +116,7 @@ def test_others_go_out_of_sight_and_come_back() -> None:
     assert look(False, "head (pid 1)") == "the learner on head (pid 1) does not answer"
     assert look(False, "head (pid 1)") == ""
     assert look(True, "head (pid 1)") == "the learner on head (pid 1) is back"
+    assert look(True, "head (pid 1)") == ""
     assert look(True, "head (pid 2)") == "the learner on head (pid 2) is back", "so soon that nobody missed it"
 
 
@@ -125,5 +127,6 @@ def test_events_have_a_time_and_a_number(capsys: pytest.CaptureFixture[str]) -> 
     lines = capsys.readouterr().out.splitlines()
     assert all(re.fullmatch(r"\d\d:\d\d:\d\d event \d+", line) for line in lines)
     recent = console.recent()
+    assert len(recent) == RECENT
     assert [line for _, line in recent] == lines[-len(recent) :]
     assert [number for number, _ in recent] == sorted({number for number, _ in recent})

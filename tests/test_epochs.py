@@ -149,7 +149,22 @@ def test_episodes_are_kept_as_long_as_they_may_be_asked_for(spec: EnvSpec, tmp_p
         assert not isinstance(reply, Wait)
         assert reply.drawn.first_episode == told[back]
         steps = [record.env_step for record in reply.drawn.episodes]
-        assert steps == [4 * (number + 1) for number in range(told[back], one.episodes_total)]
+        assert steps == [4 * (number + 1) for number in range(told[back], one.table.inserted // 4)]
+    kept = twin.snapshot(twin.drawn, [back])
+    assert kept.state["first_episode"] == told[back], "the restored one knows which episodes an epoch needs"
+    kept.table.frames.release()
+
+
+def test_a_draw_that_may_be_repeated_keeps_its_episodes(spec: EnvSpec) -> None:
+    core = ReplayCore(CONFIG, spec)
+    for number in range(3):
+        core.insert(make_segment(spec, number))
+    for sequence, episodes_from in ((0, 0), (1, 2)):
+        assert not isinstance(core.draw(DrawRequest(1, sequence, 0, 4, episodes_from)), Wait)
+    for base, first in ((0, 0), (1, 2)):
+        kept = core.snapshot(base, [base])
+        assert kept.state["first_episode"] == first
+        kept.table.frames.release()
 
 
 def test_a_run_without_epochs_keeps_a_bounded_number_of_episodes(spec: EnvSpec) -> None:
@@ -167,6 +182,7 @@ def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
     assert isinstance(core.draw(DrawRequest(1, drawn, drawn, 4, 0)), Wait)
     assert not isinstance(core.draw(DrawRequest(2, 5, 5, 4, 3)), Wait), "another learner, back at update 5"
     assert core.drawn == 6
+    assert [drawn.sequence for _, drawn in core.repeatable()] == [5], "the other one's are forgotten"
     with pytest.raises(RunError, match="another learner has taken over"):
         core.draw(DrawRequest(1, drawn, drawn, 4, 0))
     core.draw(DrawRequest(2, 20, 20, 4, 0))
@@ -175,6 +191,8 @@ def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
     older.insert(make_segment(spec))
     assert isinstance(older.draw(DrawRequest(2, 20, 20, 4, 9)), Wait)
     assert (older.drawn, older.episodes_total) == (20, 9), "episodes that the learner knows keep their numbers"
+    assert isinstance(older.draw(DrawRequest(2, 30, 30, 4, 11)), Wait)
+    assert (older.drawn, older.episodes_total) == (30, 11), "also of a learner that it knows"
 
 
 def test_learner_epochs(tmp_path: Path) -> None:
@@ -184,6 +202,7 @@ def test_learner_epochs(tmp_path: Path) -> None:
     torn = tmp_path / "checkpoints" / "400"
     torn.mkdir()
     (torn / "learner.pt").write_bytes(b"half")
+    assert complete_epochs(tmp_path) == [200, 300]
     newest = newest_epoch(tmp_path)
     assert newest is not None
     assert load_learner(newest)["flat"].tolist() == [300.0] * 3
