@@ -66,10 +66,10 @@ def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_
         return node
 
     def open_route(endpoints: Sequence[str]) -> zenoh.Session:
-        opened.append(endpoints)
-        return open_session((), endpoints)
+        opened.append((endpoints, session := open_session((), endpoints)))
+        return session
 
-    opened: list[Sequence[str]] = []
+    opened: list[tuple[Sequence[str], zenoh.Session]] = []
     first = serve(at[0])
     with ReplayRoute("test", 7, open_route, at[:1]) as route:
         wait_for("the first", lambda: route.is_up)
@@ -91,7 +91,10 @@ def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_
             given_up.cancel()
             assert found
             assert route.is_up
-            assert opened == [at[:1], at[1:]]
+            assert [(endpoints, session.is_closed()) for endpoints, session in opened] == [
+                (at[:1], True),
+                (at[1:], False),
+            ]
     assert core.table.inserted == 8
 
 
