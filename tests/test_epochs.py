@@ -179,7 +179,7 @@ def test_a_run_without_epochs_keeps_a_bounded_number_of_episodes(spec: EnvSpec) 
 def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
     core = _used_core(spec)
     drawn = core.drawn
-    assert isinstance(core.draw(DrawRequest(1, drawn, drawn, 4, 0)), Wait)
+    assert isinstance(core.draw(DrawRequest(1, drawn, drawn - 1, 4, 0)), Wait)
     assert not isinstance(core.draw(DrawRequest(2, 5, 5, 4, 3)), Wait), "another learner, back at update 5"
     assert core.drawn == 6
     assert [drawn.sequence for _, drawn in core.repeatable()] == [5], "the other one's are forgotten"

@@ -44,9 +44,10 @@ def test_lines_wait_for_space(small_disk: Path) -> None:
     (small_disk / "filler").write_bytes(bytes(250_000))
     written = ""
     while not lines.problem:
-        lines.write(line := f"line {len(written)}\n")
+        lines.write(line := f"a line {len(written)}\n")
         written += line
     assert lines.problem == "No space left on device"
+    assert not (small_disk / "lines").read_text().endswith("\n"), "there was space for a part of the last line"
     (small_disk / "filler").unlink()
     lines.write("the end\n")
     assert not lines.problem
@@ -68,9 +69,9 @@ def test_episodes_metrics_and_scalars_wait_for_space(small_disk: Path, capsys: p
         assert threading.active_count() == threads, "TensorBoard's file needs no thread that could die of this"
         filler.unlink()
         directory.conclude(summary, "a run")
+        assert len((path / "episodes.csv").read_text().splitlines()) == 1 + summary.episodes
     run.env.close()
     assert capsys.readouterr().out == f"{path}: No space left on device\n"
-    assert len((path / "episodes.csv").read_text().splitlines()) == 1 + summary.episodes
     assert (path / "learning_curve.png").stat().st_size
     board = EventAccumulator(str(path / "tb")).Reload()
     assert len(board.Scalars("episode/return")) == summary.episodes
