@@ -48,11 +48,11 @@ def test_frozen_peers_do_not_make_a_process_deaf(server: Node) -> None:
             time.sleep(0.05)
         for process in frozen:
             process.send_signal(signal.SIGSTOP)
-        weights = bytearray(1 << 20)
+        weights, question = bytearray(1 << 20), Current().encode("test")
         while len(server.session.info.peers_zid()) > 1:
             server.publish(server.key("weights", "1"), weights)
+            client.ask(client.key("role"), question, timeout=4.0)
             time.sleep(0.02)
-        question = Current().encode("test")
         for _ in range(20):
             client.ask(client.key("role"), question, timeout=4.0)
             time.sleep(0.1)
