@@ -10,6 +10,7 @@ from torch import Tensor
 
 from learner.edl.arrays import ArrayT, convert_like, namespace, widened
 
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # the two other indices of three
 _SMALL = 8  # the shorter side up to which an SVD is faster than the algebra with a Gram matrix
 
 
@@ -18,7 +19,7 @@ class _Limits:
     """Bounds within which the Gram matrix gives an accurate result.
 
     square: the shortest row's squared length. inflation: the largest sum of variance inflation factors (see
-    `whitened`). ratio: the smallest ratio of two eigenvalues.
+    `whitened`). ratio: the smallest ratio of two rows' squared lengths, of two eigenvalues for more than three rows.
     """
 
     square: float
@@ -42,7 +43,8 @@ def whitened(gram: ArrayT, e: ArrayT) -> tuple[ArrayT, ArrayT | None]:
     if gram.shape[-1] == 2:
         white, doubtful = _whitened_pairs(gram, e, limits)
     else:
-        wide, doubtful = _whitened_by_eigh(widened(gram), widened(e), limits)
+        whiten = _whitened_triples if gram.shape[-1] == 3 else _whitened_by_eigh
+        wide, doubtful = whiten(widened(gram), widened(e), limits)
         white = convert_like(wide, gram)
     if doubtful is not None:
         white[namespace(gram).broadcast_to(doubtful, white.shape[:-1])] = 0
@@ -68,6 +70,33 @@ def _whitened_pairs(g: ArrayT, e: ArrayT, limits: _Limits) -> tuple[ArrayT, Arra
     white[..., 0] = top
     white[..., 1] = ((a + d) * second - c * first) / scale
     return white, doubtful
+
+
+def _whitened_triples(g: ArrayT, e: ArrayT, limits: _Limits) -> tuple[ArrayT, ArrayT | None]:
+    """The closed form for 3 x 3, with the adjugate A of G and the invariants of U = G^(1/2).
+
+    x = tr U, y = (x^2 - tr G) / 2 and z = det U solve x^2 = tr G + 2 y and y^2 = tr A + 2 x z, sums of positive terms
+    only. Then U^(-1) = (y I + ((tr A + x z) A - A^2) / z^2) / (x y - z). In float64 this is as accurate as `eigh`.
+    """
+    xp = namespace(g)
+    g = xp.einsum("...ij->ij...", g)
+    first, second = g[_NEXT], g[_AFTER]
+    a = first[:, _NEXT] * second[:, _AFTER] - first[:, _AFTER] * second[:, _NEXT]
+    lengths, minors = xp.einsum("ii...->i...", g), xp.einsum("ii...->i...", a)
+    determinant = (g[0] * a[0]).sum(0)
+    shortest = xp.amin(lengths, 0)
+    safe = (shortest > limits.square) & (shortest > limits.ratio * xp.amax(lengths, 0))
+    safe &= (lengths * minors).sum(0) < limits.inflation * determinant
+    trace, minor, z = lengths.sum(0), minors.sum(0), determinant**0.5
+    y = (minor + 2 * z * (3 * trace) ** 0.5) ** 0.5  # at most a tenth too large
+    for _ in range(3):  # Newton's method doubles the digits
+        x = (trace + 2 * y) ** 0.5
+        next_y = (minor + 2 * x * z) ** 0.5
+        y = y - (y - next_y) / (1 - z / (x * next_y))
+    x = (trace + 2 * y) ** 0.5
+    solved = xp.einsum("ij...,...j->...i", a / determinant, e)
+    rest = (minor + x * z)[..., None] * solved - xp.einsum("ij...,...j->...i", a, solved)
+    return (y[..., None] * e + rest) / (x * y - z)[..., None], None if safe.all() else ~safe
 
 
 def _whitened_by_eigh(g: ArrayT, e: ArrayT, limits: _Limits) -> tuple[ArrayT, ArrayT | None]:
