@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.errors import UsageError
-from common.networks.network import FlatNetwork, preprocess
+from common.networks.network import FlatNetwork, q_values
 from common.process.randomness import generator_state, set_generator_state
 from common.registry import loaded
 from common.settings import schedules
@@ -127,11 +127,10 @@ class Agent:
         """True while every parameter of both networks is finite."""
         return all(_finite(network.flat) for network in self.networks)
 
-    def q_values(self, obs: Array) -> tuple[Tensor, Tensor]:
+    def q_values(self, obs: Array) -> tuple[Values, Values]:
         """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
-        with torch.no_grad():
-            x = preprocess(torch.as_tensor(obs, device=self.device), self.spec)
-            return self.networks[0](x), self.networks[1](x)
+        first, second = self.networks
+        return q_values(first, obs, self.spec), q_values(second, obs, self.spec)
 
     def state(self) -> dict[str, Any]:
         """The state for `load_state`; torch.load reads it with weights_only."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -69,7 +70,7 @@ def td_errors(batch: Batch, values: Values, bootstrap: Values, gamma: float) -> 
 
     values: y = Q(x), float32 [batch, actions]. bootstrap: V(x'), float32 [batch].
     """
-    discounts = np.float32(gamma) ** batch.span * ~batch.terminated
+    discounts = _powers(gamma)[batch.span] * ~batch.terminated
     errors: Values = values[np.arange(len(batch)), batch.actions] - (batch.rewards + discounts * bootstrap)
     return errors
 
@@ -84,3 +85,10 @@ def output_error(batch: Batch, slopes: Values, outputs: Values) -> Values:
     error = np.zeros_like(outputs)
     error[np.arange(len(batch)), batch.actions] = slopes * batch.weights / np.float32(len(batch))
     return error
+
+
+@cache
+def _powers(gamma: float) -> Values:
+    """gamma^k of every span k that a transition may have, float32 [256]."""
+    powers: Values = np.float32(gamma) ** np.arange(256, dtype=np.uint8)
+    return powers

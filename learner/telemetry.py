@@ -49,14 +49,14 @@ class Telemetry:
         """The metrics of the updates since the last row, of which there must be at least one."""
         errors = np.concatenate(self._errors)
         age, reuse, lag = (np.concatenate([arrays[i] for arrays in self._batches]) for i in range(3))
-        distinct = sum(len(np.unique(ids)) for *_, ids in self._batches)
+        distinct = sum(len(set(ids.tolist())) for *_, ids in self._batches)
         began, updates, steps = self._began
         seconds = max(now - began, 1e-9)
         self._errors, self._batches = [], []
         self._began = (now, agent.updates, drawn.inserted)
         assert self.fixed is not None
         q1, q2 = agent.q_values(self.fixed)
-        self.q_abs_mean = float((q1.abs().mean() + q2.abs().mean()) / 2)
+        self.q_abs_mean = float((np.abs(q1).mean() + np.abs(q2).mean()) / 2)
         return {
             "env_step": drawn.inserted,
             "update": agent.updates,
@@ -65,7 +65,7 @@ class Telemetry:
             "loss": float(agent.loss.cost(errors).mean()),
             "s": agent.exploration_rate(),
             "epsilon": epsilon,
-            "q_gap": float((q1 - q2).norm(dim=1).mean()),
+            "q_gap": float(np.linalg.norm(q1 - q2, axis=1).mean()),
             "q1_mean": float(q1.mean()),
             "q2_mean": float(q2.mean()),
             "q_abs_mean": self.q_abs_mean,

@@ -155,6 +155,9 @@ class Trainer:
 
     def _number_episodes(self, drawn: Drawn) -> list[EpisodeRow]:
         """Store the counters, and number the episodes."""
+        self.drawn = drawn
+        if not drawn.episodes:
+            return []
         self.drawn = msgspec.structs.replace(drawn, episodes=())
         number, updates, s = self.telemetry.episode, self.agent.updates, self.agent.exploration_rate()
         return [EpisodeRow(number(record.end.episode_return), record, updates, s) for record in drawn.episodes]

@@ -58,7 +58,7 @@ def config(tmp_path: Path) -> RunConfig:
 
 def values(agent: Agent) -> list[NDArray[np.float32]]:
     """What both networks say of every cell and action, float32 [cells, actions]."""
-    return [q.numpy() for q in agent.q_values(np.eye(CELLS, dtype=np.float32))]
+    return list(agent.q_values(np.eye(CELLS, dtype=np.float32)))
 
 
 @pytest.mark.parametrize("seed", [0, 1])

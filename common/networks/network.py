@@ -205,9 +205,9 @@ class FlatNetwork:
         return hashlib.sha256(repr(self.layout).encode()).hexdigest()[:16]
 
 
-def q_values(network: FlatNetwork, obs: NDArray[Any], spec: EnvSpec) -> NDArray[np.floating[Any]]:
+def q_values(network: FlatNetwork, obs: NDArray[Any], spec: EnvSpec) -> NDArray[Any]:
     """Q-values [batch, actions] of observations <frame_dtype>[batch, *obs_shape], without gradients."""
     if network.in_numpy is not None:
         return network.in_numpy(preprocess(obs, spec))
     with torch.inference_mode():
-        return network(preprocess(torch.from_numpy(obs), spec).to(network.flat.dtype)).float().numpy()
+        return network(preprocess(torch.from_numpy(obs), spec).to(network.flat)).float().cpu().numpy()

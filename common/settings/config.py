@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -154,7 +155,7 @@ class ReplaySettings:
     journal_keep: bool = False
     """Keep journal files that an epoch has made redundant, so that the run can be re-executed from its beginning."""
 
-    @property
+    @cached_property
     def prioritized(self) -> bool:
         """Whether the table uses TD errors as priorities."""
         return EVICTIONS.get(self.eviction).priorities or SAMPLERS.get(self.sampling).priorities
@@ -221,23 +222,23 @@ class RunConfig:
         named = {"env.id": self.env.id, "network.kind": self.network.kind}
         return {field: value for field, value in named.items() if ":" in value}
 
-    @property
+    @cached_property
     def planned_updates(self) -> int:
         """Updates of a run of all `total_steps`: the ratio applies from `learning_starts` on."""
         return round(self.replay.ratio * (self.total_steps - self.replay.learning_starts))
 
-    @property
+    @cached_property
     def two_networks(self) -> bool:
         """True for the cooperative methods; False if the second network is a copy of the first."""
         return METHODS.get(self.method).two_networks
 
-    @property
+    @cached_property
     def swap_period(self) -> int:
         """C of this method, in `learner.swap_unit`: the period of role swaps, or of copies to the target network."""
         settings = self.learner
         return settings.swap_every if self.two_networks else settings.target_update_every or settings.swap_every
 
-    @property
+    @cached_property
     def feedback(self) -> str:
         """The feedback of this method: "none" for the gradient methods."""
         return self.edl.feedback if METHODS.get(self.method).error_driven else "none"
