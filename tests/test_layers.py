@@ -7,8 +7,8 @@ from test_graph import _by_svd, _inputs, _networks, _relative
 from torch import Tensor, nn
 
 from learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
-from learner.edl.graph import Graph
-from learner.edl.layers import make_passes
+from learner.edl.graph import Graph, Layer
+from learner.edl.layers import _range, make_passes
 from learner.edl.passes import Tape, UnsupportedLayerError
 
 
@@ -190,3 +190,44 @@ def test_the_range_of_a_dueling_head_lies_beside_the_mean(dtype: torch.dtype) ->
             assert found.rank == rank
             torch.testing.assert_close(found.basis @ found.basis.T, projection)
             torch.testing.assert_close(found.outside, torch.eye(3, dtype=dtype) - projection)
+
+
+class Given:
+    """A trial whose T is known: [batch, actions, n]."""
+
+    def __init__(self, *rows: list[float]) -> None:
+        self._t = torch.tensor([rows], dtype=torch.float64)
+
+    def transforms(self, _: Layer) -> Tensor:
+        return self._t
+
+
+FAINT = (1.5e-10 / 4) ** 0.5  # an eigenvalue of 1.5e-10 of T T^T, whose largest is 4
+
+
+@pytest.mark.parametrize(
+    ("trials", "rank", "basis"),
+    [
+        ([Given([1, 0], [0, 0], [0, 0]), Given([0, 0], [0, 1e-8], [0, 0])], 1, [[1, 0, 0], [0, 1, 0]]),
+        ([Given([1, 0], [0, 3e-6])], 1, [[1, 0]]),
+        ([Given([1, FAINT], [1, -FAINT], [1, FAINT], [1, -FAINT])], 1, [[0.5, 0.5, 0.5, 0.5]]),
+        ([Given([0.3, 0.7, 0.9], [0.6, 1.4, 1.8], [1.1 * 0.3, 1.1 * 0.7, 1.1 * 0.9])], 1, [[1, 2, 1.1]]),
+        ([Given([0, 0], [0, 0])], 0, []),
+    ],
+)
+def test_directions_count_from_a_hundred_thousandth_of_the_largest(
+    trials: list[Given], rank: int, basis: list[list[float]]
+) -> None:
+    """Singular values are compared within each sample, so that a trial with small ones shows its directions as well."""
+    found = _range(trials, Layer("inner", nn.Linear(2, 2).double()))  # type: ignore[arg-type]
+    assert found is not None
+    actions = len(found.outside)
+    rows = torch.tensor(basis, dtype=torch.float64).reshape(-1, actions)
+    rows /= rows.norm(dim=1, keepdim=True)
+    torch.testing.assert_close(found.basis @ found.basis.T, rows.T @ rows)
+    torch.testing.assert_close(found.outside, torch.eye(actions, dtype=torch.float64) - rows.T @ rows)
+    assert found.rank == rank
+
+
+def test_a_small_direction_above_that_is_full_rank() -> None:
+    assert _range([Given([1, 0], [0, 3e-5])], Layer("inner", nn.Linear(2, 2).double())) is None  # type: ignore[list-item]
