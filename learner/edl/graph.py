@@ -166,9 +166,7 @@ def _gradients(root: Tensor, inputs: list[Tensor], cotangent: Tensor, batched: b
 
     An input that root does not depend on gets 0. The graph stays for further passes.
     """
-    with torch.inference_mode(mode=False):
-        cotangent = cotangent.clone() if cotangent.is_inference() else cotangent
-        found = torch.autograd.grad(
-            root, inputs, cotangent, retain_graph=True, is_grads_batched=batched, materialize_grads=True
-        )
+    found = torch.autograd.grad(
+        root, inputs, cotangent, retain_graph=True, is_grads_batched=batched, materialize_grads=True
+    )
     return list(found)
