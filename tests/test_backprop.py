@@ -21,15 +21,18 @@ def _uneven() -> nn.Sequential:
     narrow = nn.Linear(7, 1)
     nn.init.constant_(narrow.bias, 3.0)  # alive
     return nn.Sequential(
-        nn.Conv2d(2, 4, (2, 3), stride=(2, 1), padding=(1, 2), dilation=(1, 2), groups=2, bias=False), nn.ReLU(),
-        nn.Sequential(nn.Conv2d(4, 6, 3, stride=(2, 3)), nn.ReLU(), nn.Flatten()),
-        nn.Linear(6 * 2 * 3, 7, bias=False), nn.ReLU(), nn.Flatten(),
+        nn.Conv2d(2, 4, 3, stride=(1, 2)), nn.ReLU(),
+        nn.Sequential(
+            nn.Conv2d(4, 6, (2, 3), stride=(2, 1), padding=(1, 2), dilation=(1, 2), groups=2, bias=False), nn.ReLU(),
+            nn.Flatten(),
+        ),
+        nn.Linear(6 * 4 * 4, 7, bias=False), nn.ReLU(), nn.Flatten(),
         narrow, nn.ReLU(), nn.Linear(1, 3),
     ).double()  # fmt: skip
 
 
 def _inputs(batch: int) -> Tensor:
-    return torch.randn(batch, 2, 8, 10, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return torch.randn(batch, 2, 9, 10, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
 def _jacobians(network: nn.Sequential, x: Tensor) -> list[Tensor]:

@@ -83,8 +83,11 @@ def test_samples_that_lack_rank_get_a_whole_polar_factor() -> None:
             rule.backward(rule.chain.forward(x[[sample]]), np.eye(2)[[row]], s, out)
         b[sample, row] = out["0.bias"]
     values = np.linalg.svd(b, compute_uv=False)
-    np.testing.assert_allclose(values[:, -1], s, rtol=1e-6)
-    assert (values[:, 0] > s * 1.01).all()
+    t, whole = (feedback_matrices(network, torch.from_numpy(x), rate)["0"] for rate in (0.0, s))
+    expected = torch.linalg.svdvals(t) + s
+    assert (expected[:, 0] > s * 1.01).all()
+    np.testing.assert_allclose(values, expected, rtol=1e-6)
+    torch.testing.assert_close(torch.linalg.svdvals(whole), expected)
 
 
 @pytest.mark.parametrize("kind", ["mlp", "nature"])

@@ -149,6 +149,16 @@ def test_the_equations_on_any_mlp(seed: int, trained: bool, actions: int, batch:
     assert _relative(edl_gradients(network.float(), x.float(), error.float(), 0.7), expected) < 1e-4
 
 
+@pytest.mark.parametrize("actions", [2, 3, 5])
+def test_layers_without_a_relu_between_them_have_one_transform_for_all_samples(actions: int) -> None:
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(4, 20), nn.Linear(20, actions)).double()
+    _, x, error = _case("mlp", actions, 7)
+    assert _relative(edl_gradients(network, x, error, 0.3), _reference(network, x, error, 0.3)) < 1e-9
+    values = torch.linalg.svdvals(network[1].weight) + 0.3
+    torch.testing.assert_close(torch.linalg.svdvals(feedback_matrices(network, x, 0.3)["0"]), values.expand(7, -1))
+
+
 @pytest.mark.parametrize("actions", [2, 5])
 def test_samples_without_full_rank_leave_the_others_alone(actions: int) -> None:
     """Inputs of zero make the hidden layers of some samples die; the others still follow the equations."""
