@@ -6,29 +6,27 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from common.messaging.messages.sample import Drawn
 from common.returns import RETURN_WINDOW
 from common.types import Array, Batch
 from learner.agent import Agent, Update
-
-FIXED_STATES = 256
+from learner.diagnostics import Diagnostics
 
 
 class Telemetry:
     """Collects from each update the values for a row of metrics.jsonl.
 
-    returns: of the last 100 episodes. fixed: the first 256 states drawn, on which Q1 and Q2 are compared.
-    largest_reward: the largest |reward| of all batches. q_abs_mean: mean |Q| of both networks over `fixed` at the last
-    row. now: seconds of a monotonic clock.
+    returns: of the last 100 episodes. diagnostics: what is measured on the first 128 transitions drawn.
+    largest_reward: the largest |reward| of all batches. q_abs_mean: mean |Q| of both networks over the states of those
+    transitions at the last row. now: seconds of a monotonic clock.
     """
 
     def __init__(self, now: float) -> None:
         self.returns: deque[float] = deque(maxlen=RETURN_WINDOW)
         self.episodes = 0
-        self.fixed: Array | None = None
+        self.diagnostics = Diagnostics()
         self.largest_reward = 0.0
         self.q_abs_mean = 0.0
         self._errors: list[NDArray[np.float32]] = []
@@ -37,8 +35,7 @@ class Telemetry:
 
     def add(self, agent: Agent, batch: Batch, update: Update) -> None:
         """Note one update."""
-        if self.fixed is None or len(self.fixed) < FIXED_STATES:
-            self._fix(batch, agent)
+        self.diagnostics.add(batch)
         self._errors.append(update.td_errors)
         self.largest_reward = max(self.largest_reward, float(np.abs(batch.rewards).max()))
         # Copies, because views would keep a whole message alive.
@@ -54,9 +51,8 @@ class Telemetry:
         seconds = max(now - began, 1e-9)
         self._errors, self._batches = [], []
         self._began = (now, agent.updates, drawn.inserted)
-        assert self.fixed is not None
-        q1, q2 = agent.q_values(self.fixed)
-        self.q_abs_mean = float((np.abs(q1).mean() + np.abs(q2).mean()) / 2)
+        measured = self.diagnostics.row(agent)
+        self.q_abs_mean = measured["q_abs_mean"]
         return {
             "env_step": drawn.inserted,
             "update": agent.updates,
@@ -65,10 +61,7 @@ class Telemetry:
             "loss": float(agent.loss.cost(errors).mean()),
             "s": agent.exploration_rate(),
             "epsilon": epsilon,
-            "q_gap": float(np.linalg.norm(q1 - q2, axis=1).mean()),
-            "q1_mean": float(q1.mean()),
-            "q2_mean": float(q2.mean()),
-            "q_abs_mean": self.q_abs_mean,
+            **measured,
             **self._bound(agent),
             "updates_per_s": (agent.updates - updates) / seconds,
             "env_steps_per_s": (drawn.inserted - steps) / seconds,
@@ -101,11 +94,10 @@ class Telemetry:
 
     def state(self) -> dict[str, Any]:
         """The state for `load_state`; torch.load reads it with weights_only."""
-        fixed = None if self.fixed is None else torch.from_numpy(self.fixed.copy())
         return {
             "returns": list(self.returns),
             "episodes": self.episodes,
-            "fixed": fixed,
+            "diagnostics": self.diagnostics.state(),
             "largest_reward": self.largest_reward,
         }
 
@@ -113,7 +105,7 @@ class Telemetry:
         """Restore a state from `state`."""
         self.returns.extend(state["returns"])
         self.episodes = state["episodes"]
-        self.fixed = None if state["fixed"] is None else state["fixed"].numpy()
+        self.diagnostics.load_state(state.get("diagnostics", {}))  # earlier versions did not save it
         self.largest_reward = state.get("largest_reward", 0.0)
 
     def episode(self, episode_return: float) -> int:
@@ -131,11 +123,6 @@ class Telemetry:
     def return_sd(self) -> float:
         """Standard deviation of the returns of the last 100 episodes."""
         return float(np.std(self.returns)) if self.returns else 0.0
-
-    def _fix(self, batch: Batch, agent: Agent) -> None:
-        held = [] if self.fixed is None else list(self.fixed)
-        new = batch.frames[batch.obs_index[: FIXED_STATES - len(held)]].reshape(-1, *agent.spec.obs_shape)
-        self.fixed = np.array([*held, *new])
 
 
 def reuse_histogram(reuse: NDArray[np.integer[Any]]) -> list[int]:

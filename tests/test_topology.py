@@ -24,8 +24,9 @@ SCRIPTS = Path(sysconfig.get_path("scripts"))
 EPISODES = "episode,env_step,update,actor,stream,return,length,epsilon,s,q1_mean,q2_mean,param_version"
 METRICS = [
     *("time", "env_step", "update", "acting", "td_error", "loss", "s", "epsilon", "q_gap", "q1_mean", "q2_mean"),
-    *("q_abs_mean", "q_bound", "updates_per_s", "env_steps_per_s", "replay_size", "terminal_share"),
-    *("sample_age_mean", "sample_age_p95", "reuse_mean", "reuse_histogram", "distinct_share"),
+    *("q_abs_mean", "archive_td_error", "archive_drift", "policy_churn", "dormant_share", "dormant_by_layer"),
+    *("effective_rank", "effective_rank_by_layer", "q_bound", "updates_per_s", "env_steps_per_s", "replay_size"),
+    *("terminal_share", "sample_age_mean", "sample_age_p95", "reuse_mean", "reuse_histogram", "distinct_share"),
     *("evicted_unsampled", "weight_lag_mean"),
 ]
 SILENT = r"(?m)^\d\d:\d\d:\d\d replay service on \S+ \(pid \d+\) does not answer$"
@@ -88,7 +89,9 @@ def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, 
     assert len(rows) == summary["episodes"]
     assert [int(row["episode"]) for row in rows] == list(range(len(rows)))
     metrics = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
-    assert all(list(row) == METRICS for row in metrics)
+    # What is compared with the last row begins with the second.
+    assert list(metrics[0]) == [name for name in METRICS if name not in {"archive_drift", "policy_churn"}]
+    assert all(list(row) == METRICS for row in metrics[1:])
     assert list((path / "tb").iterdir())
     if outcome == "complete":
         env_steps, updates = summary["env_steps"], summary["updates"]

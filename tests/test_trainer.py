@@ -85,7 +85,7 @@ def test_a_row_of_metrics_every_200_updates() -> None:
     assert row["terminal_share"] == 8 / 80
 
 
-def test_q1_and_q2_are_compared_on_the_first_256_states() -> None:
+def test_q1_and_q2_are_compared_on_the_first_128_states() -> None:
     trainer = Trainer(Agent(CONFIG, SPEC), 0.0)
     source = batches()
     seen = []
@@ -93,7 +93,9 @@ def test_q1_and_q2_are_compared_on_the_first_256_states() -> None:
         batch = next(source)
         seen.append(batch.frames[batch.obs_index[:, 0]])
         trainer.train(batch, drawn(), 0.0)
-    np.testing.assert_array_equal(trainer.telemetry.fixed, np.concatenate(seen)[:256])
+    archive = trainer.telemetry.diagnostics.archive
+    assert archive is not None
+    np.testing.assert_array_equal(archive.frames[archive.obs_index[:, 0]], np.concatenate(seen)[:128])
 
 
 def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
@@ -196,8 +198,8 @@ def test_values_that_are_not_finite_on_the_fixed_states_end_a_run_with_the_row()
     trainer, source = Trainer(Agent(replace(CONFIG, method="dqn", learner=learner), SPEC), 0.0), batches()
     for _ in range(199):
         assert trainer.train(next(source), drawn(), 0.0).metrics is None
-    assert trainer.telemetry.fixed is not None
-    trainer.telemetry.fixed[0] = 1e30
+    assert trainer.telemetry.diagnostics.archive is not None
+    trainer.telemetry.diagnostics.archive.frames[0] = 1e30
     for network in trainer.agent.networks:
         flat = network.snapshot()
         flat[-18:-2] *= 1e10  # the weights of the output: too much for that state, and for no other
