@@ -120,7 +120,7 @@ def ours(config: RunConfig, path: Path) -> Player:
 
     def update(count: int) -> None:
         for _ in range(count):
-            run.agent.update(run._table.sample(config.learner.batch_size))
+            run.agent.update(run.memory.table.sample(config.learner.batch_size))
 
     return Player(play, update)
 

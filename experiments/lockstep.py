@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-import threading
 import time
 import zlib
 from collections.abc import Iterable, Iterator
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -16,21 +13,18 @@ import torch
 
 from actors.player import Player, Turn
 from actors.policy import Policy
-from actors.segments import SegmentAssembler
 from common.envs.make import make_vector_env
 from common.errors import RunError, UsageError
 from common.messaging.messages.sample import EpisodeRecord
 from common.process.randomness import generator_state, set_generator_state
 from common.process.run_ids import read_run_id
-from common.settings import schedules
 from common.settings.config import RunConfig
 from experiments import old_checkpoints
-from learner.agent import Agent
+from experiments.memory import TableMemory, make_memory
 from learner.records.epochs import load_learner, save_epoch
 from learner.records.run_directory import RunDirectory
 from learner.trainer import Effects, Trainer
-from replay.core import ReplayCore
-from replay.persistence.storage import Mark, load_snapshot, save_snapshot
+from replay.persistence.storage import Mark
 
 
 class Lockstep:
@@ -46,21 +40,16 @@ class Lockstep:
         self.config = config
         self.step = 0
         self.env = make_vector_env(config.env, 1, int(env_seed.generate_state(1)[0]))
-        self.agent = Agent(config, self.env.spec)
+        self.agent, self.memory = make_memory(config, self.env.spec)
         self.trainer = Trainer(self.agent, time.monotonic())
         self._policy_rng = np.random.default_rng(policy_seed)
         first, second = self.agent.networks
         self._policy = Policy((first, second), self.env.spec, self._policy_rng)
-        self._player = Player(self.env, self._policy, partial(schedules.epsilon, config.actor))
-        self._segments = SegmentAssembler(
-            self.env.spec, 1, 0, 1, n_step=config.replay.n_step, gamma=config.learner.gamma
-        )
-        self._replay = ReplayCore(config, self.env.spec)
-        self._table = self._replay.table
+        self._player = Player(self.env, self._policy, self.agent.epsilon)
         self._actions: list[int] = []
         first_obs = self._player.begin()
         self._seen = zlib.crc32(first_obs.tobytes())
-        self._segments.begin(first_obs)
+        self.memory.begin(first_obs)
 
     def play(self) -> Iterator[Effects]:
         """Run one iteration of Algorithm 1's inner loop; yields the effects of each update."""
@@ -69,22 +58,13 @@ class Lockstep:
         self._player.send(self.step, self.agent.updates)
         turn = self._player.recv()
         self._follow(turn)
-        self._store(turn)
+        self.memory.add(turn)
         self.step += 1
-        table = self._table
-        drawn = msgspec.structs.replace(
-            self.trainer.drawn,
-            inserted=self.step,
-            size=len(table),
-            evicted=table.evicted,
-            evicted_unsampled=table.evicted_unsampled,
-            terminal=table.terminal,
-        )
-        for _ in range(self._updates_due()):
-            batch = table.sample(learner.batch_size)
+        drawn = msgspec.structs.replace(self.trainer.drawn, inserted=self.step, **self.memory.counters())
+        for batch in self.memory.batches(self.step):
             effects = self.trainer.train(batch, drawn, time.monotonic())
             if effects.priorities is not None:
-                table.update_priorities(batch.ids, effects.priorities)
+                self.memory.update_priorities(batch.ids, effects.priorities)
             yield effects
         ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in turn.ended.items())
         yield self.trainer.receive(msgspec.structs.replace(drawn, episodes=ended))
@@ -100,19 +80,6 @@ class Lockstep:
         newest = steps.next_obs[0, -1] if self.env.spec.stack > 1 else steps.next_obs
         for shown in (newest, steps.raw_rewards, steps.terminated, *([steps.obs] if steps.restarted[0] else [])):
             self._seen = zlib.crc32(shown.tobytes(), self._seen)
-
-    def _store(self, turn: Turn) -> None:
-        for segment in self._segments.add(turn.actions, turn.steps, turn.version, turn.ended):
-            self._table.insert(segment)
-
-    def _updates_due(self) -> int:
-        """Number of updates that the replay ratio requires after this step."""
-        return self._updates_by(self.step) - self._updates_by(self.step - 1)
-
-    def _updates_by(self, step: int) -> int:
-        """Number of updates after the first `step` steps."""
-        settings = self.config.replay
-        return math.floor(settings.ratio * max(0, step - settings.learning_starts))
 
     def save(self, directory: RunDirectory) -> None:
         """Save an epoch that `restore` continues exactly to the bit.
@@ -132,8 +99,7 @@ class Lockstep:
         mark = Mark(directory.run_id(), 0)
 
         def snapshot(folder: str) -> None:
-            path = directory.path / folder / "replay"
-            save_snapshot(self._replay.snapshot(self.agent.updates), threading.Condition(), path, mark)
+            self.memory.save(directory.path / folder / "replay", mark, self.agent.updates)
 
         try:
             save_epoch(directory.path, self.agent.updates, state, snapshot)
@@ -152,8 +118,8 @@ class Lockstep:
             RunError: the environment is not deterministic: its observations, rewards or ends differ from the run's.
         """
         state = load_learner(epoch)
-        if old_checkpoints.is_old(epoch):
-            state = old_checkpoints.load(epoch, state, self._table, self._replay_actions)
+        if isinstance(self.memory, TableMemory) and old_checkpoints.is_old(epoch):
+            state = old_checkpoints.load(epoch, state, self.memory.table, self._replay_actions)
         elif "player" not in state:
             raise UsageError(f"{epoch}: saved by a distributed run; coop-local --resume continues it")
         else:
@@ -163,7 +129,7 @@ class Lockstep:
                     f"{epoch}: {self.config.env.id} showed something else when the run's {len(self._actions):,} "
                     "actions were played again; a lockstep run goes on only where the seed determines the environment"
                 )
-            load_snapshot(self._replay, epoch / "replay", read_run_id(epoch.parents[1]))
+            self.memory.load(epoch / "replay", read_run_id(epoch.parents[1]))
         self.trainer.load_state(state, time.monotonic())
         set_generator_state(self._policy_rng, state["player"]["policy"])
         self.step = self.trainer.drawn.inserted
@@ -171,8 +137,8 @@ class Lockstep:
         return sizes
 
     def _replay_actions(self, actions: Iterable[int]) -> None:
-        """Play the actions of a run again; the table is restored separately, from its snapshot."""
+        """Play the actions of a run again; the memory is restored separately."""
         for step, action in enumerate(actions):
             turn = self._player.replay(np.array([action], np.int32))
-            self._segments.add(turn.actions, turn.steps, self._updates_by(step), turn.ended)
+            self.memory.follow(turn, step)
             self._follow(turn)

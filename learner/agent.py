@@ -119,6 +119,10 @@ class Agent:
             self._networks[1].load(self.networks[0].flat)
             self.versions[1] = self.updates
 
+    def epsilon(self, env_step: int) -> float:
+        """Probability of a random action after `env_step` environment steps."""
+        return schedules.epsilon(self.config.actor, env_step)
+
     def exploration_rate(self) -> float:
         """The present scale of s; 0 for the gradient methods."""
         return 0.0 if self.config.feedback == "none" else schedules.exploration_rate(self.config.edl, self.updates)

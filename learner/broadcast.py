@@ -6,7 +6,7 @@ from common.messaging.keys import role_key, weights_key
 from common.messaging.messages.weights import Current, Role, Weights
 from common.messaging.transport import Node
 from common.messaging.wire import Message
-from learner.agent import Agent
+from learner.protocol import Agent
 
 
 class Broadcaster:

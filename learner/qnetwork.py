@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.errors import UsageError
-from common.networks.network import FlatNetwork, build_network, preprocess, sample_inputs
+from common.networks.network import FlatNetwork, preprocess, sample_inputs
+from common.registry import loaded
 from common.settings.config import RunConfig
+from common.settings.methods import METHODS
 from common.types import Batch, EnvSpec
 from learner.edl.arrays import AnyArray, assign, convert_like
 from learner.edl.feedback import FeedbackRule
@@ -135,7 +137,8 @@ def make_network(
 ) -> FlatNetwork:
     """Make network 0 or 1 with its initial parameters; they are equal if the second network is a copy."""
     seed = int(np.random.SeedSequence([config.seed, number if config.two_networks else 0]).generate_state(1)[0])
-    return FlatNetwork(build_network(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
+    build = loaded(METHODS.get(config.method).network, f"method {config.method!r}")
+    return FlatNetwork(build(config.network.kind, spec, config.network.hidden, seed).to(device, dtype))
 
 
 def make_q_network(

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from common.messaging.messages.sample import Drawn
 from common.returns import RETURN_WINDOW
 from common.types import Array, Batch
-from learner.agent import Agent, Update
+from learner.agent import Update
 from learner.diagnostics import Diagnostics
+from learner.protocol import Agent
 
 
 class Telemetry:

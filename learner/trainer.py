@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.messaging.messages.sample import Drawn, EpisodeRecord
-from common.settings import schedules
 from common.types import Batch
-from learner.agent import Agent
+from learner.protocol import Agent
 from learner.telemetry import Telemetry
 
 METRICS_EVERY = 200  # updates
@@ -126,7 +125,7 @@ class Trainer:
 
     def epsilon(self) -> float:
         """The actors' epsilon at the environment steps last received."""
-        return schedules.epsilon(self.config.actor, self.drawn.inserted)
+        return self.agent.epsilon(self.drawn.inserted)
 
     def seconds(self, now: float) -> float:
         """Seconds that the run has taken, over all its resumptions."""

@@ -161,7 +161,7 @@ def test_an_epoch_of_the_old_format_goes_on_to_the_byte(tmp_path: Path) -> None:
         run.save(directory)
         epoch = tmp_path / "run" / "checkpoints" / str(run.agent.updates)
         state = load_learner(epoch)
-        meta, arrays = whole_state(run._table)
+        meta, arrays = whole_state(run.memory.table)
     shutil.rmtree(epoch / "replay")
     (epoch / "replay").mkdir()
     played = state.pop("player")
@@ -195,7 +195,7 @@ def test_steps_that_wait_for_their_return_come_back_with_a_resumed_run(tmp_path:
             for _ in range(30):
                 for _ in run.play():
                     pass
-            tables.append(whole_state(run._table)[1])
+            tables.append(whole_state(run.memory.table)[1])
             run.env.close()
     assert tables[0].keys() == tables[1].keys()
     for name, column in tables[0].items():

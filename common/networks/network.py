@@ -20,6 +20,7 @@ from common.errors import UsageError
 from common.networks.convolution import ConvolutionNetwork
 from common.networks.custom import custom_network
 from common.networks.dense import Dense
+from common.networks.normalised import NormalisedNetwork
 from common.settings.config import NETWORK_KINDS
 from common.types import EnvSpec
 
@@ -149,8 +150,8 @@ def _function(layer: nn.Module, fresh: bool) -> Callable[[Tensor], Tensor]:
     return layer
 
 
-def _in_numpy(module: nn.Module) -> Dense | None:
-    return next((form(module) for form in (Dense, ConvolutionNetwork) if form.fits(module)), None)
+def _in_numpy(module: nn.Module) -> Dense | NormalisedNetwork | None:
+    return next((form(module) for form in (Dense, ConvolutionNetwork, NormalisedNetwork) if form.fits(module)), None)
 
 
 class FlatNetwork:

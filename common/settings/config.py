@@ -233,6 +233,11 @@ class RunConfig:
         return METHODS.get(self.method).two_networks
 
     @cached_property
+    def streaming(self) -> bool:
+        """True for methods that learn from each step once and have no replay buffer."""
+        return METHODS.get(self.method).stream is not None
+
+    @cached_property
     def swap_period(self) -> int:
         """C of this method, in `learner.swap_unit`: the period of role swaps, or of copies to the target network."""
         settings = self.learner
@@ -245,7 +250,9 @@ class RunConfig:
 
 
 def value_of(config: RunConfig, name: str) -> Any:  # noqa: ANN401 (a value of any field)
-    """The value of a setting by its dotted name; None for one of another method."""
+    """The value of a setting by its dotted name; None for one of another method, 0 for the capacity of no buffer."""
+    if name == "replay.capacity" and config.streaming:
+        return 0
     section, _, field_name = name.partition(".")
     if section == METHODS.get(config.method).table:
         return getattr(config.own, field_name, None)
@@ -255,6 +262,8 @@ def value_of(config: RunConfig, name: str) -> Any:  # noqa: ANN401 (a value of a
 
 def check_distributed(config: RunConfig) -> None:
     """Raise UsageError for settings of lockstep runs only: with many actors there is no single step or episode."""
+    if config.streaming:
+        raise UsageError(f"method = {config.method!r}: in lockstep runs only; it has no replay buffer to share")
     if config.learner.swap_unit == "steps":
         raise UsageError("learner.swap_unit = 'steps': in lockstep runs only; the roles' processes count updates")
     if config.learner.reset_role_at_episode:

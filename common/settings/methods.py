@@ -20,6 +20,10 @@ class Method:
     error_driven: error-driven learning feeds the error back; if False, the ordinary gradient does.
     rule: of the targets and the extra cost: a `learner.methods.rule.Rule`, or "module:Class" to import it in the
         learner only.
+    network: makes the Q-network, with the arguments and result of `common.networks.network.build_network`;
+        "module:function" to import it where networks are made.
+    stream: for a method without a replay buffer, its agent, a class like `learner.methods.stream_q:StreamAgent`, or
+        "module:Class"; such a method runs in lockstep only. None: updates with batches from a replay table.
     settings: a frozen dataclass of the method's own settings, which a config holds in the table `Method.table`.
     conditions: on which these settings have an effect.
     colour: in figures; None: the next one that is free.
@@ -30,6 +34,8 @@ class Method:
     two_networks: bool = False
     error_driven: bool = False
     rule: str | Callable[..., Any] = "learner.methods.rule:Rule"
+    network: str | Callable[..., Any] = "common.networks.network:build_network"
+    stream: str | Callable[..., Any] | None = None
     settings: type[Any] | None = None
     conditions: tuple[Condition, ...] = ()
     colour: str | None = None
@@ -57,5 +63,6 @@ METHODS = Registry(
         "g-coop": Method("g-coop", "two networks, gradient", two_networks=True, colour="#56B4E9"),
         "coop": Method("coop", "two networks, error-driven", True, True, colour="#D55E00"),
         "medqn": "common.settings.medqn:MEDQN",
+        "stream-q": "common.settings.stream_q:STREAM_Q",
     },
 )

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from common.networks.convolution import ConvolutionNetwork
+from common.networks.dense import Dense
 from common.networks.network import FlatNetwork
 from learner.edl.arrays import AnyArray, convert_like
 from learner.edl.convolution import ConvolutionChain
@@ -34,7 +35,7 @@ class Trainable:
 
     def __init__(self, network: FlatNetwork, in_numpy: bool, example: Tensor | None) -> None:
         """in_numpy: use numpy if the network has a form in numpy. example: see `make_passes`, which may raise."""
-        form = network.in_numpy if in_numpy else None
+        form = network.in_numpy if in_numpy and isinstance(network.in_numpy, Dense) else None
         self.in_numpy = form is not None
         self.values = form or network
         theta, gradient = network.flat, torch.zeros_like(network.flat)

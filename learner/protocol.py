@@ -1,0 +1,62 @@
+"""What the trainer and its records ask of an agent: one with a replay table, or one that learns from single steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from common.networks.network import FlatNetwork
+from common.settings.config import RunConfig
+from common.types import Array, Batch, EnvSpec
+from learner.agent import Update
+from learner.losses import Loss
+
+
+class Agent(Protocol):
+    """See `learner.agent.Agent` for the attributes."""
+
+    config: RunConfig
+    spec: EnvSpec
+    loss: Loss
+
+    @property
+    def acting(self) -> int:
+        """Index of the network that acts and is trained, 0 or 1."""
+
+    @property
+    def updates(self) -> int:
+        """Number of updates done."""
+
+    @property
+    def networks(self) -> Sequence[FlatNetwork]:
+        """The parameters of both networks."""
+
+    @property
+    def versions(self) -> Sequence[int]:
+        """`updates` at each network's last change."""
+
+    def update(self, batch: Batch) -> Update:
+        """Learn from a batch."""
+
+    def swap(self) -> None:
+        """Change the acting role, or what the method does instead."""
+
+    def epsilon(self, env_step: int) -> float:
+        """Probability of a random action after `env_step` environment steps."""
+
+    def exploration_rate(self) -> float:
+        """The present scale of s."""
+
+    def finite(self) -> bool:
+        """True while every parameter is finite."""
+
+    def q_values(self, obs: Array) -> tuple[Tensor, Tensor]:
+        """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
+
+    def state(self) -> dict[str, Any]:
+        """The state for `load_state`."""
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore a state from `state`."""
