@@ -8,6 +8,8 @@ The methods (`common.settings.methods`) differ only in these:
     g-coop   independent      the other network  none                                  none
     coop     independent      the other network  transform | weight-gradient | random  none
     medqn    copy of first    copied every C     none                                  Q away from the target network's
+
+A method without a replay buffer has an agent of its own (`learner.methods.stream_q`).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from common.settings.resuming import check_resumed
 from common.settings.sources import base_config
 from common.settings.tables import load_tables, preset_names, resolve, to_tables, to_toml, validated
 
-METHODS = ["dqn", "edql", "g-coop", "coop", "medqn"]
+METHODS = ["dqn", "edql", "g-coop", "coop", "medqn", "stream-q"]
 
 
 def parsed(flags: list[str], monkeypatch: pytest.MonkeyPatch, *, lockstep: bool = False) -> RunConfig:
@@ -104,6 +104,16 @@ def test_tables_of_methods_are_checked(text: str, words: str) -> None:
         (["--env.no-episodic-life"], ["env.episodic-life"]),
         (["--method", "medqn", "--medqn.epochs", "2", "--medqn.states", "real"], []),
         (["--method", "dqn", "--medqn.epochs", "2"], ["medqn.epochs"]),
+        (["--method", "stream-q", "--stream-q.trace-decay", "0.9", "--learner.gamma", "0.9", "--seed", "3"], []),
+        (
+            ["--method", "stream-q", "--replay.capacity", "900", "--learner.double", "--actor.epsilon-final", "0"],
+            ["actor.epsilon-final", "learner.double", "replay.capacity"],
+        ),
+        (
+            ["--method", "stream-q", "--stream-q.epsilon-start", "0.01", "--stream-q.epsilon-share", "0.5"],
+            ["stream-q.epsilon-share"],
+        ),
+        (["--stream-q.trace-decay", "0.9"], ["stream-q.trace-decay"]),
         (
             ["--method", "medqn", "--medqn.lambda-start", "0", "--medqn.lambda-end", "0", "--medqn.states", "real"],
             ["medqn.states"],

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from common.types import Array
 
 Floats = NDArray[np.float32]
+_UNSCALED = np.ones((1, 1), np.float32)
 
 
 class Standardize(nn.Module):
@@ -35,7 +36,7 @@ class Record(NamedTuple):
 
     inputs: float32 [batch, in], or [batch, in, places] of a convolution. normalised: float32 [batch, out * places],
     the pre-activations after normalisation, or the network's output. scale: float32 [batch, 1], the reciprocal of the
-    standard deviation by which they were divided.
+    standard deviation by which they were divided; of the output, that of a batch of one.
     """
 
     inputs: Floats
@@ -47,7 +48,8 @@ class Layer:
     """One Linear or Conv2d layer.
 
     weight: float32 [out, in]. bias: float32 [out]. windows: int [in, places], which inputs a kernel sees at each place;
-    None for a Linear layer.
+    None for a Linear layer. average: float32 [out * places, 1], by which a product gives the mean of pre-activations
+    in a fraction of the time of `mean`.
     """
 
     def __init__(self, module: nn.Linear | nn.Conv2d, shape: tuple[int, ...]) -> None:
@@ -56,6 +58,8 @@ class Layer:
         self.weight: Floats = module.weight.detach().flatten(1).numpy()
         self.bias: Floats = module.bias.detach().numpy()
         self.windows = _windows(module, shape) if isinstance(module, nn.Conv2d) else None
+        size = len(self.bias) * (1 if self.windows is None else self.windows.shape[1])
+        self.average = np.full((size, 1), 1 / size, np.float32)
 
     def __call__(self, x: Floats) -> tuple[Floats, Floats]:
         """What the layer sees (see `Record`), and its pre-activations, float32 [batch, out * places]."""
@@ -101,13 +105,13 @@ class NormalisedNetwork:
             h: Floats = ((x - self.mean) / self.sd).reshape(len(x), -1)
             for layer in self.layers[:-1]:
                 seen, y = layer(h)
-                size = np.float32(1 / y.shape[1])
-                y -= size * y.sum(1, keepdims=True)
-                scale = 1 / np.sqrt(size * (y * y).sum(1, keepdims=True) + self._eps)
+                average = layer.average
+                y -= y.dot(average)
+                scale = 1 / np.sqrt((y * y).dot(average) + self._eps)
                 y *= scale
                 records.append(Record(seen, y, scale))
                 h = np.maximum(y, self.slope * y)
-            records.append(Record(*self.layers[-1](h), np.ones((len(h), 1), np.float32)))
+            records.append(Record(*self.layers[-1](h), _UNSCALED))
         return records
 
 

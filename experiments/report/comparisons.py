@@ -92,7 +92,7 @@ def sizes_table(study: Study) -> ResultTable:
     values = by_seed(study, score)
     for others in _slices(study):
         small, large = _halves(study, others)
-        for method in study.methods:
+        for method in study.buffered:
             whole = values[method].reindex(columns=[*small, *large]).dropna()
             low, high = whole[small].mean(axis="columns"), whole[large].mean(axis="columns")
             rows.append([_words(study, others), method, low.mean(), high.mean(), *over_seeds(high - low), len(whole)])
@@ -107,7 +107,7 @@ def interaction_table(study: Study) -> ResultTable:
         values = by_seed(study, measure)
         for others in _slices(study):
             small, large = _halves(study, others)
-            for x, y in pairs(study.methods):
+            for x, y in pairs(study.buffered):
                 apart = differences(values, x, y).reindex(columns=[*small, *large]).dropna()
                 low, high = apart[small].mean(axis="columns"), apart[large].mean(axis="columns")
                 where = _words(study, others)
@@ -175,12 +175,12 @@ def _threshold(environment: str) -> str:
 def _halves(study: Study, others: Setting | None) -> tuple[list[int], list[int]]:
     """Indices of the settings with the smaller and the larger half of the capacities; of all other axes if None."""
     place = study.axes.index(CAPACITY)
-    sizes = sorted({setting[place] for setting in study.settings})
+    sizes = sorted({setting[place] for setting in study.settings if setting[place]})
     split = sizes[math.ceil(len(sizes) / 2) - 1]
     chosen = [
         (number, setting[place] <= split)
         for number, setting in enumerate(study.settings)
-        if others is None or setting[:place] + setting[place + 1 :] == others
+        if setting[place] and (others is None or setting[:place] + setting[place + 1 :] == others)
     ]
     return [number for number, small in chosen if small], [number for number, small in chosen if not small]
 
@@ -197,7 +197,7 @@ def _words(study: Study, others: Setting | None) -> str:
 
 
 def _sizes_note(study: Study) -> str:
-    sizes = sorted({int(value_of(run.config, CAPACITY)) for run in study.runs})
+    sizes = sorted({int(value_of(run.config, CAPACITY)) for run in study.runs if not run.config.streaming})
     half = math.ceil(len(sizes) / 2)
     small, large = (", ".join(map(str, part)) for part in (sizes[:half], sizes[half:]))
     seeds = "Means over the seeds that have all of them, 95 % bootstrap intervals over seeds."

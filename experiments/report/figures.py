@@ -100,9 +100,12 @@ def buffers(study: Study) -> Figure:
             if capacities:
                 mean = np.array([each.mean() for each in scores])
                 sd = np.array([each.std(ddof=1) if len(each) > 1 else 0.0 for each in scores])
-                lines.append(Line(method, np.array(capacities, np.float64), Interval(mean, mean - sd, mean + sd)))
+                at, interval = np.array(capacities, np.float64), Interval(mean, mean - sd, mean + sd)
+                lines.append(Line(method, at, interval, dashed=method not in study.buffered))
         panels.append(Panel(_without(study, CAPACITY, others), "capacity", "return", lines, marks=True, wide_x=True))
     text = "Mean over runs of the return of the last 100 episodes; error bars: one standard deviation over runs."
+    if len(study.buffered) < len(study.methods):
+        text += " Dashed: without a replay buffer, so that its runs are those of size 0 everywhere."
     return Figure("buffers", "Mean return against buffer size", text, counts(study.runs), panels, same_y=True)
 
 
@@ -117,7 +120,7 @@ def diagnostics(study: Study) -> Figure:
     for others in other_settings(study, CAPACITY)[:MOST_PANELS]:
         for name, words in names.items():
             lines = []
-            for method in study.methods:
+            for method in study.buffered:
                 capacities, values = along(study, CAPACITY, method, others, partial(diagnostic, name=name))
                 points = [(c, v[~np.isnan(v)]) for c, v in zip(capacities, values, strict=True)]
                 points = [(c, v) for c, v in points if len(v)]
@@ -183,7 +186,7 @@ def _curves(
     for setting in settings:
         lines = []
         for method in study.methods:
-            runs = [run for run in study.of(method, setting) if usable(run)]
+            runs = [run for run in study.of_beside(method, setting) if usable(run)]
             if runs:
                 lines.append(_line(method, *curve(runs)))
                 used += runs

@@ -101,8 +101,11 @@ def over_seeds(values: Sequence[float] | Floats) -> Estimate:
 
 
 def by_seed(study: Study, measure: Callable[[Run], float]) -> pd.DataFrame:
-    """A measure of every run: a row per seed, columns (method, index of the setting); nan if there is no run."""
-    measured = study.frame.assign(value=study.frame["run"].map(measure))
+    """A measure of every run: a row per seed, columns (method, index of the setting); nan if there is no run.
+
+    Runs without a replay buffer count at each setting of the others' buffers.
+    """
+    measured = study.beside.assign(value=study.beside["run"].map(measure))
     return measured.pivot_table("value", "seed", ["method", "setting"], aggfunc="last")
 
 

@@ -31,6 +31,7 @@ class Line:
     label: str
     x: Floats
     y: Interval
+    dashed: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def _draw_panel(axes: Axes, panel: Panel, colours: dict[str, str]) -> None:
         value, low, high = line.y
         if panel.marks:
             below, above = (value - low).clip(0), (high - value).clip(0)
-            style = "o" if panel.ticks else "o-"
+            style = "o" if panel.ticks else "o--" if line.dashed else "o-"
             axes.errorbar(line.x, value, (below, above), fmt=style, capsize=3, color=colour, label=line.label)
         else:
             axes.plot(line.x, value, color=colour, label=line.label)
@@ -130,7 +131,11 @@ def _colour(label: str, taken: Sequence[str]) -> str:
 
 def _spread_x(axes: Axes, panel: Panel) -> None:
     values = sorted({float(x) for line in panel.lines for x in line.x})
-    if values and values[-1] >= DECADE * values[0]:
-        axes.set_xscale("log")
+    sizes = [value for value in values if value]
+    if sizes and sizes[-1] >= DECADE * sizes[0]:
+        if len(sizes) == len(values):
+            axes.set_xscale("log")
+        else:
+            axes.set_xscale("symlog", linthresh=sizes[0], linscale=0.5)  # 0 has no place on a logarithmic axis
         axes.set_xticks(values, [f"{value:g}" for value in values], rotation=45)
         axes.minorticks_off()

@@ -44,7 +44,7 @@ def paper_table(study: Study) -> ResultTable:
             env if axis == "env.id" else value for axis, value in zip(study.axes, study.reference, strict=True)
         )
         for method in dict.fromkeys([*PAPER_METHODS, *study.methods]):
-            runs = study.of(method, setting)
+            runs = study.of_beside(method, setting)
             paper = column.get(method, (None, None))
             rows.append([env, method, *paper, *_over_runs(runs), *_lengths(runs)])
     columns = [

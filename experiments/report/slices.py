@@ -29,17 +29,21 @@ def along(
 ) -> tuple[list[int], list[Floats]]:
     """The values of one axis, others fixed, at which a method has runs, and a measure of the runs at each value."""
     place = study.axes.index(axis)
-    settings = [s for s in study.settings if s[:place] + s[place + 1 :] == others and study.of(method, s)]
-    measured = [np.array([measure(run) for run in study.of(method, setting)]) for setting in settings]
+    settings = [s for s in study.settings if s[:place] + s[place + 1 :] == others and study.of_beside(method, s)]
+    measured = [np.array([measure(run) for run in study.of_beside(method, setting)]) for setting in settings]
     return [setting[place] for setting in settings], measured
 
 
 def matrices(study: Study) -> dict[str, Floats]:
-    """Scores float64 [seeds, settings] of each method, over the settings and seeds that all methods have."""
+    """Scores float64 [seeds, settings] of each method, over the settings and seeds that all methods have.
+
+    If settings of the replay buffer differ, methods without one are left out: they have one set of runs for all sizes.
+    """
+    methods = study.buffered if any(axis.startswith("replay.") for axis in study.axes) else study.methods
     scores = study.frame.assign(score=study.frame["run"].map(score))
     tables = {
         method: scores[scores["method"] == method].pivot_table("score", "seed", "setting", aggfunc="last")
-        for method in study.methods
+        for method in methods
     }
     shared = sorted(set.intersection(*(set(table.columns) for table in tables.values())))
     whole = {method: table.reindex(columns=shared).dropna().to_numpy() for method, table in tables.items()}
@@ -53,7 +57,8 @@ def pairs(methods: Sequence[str]) -> list[tuple[str, str]]:
 
 def counts(runs: Sequence[Run]) -> str:
     """The numbers of runs and the seeds by method: "dqn: 12 runs, seeds 0,1; coop: 6 runs, seeds 0-2"."""
-    by_method = pd.Series(runs, dtype=object).groupby([run.config.method for run in runs], sort=False)
+    distinct = list({run.name: run for run in runs}.values())
+    by_method = pd.Series(distinct, dtype=object).groupby([run.config.method for run in distinct], sort=False)
     return "; ".join(f"{method}: {len(group)} runs, seeds {seeds_of(list(group))}" for method, group in by_method)
 
 

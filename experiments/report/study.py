@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +24,8 @@ from experiments.sweep.grid import parse_grid
 
 Floats = NDArray[np.float64]
 Setting = tuple[Any, ...]  # a value for each axis
+
+Groups = Mapping[tuple[str, int], list["Run"]]  # runs by method and index of the setting
 
 SERIES = ("env_step", "q_gap", "sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
 Q_SIZE, Q_BOUND = "q_abs_mean", "q_bound"  # missing in runs of earlier versions
@@ -74,6 +76,11 @@ class Study:
         return [method for method in METHODS.names() if any(run.config.method == method for run in self.runs)]
 
     @property
+    def buffered(self) -> list[str]:
+        """The methods with a finished run that have a replay buffer."""
+        return [method for method in self.methods if METHODS.get(method).stream is None]
+
+    @property
     def environments(self) -> list[str]:
         """The environments of the runs."""
         return sorted({run.config.env.id for run in self.runs})
@@ -104,21 +111,52 @@ class Study:
     @cached_property
     def frame(self) -> pd.DataFrame:
         """A row per run, ordered by seed: `run`, `method`, `seed` and `setting`, the index in `settings`."""
+        return self._frame(lambda run: [self.setting(run)])
+
+    @cached_property
+    def beside(self) -> pd.DataFrame:
+        """Like `frame`, but a run without a replay buffer has a row at each setting of the others' buffers."""
+        return self._frame(self._settings_beside)
+
+    def _frame(self, settings_of: Callable[[Run], Sequence[Setting]]) -> pd.DataFrame:
         places = {setting: place for place, setting in enumerate(self.settings)}
-        rows = [(run, run.config.method, run.config.seed, places[self.setting(run)]) for run in self.runs]
+        rows = [(run, run.config.method, run.config.seed, places[at]) for run in self.runs for at in settings_of(run)]
         return pd.DataFrame(rows, columns=["run", "method", "seed", "setting"]).sort_values("seed", kind="stable")
+
+    def _settings_beside(self, run: Run) -> list[Setting]:
+        """The settings at which a run is compared with others."""
+        own = self.setting(run)
+        if not run.config.streaming:
+            return [own]
+        fixed = [place for place, axis in enumerate(self.axes) if not axis.startswith("replay.")]
+        return [setting for setting in self.settings if all(setting[place] == own[place] for place in fixed)]
 
     def of(self, method: str, setting: Setting) -> list[Run]:
         """The runs of one method at one setting, ordered by seed."""
-        return self._groups.get((method, self.settings.index(setting)), []) if setting in self.settings else []
+        return self._find(self._groups, method, setting)
+
+    def of_beside(self, method: str, setting: Setting) -> list[Run]:
+        """The runs with which others at a setting are compared: as `of`, or those without a replay buffer."""
+        return self._find(self._groups_beside, method, setting)
+
+    def _find(self, groups: Groups, method: str, setting: Setting) -> list[Run]:
+        return groups.get((method, self.settings.index(setting)), []) if setting in self.settings else []
 
     @cached_property
-    def _groups(self) -> dict[tuple[str, int], list[Run]]:
-        return {key: list(runs) for key, runs in self.frame.groupby(["method", "setting"])["run"]}
+    def _groups(self) -> Groups:
+        return _grouped(self.frame)
+
+    @cached_property
+    def _groups_beside(self) -> Groups:
+        return _grouped(self.beside)
 
     def index(self, axis: str) -> int | None:
         """The index of an axis in a setting; None if the runs do not differ in it."""
         return self.axes.index(axis) if axis in self.axes else None
+
+
+def _grouped(frame: pd.DataFrame) -> Groups:
+    return {key: list(runs) for key, runs in frame.groupby(["method", "setting"])["run"]}
 
 
 def load_study(path: Path) -> Study:

@@ -20,6 +20,7 @@ from common.errors import UsageError
 from common.settings.config import RunConfig, check_distributed
 from common.settings.environment import EnvSettings
 from common.settings.fields import Count, Positive
+from common.settings.methods import METHODS
 from common.settings.names import MethodName
 from common.settings.overrides import leaves, merged, nested, of_method
 from common.settings.renamed import current
@@ -124,7 +125,7 @@ def _text(name: str) -> str:
 
 def _cells(file: GridFile) -> tuple[Cell, ...]:
     axes = _axes(file)
-    names = _short_names(tuple(axes))
+    names = dict(zip(axes, _short_names(tuple(axes)), strict=True))
     preset = load_tables(file.preset, None)
 
     @cache
@@ -133,13 +134,18 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
 
     cells = []
     for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
-        total_steps = dict(zip(axes, values, strict=True)).get(("total_steps",), file.fixed.get("total_steps"))
+        chosen = dict(zip(axes, values, strict=True))
+        if METHODS.get(method).stream is not None:
+            if any(value != axes[path][0] for path, value in chosen.items() if path[0] == "replay"):
+                continue  # it has no replay buffer: one cell for all settings of the others'
+            chosen = {path: value for path, value in chosen.items() if path[0] != "replay"}
+        total_steps = chosen.get(("total_steps",), file.fixed.get("total_steps"))
         fits = type(total_steps) is int and total_steps > 0  # other values are refused below
         start = base(method, total_steps if fits else None)
         tables = merged(start, current(file.fixed, start["learner"]["optimizer"]))
-        for path, value in zip(axes, values, strict=True):
+        for path, value in chosen.items():
             tables = merged(tables, current(nested(path, value), tables["learner"]["optimizer"]))
-        parts = [f"{name}={_word(value)}" for name, value in zip(names, values, strict=True)]
+        parts = [f"{names[path]}={_word(value)}" for path, value in chosen.items()]
         config = validated({**of_method(tables, method), "seed": seed})
         cells.append(Cell("-".join([method, *parts, f"seed={seed}"]), config))
     for cell in cells:

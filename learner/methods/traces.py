@@ -40,7 +40,7 @@ class Traces:
         for number in reversed(range(len(records))):
             layer, record = self._form.layers[number], records[number]
             if number < len(records) - 1:
-                slope = self._before_normalisation(slope, record)
+                slope = self._before_normalisation(slope, record, layer.average[:, 0])
             if layer.windows is None:
                 self._weights[number].addr_(torch.from_numpy(slope), torch.from_numpy(record.inputs[0]))
                 self._biases[number] += slope
@@ -51,13 +51,11 @@ class Traces:
                 self._weights[number] += torch.from_numpy(at_places.dot(record.inputs[0].T))
                 self._biases[number] += at_places.sum(1)
 
-    def _before_normalisation(self, slope: Floats, record: Record) -> Floats:
+    def _before_normalisation(self, slope: Floats, record: Record, average: Floats) -> Floats:
         """The slope float32 [n] at a layer's pre-activations, from that at the outputs of its leaky ReLUs."""
         y = record.normalised[0]
         slope = np.where(y > 0, slope, self._form.slope * slope)
-        size = np.float32(1 / len(y))
-        slope -= size * slope.sum()
-        slope -= size * y.dot(slope) * y
+        slope -= slope.dot(average) + y * (y * slope).dot(average)
         slope *= record.scale[0]
         return slope
 
