@@ -144,7 +144,7 @@ class Batch:
 
     def columns(self) -> dict[str, Array]:
         """All arrays except the frames, by name."""
-        return {column.name: getattr(self, column.name) for column in fields(self) if column.name != "frames"}
+        return {column.name: getattr(self, column.name) for column in fields(Batch) if column.name != "frames"}
 
 
 def _one_each(count: int) -> NDArray[np.uint8]:

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from common.networks.network import preprocess
 from common.types import Batch
-from learner.agent import Agent
 from learner.losses import td_errors
+from learner.protocol import Agent
 from learner.qnetwork import on_host
 
 ARCHIVED = 128  # transitions

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from torch import Tensor
+import torch
 
 from common.networks.network import FlatNetwork
 from common.settings.config import RunConfig
 from common.types import Array, Batch, EnvSpec
 from learner.agent import Update
-from learner.losses import Loss
+from learner.losses import Loss, Values
+from learner.methods.rule import Rule
 
 
 class Agent(Protocol):
@@ -20,6 +21,8 @@ class Agent(Protocol):
     config: RunConfig
     spec: EnvSpec
     loss: Loss
+    device: torch.device
+    rule: Rule
 
     @property
     def acting(self) -> int:
@@ -52,7 +55,7 @@ class Agent(Protocol):
     def finite(self) -> bool:
         """True while every parameter is finite."""
 
-    def q_values(self, obs: Array) -> tuple[Tensor, Tensor]:
+    def q_values(self, obs: Array) -> tuple[Values, Values]:
         """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
 
     def state(self) -> dict[str, Any]:

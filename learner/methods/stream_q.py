@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from common.networks.network import FlatNetwork, preprocess, q_values
+from common.networks.network import FlatNetwork, preprocess
 from common.networks.normalised import NormalisedNetwork
 from common.settings.config import RunConfig
 from common.settings.stream_q import StreamQSettings
 from common.types import Array, Batch, EnvSpec
 from learner.agent import Update
-from learner.losses import LOSSES
+from learner.losses import LOSSES, Values
 from learner.methods.moments import RewardScale, RunningMoments
+from learner.methods.rule import Rule
 from learner.methods.traces import Traces, bounded_step
 from learner.qnetwork import make_network
 
@@ -56,7 +56,9 @@ class StreamAgent:
         self.loss = LOSSES["squared"]
         self.updates = 0
         self._settings = config.own
-        self._network = make_network(config, spec, 0, torch.device("cpu"))
+        self.device = torch.device("cpu")
+        self.rule = Rule(config, np.random.default_rng(0))  # which draws no numbers
+        self._network = make_network(config, spec, 0, self.device)
         assert isinstance(self._network.in_numpy, NormalisedNetwork)
         self._form = self._network.in_numpy
         self._traces = Traces(self._network, self._form)
@@ -119,9 +121,9 @@ class StreamAgent:
         """True while every parameter is finite."""
         return math.isfinite(self._network.flat.sum().item()) or bool(torch.isfinite(self._network.flat).all())
 
-    def q_values(self, obs: Array) -> tuple[Tensor, Tensor]:
+    def q_values(self, obs: Array) -> tuple[Values, Values]:
         """Q, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape], twice."""
-        values = torch.from_numpy(q_values(self._network, obs, self.spec))
+        values = self._form(preprocess(obs, self.spec))
         return values, values
 
     def state(self) -> dict[str, Any]:
