@@ -81,8 +81,8 @@ def test_the_largest_segment_and_batch_that_are_allowed_fit_into_a_message() -> 
 
 
 def test_a_method_table_overrides_the_rest() -> None:
-    assert base_config(["--method", "g-coop"]).learner.optimizer == "adam"
-    assert base_config(["--method", "coop"]).learner.optimizer == "rmsprop"
+    assert base_config(["--preset", "cartpole-paper", "--method", "g-coop"]).learner.optimizer == "adam"
+    assert base_config(["--preset", "cartpole-paper", "--method", "coop"]).learner.optimizer == "rmsprop"
 
 
 @pytest.mark.parametrize(

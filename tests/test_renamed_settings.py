@@ -128,7 +128,7 @@ def test_earlier_flags(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["coop-lockstep", *flags])
+    monkeypatch.setattr("sys.argv", ["coop-lockstep", "--preset", "cartpole-paper", *flags])
     config = parse_run(RunOptions, "coop-lockstep", "", lockstep=True).run_config()
     assert {name: _value(config, name) for name in expected} == expected
     assert capsys.readouterr().err == (f"note: {line}\n" if line else "")
@@ -144,7 +144,8 @@ def _value(config: RunConfig, name: str) -> Any:
 def test_grids_of_earlier_versions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "g.toml"
     path.write_text(
-        'methods = ["coop", "g-coop"]\n[fixed]\nreplay.start = 50\nlearner.denominator = 1e-5\n'
+        'preset = "cartpole-paper"\nmethods = ["coop", "g-coop"]\n'
+        "[fixed]\nreplay.start = 50\nlearner.denominator = 1e-5\n"
         "[vary]\nlearner.squared_decay = [0.5, 0.6]\n"
     )
     cells = {cell.name: cell.config for cell in load_grid(str(path)).cells}

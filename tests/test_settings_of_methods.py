@@ -34,7 +34,7 @@ def test_the_config_of_a_run_of_one_method_gives_that_of_another(preset: str, fi
 def test_a_flag_of_the_first_run_stays_unless_the_second_method_has_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = parsed(["--learner.optimizer", "sgd", "--learner.gamma", "0.9"], monkeypatch)
+    config = parsed(["--preset=cartpole-paper", "--learner.optimizer=sgd", "--learner.gamma=0.9"], monkeypatch)
     file = tmp_path / "config.toml"
     file.write_text(to_toml(config))
     assert parsed([f"--config={file}"], monkeypatch) == config
@@ -89,7 +89,7 @@ def test_tables_of_methods_are_checked(text: str, words: str) -> None:
         ),
         (["--learner.target-update-every", "5"], ["learner.target-update-every"]),
         (["--method", "edql", "--learner.reset-role-at-episode"], ["learner.reset-role-at-episode"]),
-        (["--learner.beta1", "0.8", "--learner.alpha", "0.8"], ["learner.beta1"]),
+        (["--learner.optimizer", "rmsprop", "--learner.beta1", "0.8", "--learner.alpha", "0.8"], ["learner.beta1"]),
         (["--method", "g-coop", "--learner.beta2", "0.8", "--learner.alpha", "0.8"], ["learner.alpha"]),
         (["--learner.optimizer", "sgd", "--learner.eps", "1"], ["learner.eps"]),
         (["--learner.gradient-alpha", "0.5"], ["learner.gradient-alpha"]),
