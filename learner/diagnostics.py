@@ -18,7 +18,7 @@ from learner.losses import td_errors
 from learner.protocol import Agent
 from learner.qnetwork import on_host
 
-ARCHIVED = 128  # transitions
+ARCHIVED = 64  # transitions
 RANK_STATES = 32  # of the archive: no effective rank is larger; its time grows with their cube
 DORMANT_BELOW = 0.025  # tau of Sokar et al. 2023: share of the layer's mean activation
 RANK_LEFT_OUT = 0.01  # delta of Kumar et al. 2021: share of the sum of singular values
@@ -28,7 +28,7 @@ Layer = NDArray[np.float32]
 
 
 class Diagnostics:
-    """Keeps the first 128 transitions drawn, and measures the networks on them; changes nothing and draws no number.
+    """Keeps the first 64 transitions drawn, and measures the networks on them; changes nothing and draws no number.
 
     archive: those transitions, which stay as they are; None before the first batch.
     """

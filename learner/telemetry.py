@@ -19,7 +19,7 @@ from learner.protocol import Agent
 class Telemetry:
     """Collects from each update the values for a row of metrics.jsonl.
 
-    returns: of the last 100 episodes. diagnostics: what is measured on the first 128 transitions drawn.
+    returns: of the last 100 episodes. diagnostics: what is measured on the first 64 transitions drawn.
     largest_reward: the largest |reward| of all batches. q_abs_mean: mean |Q| of both networks over the states of those
     transitions at the last row. now: seconds of a monotonic clock.
     """

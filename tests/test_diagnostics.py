@@ -114,15 +114,15 @@ def test_the_archive_holds_the_first_transitions_for_good() -> None:
         diagnostics.add(batch(50, first))
     archive = diagnostics.archive
     assert archive is not None
-    assert len(archive) == 128
-    assert len(archive.frames) == 128 + 3  # each batch has one more frame than transitions
+    assert len(archive) == 64
+    assert len(archive.frames) == 64 + 2  # each batch has one more frame than transitions
     for index in ("obs_index", "next_index"):
-        frames, theirs = archive.frames[getattr(archive, index)], whole.frames[getattr(whole, index)[:128]]
+        frames, theirs = archive.frames[getattr(archive, index)], whole.frames[getattr(whole, index)[:64]]
         np.testing.assert_array_equal(frames, theirs)
     for name, column in whole.columns().items():
         assert getattr(archive, name).dtype == column.dtype
         if "index" not in name:
-            np.testing.assert_array_equal(getattr(archive, name), column[:128])
+            np.testing.assert_array_equal(getattr(archive, name), column[:64])
 
 
 def test_an_archived_batch_is_a_copy() -> None:

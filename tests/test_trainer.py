@@ -85,7 +85,7 @@ def test_a_row_of_metrics_every_200_updates() -> None:
     assert row["terminal_share"] == 8 / 80
 
 
-def test_q1_and_q2_are_compared_on_the_first_128_states() -> None:
+def test_q1_and_q2_are_compared_on_the_first_64_states() -> None:
     trainer = Trainer(Agent(CONFIG, SPEC), 0.0)
     source = batches()
     seen = []
@@ -95,7 +95,7 @@ def test_q1_and_q2_are_compared_on_the_first_128_states() -> None:
         trainer.train(batch, drawn(), 0.0)
     archive = trainer.telemetry.diagnostics.archive
     assert archive is not None
-    np.testing.assert_array_equal(archive.frames[archive.obs_index[:, 0]], np.concatenate(seen)[:128])
+    np.testing.assert_array_equal(archive.frames[archive.obs_index[:, 0]], np.concatenate(seen)[:64])
 
 
 def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
