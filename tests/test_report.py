@@ -17,7 +17,7 @@ from common.errors import RunError, UsageError
 from common.returns import running_mean
 from experiments.lockstep import Lockstep
 from experiments.report import cli
-from experiments.report.figures import figures
+from experiments.report.figures import NETWORKS, figures
 from experiments.report.measures import breaking_point, improvement, iqm_by_task
 from experiments.report.paper import table_1
 from experiments.report.results import breaking_table
@@ -86,6 +86,12 @@ def test_a_run_recomputed_from_its_episodes(name: str, study: Path, report: Path
     late = [line["sample_age_mean"] for line in lines if line["env_step"] >= lines[-1]["env_step"] / 2]
     assert float(told["sample_age_mean"]) == pytest.approx(statistics.fmean(late))
     assert float(told["evicted_unsampled"]) == pytest.approx(lines[-1]["evicted_unsampled"])
+    late = [line for line in lines if line["env_step"] >= lines[-1]["env_step"] / 2]
+    for column in ("archive_td_error", "archive_drift", "policy_churn", "dormant_share", "effective_rank"):
+        assert float(told[column]) == pytest.approx(statistics.fmean(line[column] for line in late if column in line))
+    assert float(told["terminal_share"]) == pytest.approx(statistics.fmean(line["terminal_share"] for line in late))
+    shares = [line["q_abs_mean"] / line["q_bound"] for line in late]
+    assert float(told["q_share"]) == pytest.approx(statistics.fmean(shares))
 
 
 def test_settings_and_breaking_points_recomputed(study: Path, report: Path) -> None:
@@ -140,12 +146,29 @@ def test_curves_recomputed(study: Path, report: Path) -> None:
     assert at["q_gap"][number] == pytest.approx(statistics.fmean(gaps))
 
 
+def test_curves_and_points_of_the_diagnostics(study: Path, report: Path) -> None:
+    runs = [study / f"coop-capacity=300-seed={seed}" for seed in (0, 1)]
+    lines = [[json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()] for run in runs]
+    points = [row for row in rows(report / "networks.csv") if "churn" not in row["panel"] and row["line"] == "coop"]
+    ends = [float(row["y"]) for row in points if row["panel"] == "effective rank of the last hidden layer"]
+    assert ends[-1] == pytest.approx(statistics.fmean(each[-1]["effective_rank"] for each in lines))
+    assert {row["panel"] for row in rows(report / "networks.csv")} == set(NETWORKS.values())
+    at = [row for row in rows(report / "networks_buffers.csv") if (row["line"], row["x"]) == ("coop", "300")]
+    means = [
+        statistics.fmean(line["terminal_share"] for line in each if line["env_step"] >= each[-1]["env_step"] / 2)
+        for each in lines
+    ]
+    assert [float(at[-1][name]) for name in ("y", "low", "high")] == pytest.approx(
+        [statistics.fmean(means), min(means), max(means)]
+    )
+
+
 def test_the_page_stands_alone_and_comes_out_the_same(study: Path, report: Path, tmp_path: Path) -> None:
     text = (report / "index.html").read_text()
     pictures = sorted(report.glob("*.png"))
     assert {path.stem for path in pictures} == {
         *("returns_episodes", "returns_steps", "exploration", "q_gap", "buffers", "diagnostics"),
-        *("iqm", "improvement", "profiles"),
+        *("iqm", "improvement", "profiles", "networks", "networks_buffers"),
     }
     for path in pictures:
         assert f'src="data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"' in text

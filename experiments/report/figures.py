@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -14,11 +14,14 @@ from experiments.report.measures import (
     by_episodes,
     by_steps,
     diagnostic,
+    diagnostics_of,
     improvement,
     iqm_by_task,
     iqm_overall,
+    metrics_by_steps,
     profiles,
     q_gaps,
+    rows_with,
 )
 from experiments.report.plots import Figure, Line, Panel
 from experiments.report.slices import CAPACITY, along, counts, label, matrices, other_settings, pairs
@@ -28,6 +31,20 @@ RATE = "edl.rate"
 MOST_PANELS = 9
 RETURN = "return, mean of the last 100 episodes"
 BANDS = " Interquartile mean over runs, band: 95 % bootstrap interval (none for a single run)."
+NETWORKS = {
+    "archive_td_error": "|TD error| on old transitions",
+    "archive_drift": "change of Q on old states",
+    "policy_churn": "share of greedy actions changed",
+    "dormant_share": "share of dormant units",
+    "effective_rank": "effective rank of the last hidden layer",
+    "q_share": "mean |Q| / its bound",
+    "terminal_share": "share of terminal transitions",
+}
+SHARES = frozenset({"evicted_unsampled", "policy_churn", "dormant_share", "terminal_share"})
+MEANING = (
+    "On the first transitions drawn, which stay as they are; changes are those since the last row of metrics, 200 "
+    "updates before. The share of terminal transitions is that of the buffer."
+)
 Curve = Callable[[Sequence[Run]], tuple[Floats, Floats]]
 
 
@@ -39,6 +56,7 @@ def figures(study: Study) -> tuple[list[Figure], list[str]]:
         lacking.append(f"Return against buffer size, breaking points: {CAPACITY} is the same in all finished runs.")
     else:
         made += [buffers(study), diagnostics(study)]
+    made += networks(study)
     if len(study.environments) > 1:
         lacking.append(f"Aggregates over settings: returns of {', '.join(study.environments)} have different scales.")
     else:
@@ -116,25 +134,37 @@ def diagnostics(study: Study) -> Figure:
         "reuse_mean": "draws of a sample so far",
         "evicted_unsampled": "share evicted unsampled",
     }
-    panels = []
-    for others in other_settings(study, CAPACITY)[:MOST_PANELS]:
-        for name, words in names.items():
-            lines = []
-            for method in study.buffered:
-                capacities, values = along(study, CAPACITY, method, others, partial(diagnostic, name=name))
-                points = [(c, v[~np.isnan(v)]) for c, v in zip(capacities, values, strict=True)]
-                points = [(c, v) for c, v in points if len(v)]
-                if points:
-                    ends = [[v.mean() for _, v in points], [v.min() for _, v in points], [v.max() for _, v in points]]
-                    at = np.array([c for c, _ in points], np.float64)
-                    lines.append(Line(method, at, Interval(*map(np.array, ends))))
-            title, share = _without(study, CAPACITY, others), name == "evicted_unsampled"
-            panels.append(Panel(title, "capacity", words, lines, marks=True, wide_x=True, share=share))
     text = (
         "Mean over runs, of the second half of each run (share evicted: at its end); bars: least and largest run. "
         "With fifo and reservoir the buffer does not depend on the method, and the lines lie on each other."
     )
+    panels = _against_capacity(study, names, other_settings(study, CAPACITY)[:MOST_PANELS])
     return Figure("diagnostics", "What the buffer hands out", text, counts(study.runs), panels)
+
+
+def networks(study: Study) -> list[Figure]:
+    """Forgetting, plasticity and churn against environment steps and, if it varies, capacity; none without the data."""
+    names = {name: words for name, words in NETWORKS.items() if name in diagnostics_of(study)}
+    panels, used = [], []
+    for name, words in names.items():
+        lines = []
+        for method in study.methods:
+            runs = [run for run in study.of(method, study.reference) if len(rows_with(run, name)[1])]
+            if runs:
+                lines.append(_line(method, *metrics_by_steps(runs, name)))
+                used += runs
+        panels.append(Panel(words, "environment steps", words, lines, share=name in SHARES))
+    shown = [run for run in study.runs if any(run is each for each in used)]
+    text = f"{MEANING}{BANDS}{_where(study, [study.reference])}"
+    made = [Figure("networks", "Forgetting, plasticity and churn", text, counts(shown), panels)] if shown else []
+    place = study.index(CAPACITY)
+    if names and place is not None:
+        title = "Forgetting, plasticity and churn against buffer size"
+        text = f"{MEANING} Mean over runs, of the second half of each run; bars: least and largest run."
+        others = [study.reference[:place] + study.reference[place + 1 :]]
+        panels = _against_capacity(study, names, others)
+        made.append(Figure("networks_buffers", title, text, counts(study.runs), panels))
+    return [figure for figure in made if _has_lines(figure)]
 
 
 def aggregates(study: Study) -> list[Figure]:
@@ -170,6 +200,25 @@ def aggregates(study: Study) -> list[Figure]:
             [Panel("", "return", "share of runs above", shares, share=True)] if shares else [],
         ),
     ]  # fmt: skip
+
+
+def _against_capacity(study: Study, names: Mapping[str, str], settings: Sequence[Setting]) -> list[Panel]:
+    """A panel for each diagnostic at each setting of the other axes; names: the words for each."""
+    panels = []
+    for others in settings:
+        for name, words in names.items():
+            lines = []
+            for method in study.buffered:
+                capacities, values = along(study, CAPACITY, method, others, partial(diagnostic, name=name))
+                points = [(c, v[~np.isnan(v)]) for c, v in zip(capacities, values, strict=True)]
+                points = [(c, v) for c, v in points if len(v)]
+                if points:
+                    ends = [[v.mean() for _, v in points], [v.min() for _, v in points], [v.max() for _, v in points]]
+                    at = np.array([c for c, _ in points], np.float64)
+                    lines.append(Line(method, at, Interval(*map(np.array, ends))))
+            title, share = _without(study, CAPACITY, others), name in SHARES
+            panels.append(Panel(title, "capacity", words, lines, marks=True, wide_x=True, share=share))
+    return panels
 
 
 def _curves(

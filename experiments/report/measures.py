@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rliable import library, metrics
 
 from common.returns import RETURN_WINDOW
-from experiments.report.study import Floats, Run
+from experiments.report.study import LATER, Q_SHARE, Floats, Run, Study
 
 ENOUGH = 0.95  # share of the return at the largest capacity that counts as unbroken learning
 POINTS = 120  # of a curve
@@ -52,12 +52,36 @@ def spread(run: Run) -> float:
 def diagnostic(run: Run, name: str) -> float:
     """Mean of a diagnostic over the second half of a run; the last value of the share evicted unsampled.
 
-    nan for a run that is too short to have a row of metrics.
+    nan for a run without a row of metrics that has it.
     """
-    values, steps = run.metrics[name], run.metrics["env_step"]
+    steps, values = rows_with(run, name)
     if not len(values):
         return float("nan")
     return float(values[-1] if name == "evicted_unsampled" else values[steps >= steps[-1] / 2].mean())
+
+
+def diagnostics_of(study: Study) -> list[str]:
+    """The diagnostics of a study: those of every version, and of the later ones those that a run has."""
+    later = (name for name in (*LATER, Q_SHARE) if any(len(rows_with(run, name)[1]) for run in study.runs))
+    return [*DIAGNOSTICS, *later]
+
+
+def rows_with(run: Run, name: str) -> tuple[Floats, Floats]:
+    """The environment steps of the rows of metrics that have a value, and these values: float64 [rows]."""
+    values = run.metrics[name]
+    there = ~np.isnan(values)
+    return run.metrics["env_step"][there], values[there]
+
+
+def metrics_by_steps(runs: Sequence[Run], name: str) -> tuple[Floats, Floats]:
+    """Curves of a column of metrics on common environment steps: steps float64 [points], curves [runs, points].
+
+    Every run must have a row with it.
+    """
+    rows = [rows_with(run, name) for run in runs]
+    low, high = max(steps[0] for steps, _ in rows), min(steps[-1] for steps, _ in rows)
+    at = np.linspace(low, max(low, high), POINTS)
+    return at, np.stack([_latest(steps, values, at) for steps, values in rows])
 
 
 def by_steps(runs: Sequence[Run], values: Sequence[Floats]) -> tuple[Floats, Floats]:

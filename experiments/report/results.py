@@ -8,9 +8,9 @@ import numpy as np
 
 from experiments.report.comparisons import comparison_tables
 from experiments.report.measures import (
-    DIAGNOSTICS,
     breaking_point,
     diagnostic,
+    diagnostics_of,
     improvement,
     iqm_by_task,
     iqm_overall,
@@ -63,16 +63,16 @@ def paper_table(study: Study) -> ResultTable:
 
 def settings_table(study: Study) -> ResultTable:
     """Scores of every method at every setting."""
-    rows = []
+    rows, diagnostics = [], diagnostics_of(study)
     for method in study.methods:
         for setting in study.settings:
             runs = study.of(method, setting)
             if runs:
-                means = [float(np.mean([diagnostic(run, name) for run in runs])) for name in DIAGNOSTICS]
+                means = [float(np.mean([diagnostic(run, name) for run in runs])) for name in diagnostics]
                 rows.append([method, *plain(setting), *_over_runs(runs), *means])
     columns = [
         *("method", *study.axes, "mean", "sd over runs", "sd of 100 episodes", "IQM", "IQM low", "IQM high"),
-        *("runs", "seeds", *DIAGNOSTICS),
+        *("runs", "seeds", *diagnostics),
     ]
     note = (
         "Return of the last 100 episodes, as above. Diagnostics: means over the second half of the runs, "
@@ -126,15 +126,16 @@ def improvement_table(study: Study) -> ResultTable:
 
 def runs_table(study: Study) -> ResultTable:
     """Every run."""
+    diagnostics = diagnostics_of(study)
     rows: list[list[Value]] = [
         [
             *(run.name, run.config.method, run.config.seed, *plain(study.setting(run))),
             *(int(run.end_steps[-1]), len(run.returns), score(run), spread(run)),
-            *(diagnostic(run, name) for name in DIAGNOSTICS),
+            *(diagnostic(run, name) for name in diagnostics),
         ]
         for run in study.runs
     ]
-    columns = ["run", "method", "seed", *study.axes, "last step", "episodes", "mean", "sd", *DIAGNOSTICS]
+    columns = ["run", "method", "seed", *study.axes, "last step", "episodes", "mean", "sd", *diagnostics]
     return ResultTable("runs", "Every run", columns, rows, "mean and sd: of the returns of the last 100 episodes.")
 
 

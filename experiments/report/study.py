@@ -28,7 +28,9 @@ Setting = tuple[Any, ...]  # a value for each axis
 Groups = Mapping[tuple[str, int], list["Run"]]  # runs by method and index of the setting
 
 SERIES = ("env_step", "q_gap", "sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
-Q_SIZE, Q_BOUND = "q_abs_mean", "q_bound"  # missing in runs of earlier versions
+# Missing in runs of earlier versions.
+LATER = ("archive_td_error", "archive_drift", "policy_churn", "dormant_share", "effective_rank", "terminal_share")
+Q_SIZE, Q_BOUND, Q_SHARE = "q_abs_mean", "q_bound", "q_share"
 NOT_AXES = {"run", "method", "seed"}
 PRESET = "cartpole"
 
@@ -38,7 +40,8 @@ class Run:
     """One finished run with at least one episode.
 
     end_steps: float64 [episodes], environment steps when each episode ended. returns, s, q1_means, q2_means: float64
-    [episodes], of the columns `return`, `s`, `q1_mean` and `q2_mean`. metrics: float64 [rows] of each name of SERIES.
+    [episodes], of the columns `return`, `s`, `q1_mean` and `q2_mean`. metrics: float64 [rows] of each name of SERIES,
+    of LATER, and of "q_share", mean |Q| as a share of its bound; nan where a row lacks it.
     above_bound: number of rows of metrics.jsonl whose mean |Q| exceeds its bound, `q_bound`.
     """
 
@@ -209,14 +212,15 @@ def _read(source: Source, run: str, path: Path) -> Run:
     config = read_config(source, run, path)
     try:
         episodes = source.columns(run, EPISODES, ("env_step", "return", "s", "q1_mean", "q2_mean"))
-        rows = source.columns(run, METRICS, SERIES, (Q_SIZE, Q_BOUND))
+        rows = source.columns(run, METRICS, SERIES, (*LATER, Q_SIZE, Q_BOUND))
         ends, returns, s, q1, q2 = (np.array(values, np.float64) for values in episodes.values())
-        metrics = {name: np.array(rows[name], np.float64) for name in SERIES}
-        sizes = zip(rows[Q_SIZE], rows[Q_BOUND], strict=True)
-        above_bound = sum(bound is not None and size > bound for size, bound in sizes)
+        metrics = {name: np.array(values, np.float64) for name, values in rows.items()}  # None becomes nan
     except (OSError, ValueError, KeyError, UsageError) as error:
         raise RunError(f"{path / run}: a finished run with a file that can't be read: {error!r}") from error
-    return Run(run, config, ends, returns, s, q1, q2, metrics, above_bound)
+    size, bound = metrics.pop(Q_SIZE), metrics.pop(Q_BOUND)
+    with np.errstate(divide="ignore", invalid="ignore"):  # without rewards the bound is 0
+        metrics[Q_SHARE] = size / bound
+    return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()))
 
 
 def read_config(source: Source, run: str, path: Path) -> RunConfig:
