@@ -41,7 +41,7 @@ def costs(preset: str, method: str, rounds: int) -> tuple[list[float], list[floa
     while run.step < START + BATCHES:
         for _ in run.play():
             pass
-    batches = [run._table.sample(config.learner.batch_size) for _ in range(BATCHES)]
+    batches = [run.memory.table.sample(config.learner.batch_size) for _ in range(BATCHES)]
     agent, diagnostics = run.agent, run.trainer.telemetry.diagnostics
     for batch in batches:
         diagnostics.add(batch)
