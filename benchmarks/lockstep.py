@@ -55,7 +55,7 @@ def rival() -> Callable[[int], None]:
 
 def ours(method: str, path: Path) -> Callable[[int], None]:
     """Make a function that plays a number of steps in lockstep, including the run's files."""
-    config = base_config(["--preset", "cartpole", "--method", method])
+    config = base_config(["--preset", "cartpole-paper", "--method", method])
     run = Lockstep(replace(config, learner=replace(config.learner, double=False)))
     directory = RunDirectory(path, run.config)
 
