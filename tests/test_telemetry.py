@@ -29,7 +29,7 @@ def test_reuse_histogram(reuse: list[int], histogram: list[int]) -> None:
 @pytest.mark.parametrize("replacement", [True, False])
 def test_reuse_and_distinct_samples_of_a_small_table(replacement: bool, tmp_path: Path) -> None:
     """40 transitions, 32 drawn of them: 40 (1 - (1 - 1/40)^32) = 22.2 distinct ones with replacement, 32 without."""
-    config = base_config(["--method", "dqn"])
+    config = base_config(["--preset", "cartpole-paper", "--method", "dqn"])
     replay = replace(config.replay, capacity=40, learning_starts=40, replacement=replacement)
     run = Lockstep(replace(config, replay=replay))
     with RunDirectory(tmp_path, run.config) as directory:
