@@ -57,7 +57,8 @@ class Diagnostics:
         q = np.stack(agent.q_values(obs))
         next_values, preferred = q[1 - acting, size:], q[acting if settings.double else 1 - acting, size:]
         with torch.no_grad():
-            inputs = preprocess(torch.from_numpy(obs[:size]).to(agent.device), agent.spec)
+            # Contiguous, because what a picture with its channels last is flattened to would be no view of it.
+            inputs = preprocess(torch.from_numpy(obs[:size]).to(agent.device), agent.spec).contiguous()
             hidden = hidden_layers(agent.networks[acting].module, inputs)
         generator = agent.rule.rng.bit_generator  # a method's own rule may draw numbers of the run from it
         before = generator.state

@@ -70,13 +70,15 @@ def test_td_error_of_two_transitions(acting: int, double: bool, error: float) ->
     assert "dormant_share" not in row  # no hidden layer
 
 
-def test_the_td_error_of_double_targets_takes_the_acting_networks_action() -> None:
-    agent = Agent(replace(CONFIG, learner=replace(CONFIG.learner, double=True)), SPEC)
-    constant(agent, 0, (2, 1))
+@pytest.mark.parametrize(("double", "error"), [(True, 2.25), (False, 1.75)])
+def test_double_targets_take_the_action_of_the_acting_network(double: bool, error: float) -> None:
+    """4 - (1 + 0.25 * 3), and 4 - (1 + 0.25 * 5) with the other network's own action."""
+    agent = Agent(replace(CONFIG, learner=replace(CONFIG.learner, double=double)), SPEC)
+    constant(agent, 0, (4, 1))
     constant(agent, 1, (3, 5))
     diagnostics = Diagnostics()
     diagnostics.add(batch(1))
-    assert diagnostics.row(agent)["archive_td_error"] == 0.25  # 2 - (1 + 0.25 * 3)
+    assert diagnostics.row(agent)["archive_td_error"] == error
 
 
 @pytest.mark.parametrize(("method", "drift", "churn"), [("coop", (4 + 1) / 4, 1 / 2), ("dqn", (3 + 1) / 2, 1)])
@@ -258,6 +260,17 @@ def test_channels_are_the_units_of_pictures() -> None:
         hidden = hidden_layers(module, torch.rand(5, 1, 3, 3))
     assert [layer.shape for layer in hidden] == [(5, 3, 3, 2), (5, 2, 2, 3)]
     assert [dormant(layer.numpy()).tolist() for layer in hidden] == [[False, True], [False, True, False]]
+
+
+def test_channels_are_units_of_pictures_stored_with_their_channels_last() -> None:
+    """Of MinAtar's 16 channels, 12 are dead."""
+    agent = Agent(replace(CONFIG, network=NetworkSettings(kind="minatar")), EnvSpec("x", (10, 10, 4), "bool", 1, 2))
+    views = agent.networks[0].views(agent.networks[0].flat)
+    views["conv1.weight"].fill_(0)
+    views["conv1.bias"].copy_(torch.tensor([1.0] * 4 + [-1.0] * 12))
+    diagnostics = Diagnostics()
+    diagnostics.add(replace(batch(3), frames=np.zeros((4, 10, 10, 4), np.bool_)))
+    assert diagnostics.row(agent)["dormant_by_layer"][0] == 12 / 16
 
 
 def test_a_flattened_input_is_no_hidden_layer() -> None:
