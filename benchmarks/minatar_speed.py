@@ -140,7 +140,8 @@ def spread(values: list[float], digits: int) -> str:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("methods", nargs="*", default=list(METHODS.names()))
+    with_buffer = [name for name in METHODS.names() if METHODS.get(name).stream is None]
+    parser.add_argument("methods", nargs="*", default=with_buffer)
     parser.add_argument("--game", default="breakout")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--steps", type=int, default=300, help="of each, in a round; and as many updates")
