@@ -263,14 +263,16 @@ def test_channels_are_the_units_of_pictures() -> None:
 
 
 def test_channels_are_units_of_pictures_stored_with_their_channels_last() -> None:
-    """Of MinAtar's 16 channels, 12 are dead."""
+    """Of MinAtar's 16 channels, 12 are dead, and none of its 128 other units."""
     agent = Agent(replace(CONFIG, network=NetworkSettings(kind="minatar")), EnvSpec("x", (10, 10, 4), "bool", 1, 2))
     views = agent.networks[0].views(agent.networks[0].flat)
     views["conv1.weight"].fill_(0)
     views["conv1.bias"].copy_(torch.tensor([1.0] * 4 + [-1.0] * 12))
     diagnostics = Diagnostics()
     diagnostics.add(replace(batch(3), frames=np.zeros((4, 10, 10, 4), np.bool_)))
-    assert diagnostics.row(agent)["dormant_by_layer"][0] == 12 / 16
+    views["fc1.weight"].fill_(0)
+    views["fc1.bias"].fill_(1)
+    assert diagnostics.row(agent)["dormant_share"] == 12 / 144
 
 
 def test_a_flattened_input_is_no_hidden_layer() -> None:
