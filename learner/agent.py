@@ -131,7 +131,7 @@ class Agent:
 
     def finite(self) -> bool:
         """True while every parameter of both networks is finite."""
-        return all(_finite(network.flat) for network in self.networks)
+        return all(network.finite() for network in self.networks)
 
     def q_values(self, obs: Array) -> tuple[Values, Values]:
         """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
@@ -185,11 +185,6 @@ def _device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise UsageError(f"learner.device = {name!r}: {str(error).splitlines()[0]}") from error
     return device
-
-
-def _finite(values: Tensor) -> bool:
-    """True if all values are finite. Their sum tells 50 times sooner, but may overflow if they are large."""
-    return math.isfinite(values.sum().item()) or bool(torch.isfinite(values).all())
 
 
 def _decay_vector(decay: tuple[float, ...], layout: Sequence[tuple[str, tuple[int, ...]]]) -> Tensor | None:

@@ -9,10 +9,15 @@ from common.settings.config import ActorSettings, EdlSettings, LearnerSettings
 
 def epsilon(settings: ActorSettings, env_step: int) -> float:
     """Probability of a random action after `env_step` environment steps."""
-    span = settings.epsilon_start - settings.epsilon_final
+    start, final, progress = settings.epsilon_start, settings.epsilon_final, env_step / settings.epsilon_steps
     if settings.epsilon_decay == "exponential":
-        return settings.epsilon_final + span * math.exp(-env_step / settings.epsilon_steps)
-    return settings.epsilon_final + span * max(0.0, 1.0 - env_step / settings.epsilon_steps)
+        return final + (start - final) * math.exp(-progress)
+    return linear(start, final, progress)
+
+
+def linear(start: float, final: float, progress: float) -> float:
+    """Fall (or rise) from `start` to `final` on a straight line; progress: share of the way, 1 or more at its end."""
+    return final + (start - final) * max(0.0, 1.0 - progress)
 
 
 def exploration_rate(settings: EdlSettings, update: int) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ import torch
 
 from common.networks.network import FlatNetwork, preprocess
 from common.networks.normalised import NormalisedNetwork
+from common.settings import schedules
 from common.settings.config import RunConfig
 from common.settings.stream_q import StreamQSettings
 from common.types import Array, Batch, EnvSpec
@@ -110,8 +110,8 @@ class StreamAgent:
     def epsilon(self, env_step: int) -> float:
         """Probability of a random action after `env_step` environment steps."""
         settings = self._settings
-        part = min(1.0, env_step / (settings.epsilon_share * self.config.total_steps))
-        return settings.epsilon_start + (settings.epsilon_final - settings.epsilon_start) * part
+        progress = env_step / (settings.epsilon_share * self.config.total_steps)
+        return schedules.linear(settings.epsilon_start, settings.epsilon_final, progress)
 
     def exploration_rate(self) -> float:
         """The scale of s: 0, as the ordinary gradient is taken."""
@@ -119,7 +119,7 @@ class StreamAgent:
 
     def finite(self) -> bool:
         """True while every parameter is finite."""
-        return math.isfinite(self._network.flat.sum().item()) or bool(torch.isfinite(self._network.flat).all())
+        return self._network.finite()
 
     def q_values(self, obs: Array) -> tuple[Values, Values]:
         """Q, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape], twice."""
