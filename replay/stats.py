@@ -41,8 +41,8 @@ class TableStats:
 class TableSnapshot(NamedTuple):
     """A table's state at one moment, while the table stays in use.
 
-    meta, arrays: as in `Table.state`, except the array "frames". frames: its content, to be read in pieces of any
-    size between other calls on the table, and to be released at the end (it is a context manager).
+    meta, arrays: as `Table.load_state` takes them, except the array "frames". frames: its content, to be read in pieces
+    of any size between other calls on the table, and to be released at the end (it is a context manager).
     """
 
     meta: dict[str, Any]

@@ -133,14 +133,14 @@ class Copies:
 
 
 def held_ids(table: Table) -> list[int]:
-    return sorted(table._ids[: len(table)].tolist())
+    return sorted(table._columns.ids[: len(table)].tolist())
 
 
 def check_references(table: Table, pinned: Array | None = None) -> None:
     """Every slot has exactly the references of the transitions, streams and snapshots that name it."""
     tails = table._tails.slots()
     named: list[Array] = [tails[tails >= 0]]
-    named += [table._slots[: len(table)].reshape(-1), *([] if pinned is None else [pinned])]
+    named += [table._columns.slots[: len(table)].reshape(-1), *([] if pinned is None else [pinned])]
     references = table._frames.references
     expected = np.bincount(np.concatenate(named).astype(np.intp), minlength=len(references))
     np.testing.assert_array_equal(references, expected)

@@ -132,9 +132,9 @@ def test_priorities_of_evicted_transitions_are_ignored(eviction: str) -> None:
     held = set(table.sample(100).ids.tolist())
     gone = np.array(sorted(set(range(-4, 50)) - held))
     table.update_priorities(gone, np.full(len(gone), 1e9))
-    assert table._priorities.tolist() == [1.0] * 4
+    assert table._columns.priorities.tolist() == [1.0] * 4
     table.insert(stream.segment(1))
-    assert table._priorities.tolist() == [1.0] * 4
+    assert table._columns.priorities.tolist() == [1.0] * 4
 
 
 def test_priorities_find_a_transition_in_whatever_row_it_is() -> None:

@@ -12,12 +12,12 @@ from common.process.randomness import generator_state, set_generator_state
 from common.settings.policies import EVICTIONS, SAMPLERS
 from common.types import Array, Batch, EnvSpec, Segment
 from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
+from replay.table.columns import Columns
 from replay.table.frames import FrameStore, PinnedFrames, Slots
 from replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
 from replay.table.streams import StreamTails
 
 __all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
-COLUMNS = ("actions", "rewards", "terminated", "span", "param_version", "ids", "reuse", "priorities")
 
 
 class PinnedBatch(NamedTuple):
@@ -40,8 +40,7 @@ class Table:
     Deterministic: all random numbers come from `rng` (a Generator over PCG64, which the table's state includes).
     Not thread-safe: one owner makes all calls.
 
-    inserted, batches: transitions inserted and sample calls so far. terminal: transitions held that end in a terminal
-    state.
+    inserted, batches: transitions inserted and sample calls so far.
     """
 
     def __init__(
@@ -66,7 +65,6 @@ class Table:
         self.capacity = capacity
         self.inserted = 0
         self.batches = 0
-        self.terminal = 0
         self._settings = {
             "spec": [spec.env_id, list(spec.frame_shape), spec.frame_dtype, spec.stack, spec.num_actions],
             "capacity": capacity,
@@ -77,21 +75,13 @@ class Table:
         }
         self._rng = rng
         self._frames = FrameStore(spec.frame_shape, spec.frame_dtype)
-        self._slots = np.zeros((capacity, 2 * spec.stack), np.int32)  # of obs, then of next_obs
-        self._actions = np.zeros(capacity, np.int32)
-        self._rewards = np.zeros(capacity, np.float32)
-        self._terminated = np.zeros(capacity, np.bool_)
-        self._span = np.ones(capacity, np.uint8)
-        self._param_version = np.zeros(capacity, np.int64)
-        self._ids = np.zeros(capacity, np.int64)
-        self._reuse = np.zeros(capacity, np.int32)
         evicts, draws = EVICTIONS.get(eviction), SAMPLERS.get(sampling)
         self._prioritized = evicts.priorities or draws.priorities
-        self._priorities = np.zeros(capacity if self._prioritized else 0)
+        self._columns = seen = Columns(capacity, spec.stack, prioritized=self._prioritized)
         self._max_priority = 1.0
         self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
-        seen = self._ids, self._reuse, self._rewards, self._terminated, self._priorities
-        view = TableView(rng, *seen, priority_exponent, importance_exponent, replacement)
+        arrays = seen.ids, seen.reuse, seen.rewards, seen.terminated, seen.priorities
+        view = TableView(rng, *arrays, priority_exponent, importance_exponent, replacement)
         self._eviction, self._sampling = make_policies(evicts, draws, view)
         self._tails = StreamTails(self._frames, spec.stack)
         self._sampled = 0
@@ -99,6 +89,11 @@ class Table:
 
     def __len__(self) -> int:
         return min(self.inserted, self.capacity)
+
+    @property
+    def terminal(self) -> int:
+        """Transitions held that end in a terminal state."""
+        return self._columns.terminal
 
     @property
     def evicted(self) -> int:
@@ -112,8 +107,9 @@ class Table:
 
     def repeated(self) -> int:
         """Count the transitions held that equal another one in their frames, action, reward, end and span."""
-        slots = self._slots[: len(self)].astype(np.intp)
-        values = zip(slots, self._actions, self._rewards, self._terminated, self._span, strict=False)
+        held = self._columns
+        slots = held.slots[: len(self)].astype(np.intp)
+        values = zip(slots, held.actions, held.rewards, held.terminated, held.span, strict=False)
         return len(self) - len({hash((self._frames.read(each).tobytes(), *rest)) for each, *rest in values})
 
     def insert(self, segment: Segment) -> None:
@@ -124,26 +120,17 @@ class Table:
         index = np.concatenate((segment.obs_index[kept], segment.next_index[kept]), axis=1)
         slots, dropped = self._tails.store(segment, index)
         replaced = rows[rows < size]
-        self._reuse_evicted += reuse_histogram(self._reuse[replaced])
+        self._reuse_evicted += reuse_histogram(self._columns.reuse[replaced])
         self._reuse_evicted[0] += segment.steps - len(rows)
-        old = self._slots.take(replaced, axis=0).ravel()
+        old = self._columns.slots.take(replaced, axis=0).ravel()
         if self._row_of is not None:
-            for number in self._ids[replaced].tolist():
+            for number in self._columns.ids[replaced].tolist():
                 del self._row_of[number]
-        self._slots[rows] = slots[index]
-        self._actions[rows] = segment.actions[kept]
-        self._rewards[rows] = segment.rewards[kept]
-        terminated = segment.terminated[kept]
-        self.terminal += int(np.count_nonzero(terminated)) - int(np.count_nonzero(self._terminated[replaced]))
-        self._terminated[rows] = terminated
-        self._span[rows] = segment.span[kept]
-        self._param_version[rows] = segment.param_version[kept]
-        self._ids[rows] = np.arange(first, first + segment.steps)[kept]
-        self._reuse[rows] = 0
+        self._columns.write(rows, segment, kept, first, slots[index])
         self._frames.drop(np.concatenate((old, dropped)))
         self.inserted += segment.steps
         if self._row_of is not None:
-            self._row_of.update(zip(self._ids[rows].tolist(), rows.tolist(), strict=True))
+            self._row_of.update(zip(self._columns.ids[rows].tolist(), rows.tolist(), strict=True))
         if self._prioritized:
             self._set_priorities(rows, np.full(len(rows), self._max_priority))
 
@@ -171,23 +158,17 @@ class Table:
             raise ValueError("an empty table has nothing to sample")
         rows, weights = self._sampling.draw(batch_size, size)
         # Transition by transition, so that neighbouring frames are read one after another.
-        distinct, index = self._frames.unique(self._slots.take(rows, axis=0).astype(np.intp))
-        np.add.at(self._reuse, rows, np.int32(1))
+        distinct, index = self._frames.unique(self._columns.slots.take(rows, axis=0).astype(np.intp))
+        np.add.at(self._columns.reuse, rows, np.int32(1))
         self.batches += 1
         self._sampled += batch_size
-        ids = self._ids[rows]
+        columns = self._columns.read(rows)
         return distinct, {
+            **columns,
             "obs_index": np.ascontiguousarray(index[:, : self.spec.stack]),
             "next_index": np.ascontiguousarray(index[:, self.spec.stack :]),
-            "actions": self._actions[rows],
-            "rewards": self._rewards[rows],
-            "terminated": self._terminated[rows],
-            "span": self._span[rows],
             "weights": weights,
-            "ids": ids,
-            "param_version": self._param_version[rows],
-            "age": self.inserted - 1 - ids,
-            "reuse": self._reuse[rows],
+            "age": self.inserted - 1 - columns["ids"],
         }
 
     def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.floating[Any]]) -> None:
@@ -207,7 +188,7 @@ class Table:
         else:
             rows = np.array([self._row_of.get(number, self.capacity) for number in ids.tolist()], np.intp)
         held = np.flatnonzero(rows < len(self))
-        held = held[self._ids[rows[held]] == ids[held]]
+        held = held[self._columns.ids[rows[held]] == ids[held]]
         if len(held):
             self._max_priority = max(self._max_priority, float(given[held].max()))
             self._set_priorities(rows[held], given[held])
@@ -215,8 +196,7 @@ class Table:
     def stats(self) -> TableStats:
         """Compute counts and diagnostics, in time proportional to the number of transitions held."""
         size = len(self)
-        reuse = self._reuse[:size]
-        row_bytes = (self._slots.nbytes + sum(self._column(name).nbytes for name in COLUMNS)) // self.capacity
+        reuse = self._columns.reuse[:size]
         return TableStats(
             size=size,
             inserted=self.inserted,
@@ -225,7 +205,7 @@ class Table:
             batches=self.batches,
             sampled=self._sampled,
             frames_held=self._frames.held,
-            bytes_held=self._frames.bytes_held + size * row_bytes,
+            bytes_held=self._frames.bytes_held + size * self._columns.row_bytes,
             reuse_mean=float(reuse.mean()) if size else 0.0,
             reuse_held=tuple(reuse_histogram(reuse).tolist()),
             reuse_evicted=tuple(self._reuse_evicted.tolist()),
@@ -236,7 +216,7 @@ class Table:
         size = len(self)
         tail_slots = self._tails.slots()
         stored = tail_slots >= 0
-        slots = self._slots[:size]
+        slots = self._columns.slots[:size]
         distinct, index = self._frames.unique(np.concatenate((slots.ravel(), tail_slots[stored])))
         tail_index = np.full(len(tail_slots), -1, np.int32)
         tail_index[stored] = index[slots.size :]
@@ -250,7 +230,7 @@ class Table:
             "streams": self._tails.streams(),
             "rng": generator_state(self._rng),
         }
-        arrays = {name: self._column(name)[:size].copy() for name in COLUMNS}
+        arrays = self._columns.state(size)
         arrays["slots"] = index[: slots.size].reshape(slots.shape)
         arrays["tails"] = tail_index
         return TableSnapshot(meta, arrays, self._frames.pin(distinct))
@@ -272,30 +252,21 @@ class Table:
         slots = np.concatenate(
             [np.empty(0, np.intp), *(self._frames.add(frames[part], references[part]) for part in parts)]
         )
-        size = len(arrays["slots"])
-        self._slots[:size] = slots[arrays["slots"]]
-        for name in COLUMNS:
-            if name in arrays or name != "span":  # older states lack it: each transition spans one step
-                self._column(name)[:size] = arrays[name]
+        self._columns.load_state(arrays, slots[arrays["slots"]])
         self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
-        self.terminal = int(np.count_nonzero(self._terminated[:size]))
         self.inserted = meta["inserted"]
         self.batches = meta["batches"]
         self._sampled = meta["sampled"]
         self._max_priority = meta["max_priority"]
         self._reuse_evicted[:] = meta["reuse_evicted"]
         set_generator_state(self._rng, meta["rng"])
-        rows = np.arange(size)
+        rows = np.arange(len(self))
         if self._row_of is not None:
-            self._row_of.update(zip(self._ids[rows].tolist(), rows.tolist(), strict=True))
+            self._row_of.update(zip(self._columns.ids[rows].tolist(), rows.tolist(), strict=True))
         if self._prioritized:
-            self._set_priorities(rows, self._priorities[rows])
+            self._set_priorities(rows, self._columns.priorities[rows])
 
     def _set_priorities(self, rows: Slots, priorities: NDArray[np.float64]) -> None:
-        self._priorities[rows] = priorities
+        self._columns.priorities[rows] = priorities
         self._eviction.prioritise(rows)
         self._sampling.prioritise(rows, priorities)
-
-    def _column(self, name: str) -> Array:
-        column: Array = getattr(self, f"_{name}")
-        return column
