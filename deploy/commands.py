@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 
 from common.process.lifecycle import end_on_signals
@@ -44,4 +45,8 @@ def sweep() -> None:
 
 def _begin(program: str, module: str) -> None:
     end_on_signals(program)
-    importlib.import_module(module).main()
+    gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
+    main = importlib.import_module(module).main
+    gc.freeze()
+    gc.enable()
+    main()

@@ -1,6 +1,7 @@
 """Stream Q(lambda) against numbers derived by hand and against autograd."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,21 @@ def test_the_gradient_is_autograds(kind: str, spec: EnvSpec) -> None:
         expected = 0.7 * expected + torch.cat(parts)
         traces.add(form_of(network).record(x.numpy()), action, 0.7)
     torch.testing.assert_close(traces.z, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_slope_of_a_unit_at_0_is_the_leaky_one_as_autograds() -> None:
+    """Without weights and biases each unit's normalised value is 0."""
+    network = FlatNetwork(sparse_network("mlp", FOUR, (4,), 3))
+    for name, view in network.views(network.flat).items():
+        if name.startswith("fc1"):
+            view.zero_()
+        elif name.startswith("out"):
+            view.fill_(1.0)
+    traces, x = Traces(network, form_of(network)), sample_inputs(FOUR, 1)
+    traces.add(form_of(network).record(x.numpy()), 1, 0.0)
+    (expected,) = torch.autograd.grad(network.module(x)[0, 1], [dict(network.module.named_parameters())["fc1.bias"]])
+    found = network.views(traces.z)["fc1.bias"]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_moments_by_hand() -> None:
@@ -225,6 +241,43 @@ def test_a_time_limit_bootstraps_and_begins_an_episode() -> None:
     assert error == pytest.approx(2 + 0.5 * (math.sqrt(0.5) + 0.5) - 0.5)
     np.testing.assert_array_equal(traces(agent), 0)
     np.testing.assert_allclose(agent.networks[0].snapshot()[:2], [7 / 3, math.sqrt(7 / 3)], rtol=1e-6)
+
+
+def test_the_reward_that_ends_an_episode_begins_no_sum() -> None:
+    """u is 2, then 3 in place of 0.5 * 2 + 3, of variance 1/2; nothing is added to the terminal reward."""
+    agent = linear_agent()
+    agent.update(transition(1, 0, 2, 4))
+    before = agent.q_values(np.array([[4.0]], np.float32))[0][0, 0]
+    error = agent.update(transition(4, 0, 3, 1, terminated=True)).td_errors[0]
+    assert error == pytest.approx(3 / math.sqrt(0.5) - before, rel=1e-5)
+
+
+def test_stacked_pictures_are_shown_oldest_first() -> None:
+    config = RunConfig(method="stream-q", own=StreamQSettings(), network=NetworkSettings(hidden=(8,)), total_steps=1000)
+    agent, rng = StreamAgent(config, STACKED), np.random.default_rng(0)
+    frames = rng.integers(0, 256, (3, *STACKED.frame_shape), np.uint8)
+    for first in (frames[1:], frames[:2]):  # one alone would be standardized to 0
+        agent.begin(first.reshape(STACKED.obs_shape))
+    values, again = agent.q_values(frames[:2].reshape(1, *STACKED.obs_shape))
+    assert values is again
+    np.testing.assert_allclose(
+        values, agent.networks[0].module(torch.from_numpy(frames[None, :2] / np.float32(255))).detach(), rtol=1e-4
+    )
+    one = transition(0, 2, 1, 0, terminated=True)
+    index = {"obs_index": np.array([[0, 1]], np.int32), "next_index": np.array([[1, 2]], np.int32)}
+    found = agent.update(replace(one, frames=frames, **index))
+    assert found.td_errors == pytest.approx([1 - values[0, 2]], rel=1e-4)
+    assert (found.td_errors.dtype, found.s, found.swapped) == (np.float32, 0.0, False)
+
+
+def test_what_metrics_read_of_the_agent() -> None:
+    agent = linear_agent()
+    assert (agent.exploration_rate(), agent.state()["acting"], agent.device) == (0.0, 0, torch.device("cpu"))
+    assert agent.loss.cost(np.array([2.0], np.float32)) == pytest.approx([2.0])
+    values = np.array([[1.0, 3.0]], np.float32)
+    assert agent.rule.bootstrap(values, values) == pytest.approx([3.0])
+    assert agent.rule.config is agent.config
+    assert agent.rule.rng.random() >= 0
 
 
 def test_epsilon_falls_over_a_fifth_of_the_run() -> None:
