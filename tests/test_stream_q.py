@@ -75,7 +75,7 @@ def test_the_slope_of_a_unit_at_0_is_the_leaky_one_as_autograds() -> None:
         if name.startswith("fc1"):
             view.zero_()
         elif name.startswith("out"):
-            view.fill_(1.0)
+            view.copy_(torch.arange(float(view.numel())).view_as(view))
     traces, x = Traces(network, form_of(network)), sample_inputs(FOUR, 1)
     traces.add(form_of(network).record(x.numpy()), 1, 0.0)
     (expected,) = torch.autograd.grad(network.module(x)[0, 1], [dict(network.module.named_parameters())["fc1.bias"]])

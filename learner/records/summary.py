@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from common.process.console import counted
+from common.returns import RETURN_WINDOW
 from learner.trainer import Trainer
 
 
@@ -35,7 +37,9 @@ class Summary:
         return f"{self.env}, {self.method}, seed {self.seed}"
 
     def __str__(self) -> str:
-        returns = f"return of the last 100 episodes {self.return_mean_100:.1f} ({self.return_sd_100:.1f})"
+        some = counted(self.episodes, "episode")
+        over = f"the last {RETURN_WINDOW} episodes" if self.episodes > RETURN_WINDOW else some
+        returns = f"return of {over} {self.return_mean_100:.1f} ({self.return_sd_100:.1f})"
         return (
             f"{self.exit}: {self.env_steps:,} steps, {self.updates:,} updates, "
             f"{returns if self.episodes else 'no episode ended'}, {self.wall_seconds:.0f} s"
