@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from difflib import get_close_matches
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, Protocol, TypeVar
 
 from common.errors import UsageError
 from common.imports import import_object
+from common.suggestions import not_among
 
 
 class Named(Protocol):
@@ -60,8 +60,7 @@ class Registry(Generic[EntryT]):
 
     def unknown(self, name: str) -> str:
         """Why a name is refused, with a suggestion and the names allowed."""
-        near = get_close_matches(name, self.names(), n=1)
-        return f"unknown{f'; perhaps {near[0]}' if near else ''}; allowed: {', '.join(self.names())}"
+        return not_among(self.names(), name)
 
     def register(self, entry: EntryT) -> None:
         """Add an entry in this process; an entry point adds it in all of them. Raises UsageError for a name in use."""

@@ -9,7 +9,6 @@ from common.errors import RunError
 from common.process.console import say
 from common.process.lifecycle import Stop, run_main
 from common.settings.options import RunOptions, beginning, parse_run
-from experiments.lockstep_run import LockstepRun
 
 
 def main() -> None:
@@ -22,6 +21,8 @@ def _run() -> None:
     options = parse_run(RunOptions, "coop-lockstep", description, lockstep=True)
     config = options.run_config()
     path = options.directory()
+    from experiments.lockstep_run import LockstepRun  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+
     stop = Stop()
     stop.on_signals()
     with closing(LockstepRun(config, path, "coop-lockstep", resume=options.resume)) as run:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
+from tyro.conf import Positional
 
 from common.process import cli
 from common.process.lifecycle import run_main
-from experiments.reexecute import reexecute
 
 
 @dataclass(frozen=True)
 class ReexecuteOptions:
     """Flags of `coop-reexecute`."""
 
-    run_dir: tyro.conf.Positional[Path]
+    run_dir: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN_DIR")]
     """Folder of a finished run with a journal (--replay.journal; with --replay.journal-keep from its beginning)."""
 
 
@@ -27,6 +28,8 @@ def main() -> None:
 
 def _run() -> None:
     options = cli.parse(ReexecuteOptions, "coop-reexecute", "Train a run's learner again from the run's journal.")
+    from experiments.reexecute import reexecute  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+
     outcome = reexecute(options.run_dir)
     print(
         f"updates {outcome.began:,} to {outcome.updates:,} on {outcome.transitions:,} transitions, "

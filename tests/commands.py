@@ -12,7 +12,9 @@ from pathlib import Path
 
 TESTS = str(Path(__file__).parent)
 _SERVER = multiprocessing.get_context("forkserver")
-_SERVER.set_forkserver_preload(["actors.cli", "experiments.evaluation_cli", "experiments.lockstep_cli", "learner.cli"])
+_SERVER.set_forkserver_preload(
+    ["actors.process", "experiments.evaluation", "experiments.lockstep_run", "learner.process"]
+)
 
 
 def run_command(

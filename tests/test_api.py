@@ -70,7 +70,7 @@ def test_bad_settings_are_refused_before_anything_starts(tmp_path: Path) -> None
         ({"replay": 5}, "replay = 5: must be a table"),
         ({"sede": 5}, "sede = 5: no such field"),
         ({"preset": "x"}, "--preset x: unknown"),
-        ({"method": "dqqn"}, "perhaps dqn"),
+        ({"method": "dqqn"}, "did you mean dqn\\?"),
         ({"actors": 2}, "in distributed runs only"),
         ({"actors": 0, "distributed": True}, "at least 1"),
         ({"env": {"id": "Nowhere-v0"}}, "Nowhere-v0"),

@@ -96,7 +96,7 @@ def methods() -> Registry[Method]:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("soft-min", "method = 'soft-min': unknown; perhaps soft-max; allowed: dqn, medqn, broken, kind"),
+        ("soft-min", "method = 'soft-min': unknown; did you mean soft-max? allowed: dqn, medqn, broken, kind"),
         ("broken", "method 'broken' = 'my_methods:NOTHING': module 'my_methods' has no 'NOTHING'"),
         ("renamed", "method 'renamed': my_methods:SOFT has another name, 'soft-max'"),
         ("kind", "method 'kind': my_methods:EVICTION is no Method"),
@@ -159,9 +159,9 @@ def test_a_run_with_parts_of_another_package(package: Path, tmp_path: Path) -> N
     text = (tmp_path / "run" / "config.toml").read_text()
     assert "[soft_max]\nweight = 0.0\nother = 3\n" in text
     assert 'eviction = "most-drawn"\nsampling = "newest"\n' in text
-    shown = python(package, OPTIONS, "--help")
+    shown = python(package, OPTIONS, "--help-all")
     assert "--soft-max.weight" in shown.stdout
-    assert "soft-max: a mean of both" in " ".join(shown.stdout.replace("│", "").split())
+    assert "soft-max: a mean of both" in " ".join(shown.stdout.split())
     assert "most-drawn" in shown.stdout
 
 

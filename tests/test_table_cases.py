@@ -176,7 +176,7 @@ def test_estimate_covers_a_full_table() -> None:
     ("settings", "words"),
     [
         ({"capacity": 0}, "capacity: 0"),
-        ({"eviction": "lifo"}, "replay.eviction = 'lifo': unknown; perhaps fifo; allowed: fifo, reservoir"),
+        ({"eviction": "lifo"}, "replay.eviction = 'lifo': unknown; did you mean fifo\\? allowed: fifo, reservoir"),
         ({"sampling": "best"}, "replay.sampling = 'best': unknown; allowed: uniform, prioritized"),
         ({"sampling": "prioritized", "replacement": False}, "sampling: 'prioritized' draws with replacement only"),
         ({"priority_exponent": -1.0}, "priority_exponent"),

@@ -9,8 +9,8 @@ import zenoh
 from msgspec.structs import replace as changed
 from samples import await_service
 
-from actors.cli import _networks
 from actors.policy import Policy
+from actors.process import _networks
 from actors.weights import GRACE, WeightsFollower
 from common.errors import JoinError
 from common.messaging.keys import role_key, weights_key

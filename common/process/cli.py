@@ -1,48 +1,60 @@
-"""Parses command lines with tyro, and reports errors in one line."""
+"""Parses command lines with tyro, answers --help and its like, and reports errors in one line."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Sequence
-from difflib import get_close_matches
-from typing import Any, NoReturn, TypeVar, get_type_hints
+import re
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Any, NoReturn, TypeVar
 
 import tyro
 from tyro import _errors as tyro_errors  # private; pyproject.toml pins the version
 
 from common.errors import UsageError
+from common.process.flags import SHELLS, completion, placeholder, sections
+from common.process.help import full_help, short_help
+from common.suggestions import closest, not_among, refusal
+
+PACKAGE = "coop-rl"
 
 T = TypeVar("T")
 
 
 def parse(
-    kind: type[T], program: str, description: str, default: T | None = None, args: Sequence[str] | None = None
+    kind: type[T],
+    program: str,
+    description: str,
+    default: T | None = None,
+    args: Sequence[str] | None = None,
+    common: Sequence[str] = (),
 ) -> T:
     """Parse flags into a dataclass.
 
+    common: the flags that --help shows; all if empty.
+
     Raises:
         UsageError: an unknown flag or a value of the wrong type.
+        SystemExit: the flags asked for help, the version or a completion script; it has been printed.
     """
+    args = sys.argv[1:] if args is None else args
+    asked = {token.partition("=")[0].replace("_", "-") for token in args}
+    if "--help-all" in asked:
+        _answer(full_help(program, description, sections(kind, default)))
+    if asked & {"-h", "--help"}:
+        _answer(short_help(program, description, sections(kind, default), common))
+    if "--version" in asked:
+        _answer(f"{program} {version(PACKAGE)}")
+    if "--completion" in asked:
+        _answer(completion(kind, default, program, _shell(args)))
 
     def refuse(event: tyro_errors.ParseErrorEvent) -> NoReturn:
-        raise UsageError(_problem(event, list(flags(kind))))
+        raise UsageError(_problem(event, kind))
 
     with tyro_errors.on_parse_error(refuse):
         if default is None:
-            return tyro.cli(kind, prog=program, description=description, args=args)
-        return tyro.cli(kind, prog=program, description=description, args=args, default=default)
-
-
-def flags(kind: type[Any], prefix: str = "") -> Iterator[str]:
-    """The flags of a dataclass and of those nested in it, as tyro names them: "--learner.swap-every"."""
-    hints = get_type_hints(kind)
-    for field in dataclasses.fields(kind):
-        name = prefix + field.name.replace("_", "-")
-        if dataclasses.is_dataclass(inner := hints[field.name]):
-            assert isinstance(inner, type)
-            yield from flags(inner, f"{name}.")
-        else:
-            yield f"--{name}"
+            return tyro.cli(kind, prog=program, args=args, add_help=False)
+        return tyro.cli(kind, prog=program, args=args, add_help=False, default=default)
 
 
 def given_flags(args: Sequence[str]) -> set[str]:
@@ -51,19 +63,53 @@ def given_flags(args: Sequence[str]) -> set[str]:
     return names | {name.replace(".no_", ".") for name in names}
 
 
-def _problem(event: tyro_errors.ParseErrorEvent, known: Sequence[str]) -> str:
+def _answer(text: str) -> NoReturn:
+    print(text)
+    raise SystemExit(0)
+
+
+def _shell(args: Sequence[str]) -> str:
+    """The shell that --completion names."""
+    words = [word for token in args for word in token.split("=", 1)]
+    following = words[words.index("--completion") + 1 :]
+    shell = following[0] if following else ""
+    if shell not in SHELLS:
+        text = not_among(SHELLS, shell, "unknown shell" if shell else "needs a shell")
+        raise UsageError(f"--completion {shell}".rstrip() + f": {text}")
+    return shell
+
+
+def _problem(event: tyro_errors.ParseErrorEvent, kind: type[Any]) -> str:
     """Describe a parse error in one line."""
     match event:
         case tyro_errors.UnrecognizedArgs(tokens=[first, *_]):
-            flag = first.partition("=")[0].replace("_", "-")
-            near = get_close_matches(flag, [name for name in known if name != flag], n=1)
-            return f"{first}: unknown{f'; perhaps {near[0]}' if near else ''}; --help lists what there is"
+            return f"{first}: {_unknown(first.partition('=')[0].replace('_', '-'), kind)}"
         case tyro_errors.InvalidChoice(argument=argument, value=value, choices=choices):
-            return f"{argument.display_name()} {value}: allowed: {', '.join(choices)}"
+            return f"{argument.display_name()} {value}: {not_among(choices, value)}"
         case tyro_errors.MissingArgs(missing_arguments=missing):
-            return f"missing: {', '.join(one.arg.display_name() for one in missing)}"
+            args = [one.arg for one in missing]
+            names = [placeholder(arg) if arg.is_positional() else arg.display_name() for arg in args]
+            return f"missing: {', '.join(names)}"
         case tyro_errors.BadValue(argument=argument):
             return f"{argument.display_name()}: needs a value"
-        case tyro_errors.InstantiationFailure(message=message, argument=argument):
-            return f"{argument.display_name()}: {message}; allowed: {argument.lowered.metavar}" if argument else message
-    return "the command line can't be read; --help lists what there is"
+        case tyro_errors.InstantiationFailure(message=message, argument=argument) if argument:
+            return f"{argument.display_name()}: {_reason(message)}; allowed: {placeholder(argument)}"
+    return "the command line can't be read; --help-all lists every flag"
+
+
+def _reason(message: str) -> str:
+    """Why a value cannot be read, in one line; tyro's own messages show types and have several."""
+    first = message.partition("\n")[0]
+    value = re.search(r"(?: from|arguments:|base 10:|to float:) (.+?)\.?$", first)
+    return f"can't read {value[1]}" if value else first
+
+
+def _unknown(flag: str, kind: type[Any]) -> str:
+    """What to say of an unknown flag, with the one that it resembles, with or without its section."""
+    known = {name: name for part in sections(kind) for each in part.flags for name in (each.name, each.negative)}
+    if flag in known:
+        return "takes no value"
+    without = {f"--{name.rpartition('.')[2]}": name for name in reversed(known) if "." in name}
+    known = {**without, **known}
+    near = closest(flag, known)
+    return refusal("unknown", near and known[near], "--help-all lists every flag")

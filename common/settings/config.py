@@ -69,7 +69,7 @@ class LearnerSettings:
     double: bool = False
     """Double Q-learning: the trained network chooses the action at which the target network is evaluated."""
     optimizer: OptimizerName = "rmsprop"
-    """rmsprop: PyTorch's; rmsprop-mnih: centred, eps inside the square root, gradients summed over the batch."""
+    """Optimizer; rmsprop-mnih: centred, eps inside the square root, gradients summed over the batch; else PyTorch's."""
     learning_rate: PositiveFloat = 1e-3
     """Learning rate at the first update."""
     learning_rate_final: PositiveShare = 1.0
@@ -194,7 +194,7 @@ class RunConfig:
     seed: Count = 0
     """Seed of all random numbers."""
     total_steps: Steps = 50_000
-    """Environment steps of the complete run."""
+    """Environment steps of the run."""
     total_updates: Count = 0
     """Stop after this many updates; 0: no limit."""
     total_episodes: Count = 0

@@ -22,7 +22,15 @@ from common.settings.methods import METHODS, table_of
 from common.settings.renamed import current_flags
 from common.settings.resuming import check_resumed
 from common.settings.sources import base_config
-from common.settings.tables import load_tables, resolve, validated
+from common.settings.tables import load_tables, preset_names, resolve, validated
+
+# What --help shows of a run's flags, in this order.
+COMMON = (
+    *("--preset", "--config", "--method", "--seed", "--total-steps", "--run-dir", "--resume"),
+    *("--run", "--actors", "--listen", "--env.id", "--replay.capacity", "--replay.ratio", "--replay.eviction"),
+    *("--learner.batch-size", "--learner.swap-every", "--learner.target-update-every", "--learner.learning-rate"),
+    *("--edl.rate", "--actor.envs"),
+)
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,7 @@ class RoleOptions:
 class RunOptions(RunConfig):
     """The fields of a run's config, their source, and the run directory."""
 
-    preset: str | None = None
+    preset: Annotated[str | None, tyro.conf.arg(metavar=f"{{{','.join(preset_names())}}}")] = None
     """Settings that come with the package; cartpole if neither --config nor a resumed run gives any."""
     config: Path | None = None
     """A TOML file with the fields of a run, for example the config.toml of another run."""
@@ -120,7 +128,7 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     extended = _with_methods(kind)
     given_own = {} if base.own is None else {table_of(base.method): base.own}
     default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **given_own)
-    parsed = cli.parse(extended, program, description, default, args)
+    parsed = cli.parse(extended, program, description, default, args, COMMON)
     options: OptionsT = replace(parsed, own=getattr(parsed, table_of(parsed.method), None))
     given = cli.given_flags(args)
     if "learner.swap_every" in given and not options.two_networks and options.learner.target_update_every is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from importlib.resources import files
 from pathlib import Path
@@ -18,6 +18,7 @@ from common.settings.methods import METHODS
 from common.settings.overrides import merged, of_method
 from common.settings.renamed import current, with_stack
 from common.settings.rules import check_rules
+from common.suggestions import not_among
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
 _FIELDS = [field.name for field in fields(RunConfig) if field.name != "own"]
@@ -41,7 +42,7 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise UsageError(f"--config {path}: {error}") from error
     if preset not in preset_names():
-        raise UsageError(f"--preset {preset}: unknown; allowed: {', '.join(preset_names())}")
+        raise UsageError(f"--preset {preset}: {not_among(preset_names(), str(preset))}")
     return _preset(f"{preset}.toml")
 
 
@@ -89,7 +90,7 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
     """
     tables = to_tables(tables) if isinstance(tables, RunConfig) else dict(tables)
     if "own" in tables:
-        raise UsageError(f"own = {tables['own']!r}: no such field; allowed: {', '.join(_FIELDS)}")
+        raise UsageError(_no_such_field("own", tables["own"], _FIELDS))
     own = _own_settings(tables)
     try:
         config: RunConfig = replace(_ADAPTER.validate_python(tables), own=own)
@@ -109,8 +110,7 @@ def _own_settings(tables: dict[str, Any]) -> Any:  # noqa: ANN401 (an instance o
         raise UsageError(f"method = {name!r}: its settings can't be called {method.table!r}, as others are")
     given, allowed = tables.pop(method.table, {}), [field.name for field in fields(method.settings)]
     if isinstance(given, Mapping) and (unknown := given.keys() - set(allowed)):
-        name = f"{method.table}.{min(unknown)}"
-        raise UsageError(f"{name} = {given[min(unknown)]!r}: no such field; allowed: {', '.join(allowed)}")
+        raise UsageError(_no_such_field(f"{method.table}.{min(unknown)}", given[min(unknown)], allowed))
     try:
         return pydantic.TypeAdapter(method.settings).validate_python(given)
     except pydantic.ValidationError as error:
@@ -170,11 +170,14 @@ def first_problem(
     first, *rest = error.errors(include_url=False)
     name = (prefix + ".".join(str(part) for part in first["loc"])).removesuffix(".")
     if first["type"] == "unexpected_keyword_argument":
-        allowed = ", ".join(_siblings(first["loc"], example))
-        text = f"{name} = {first['input']!r}: no such field; allowed: {allowed}"
+        text = _no_such_field(name, first["input"], _siblings(first["loc"], example))
     else:
         text = f"{name} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
     return f"{text} (and {len(rest)} more)" if rest else text
+
+
+def _no_such_field(name: str, value: object, allowed: Sequence[str]) -> str:
+    return f"{name} = {value!r}: {not_among(allowed, name.rpartition('.')[2], 'no such field')}"
 
 
 def _siblings(path: tuple[int | str, ...], example: Any) -> list[str]:  # noqa: ANN401

@@ -12,6 +12,7 @@ from tyro.conf import Positional
 from common.errors import Interrupted, RunError, UsageError
 from common.process.cli import parse
 from common.process.lifecycle import Stop, run_main
+from common.suggestions import closest, refusal
 from experiments.sweep import slurm
 from experiments.sweep.display import SweepDisplay
 from experiments.sweep.folder import CellFolder, claim_folder, default_folder
@@ -62,7 +63,9 @@ def _run() -> None:
 def _chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
     cells = [CellFolder(folder, cell) for cell in grid.cells if options.cell in (None, cell.name)]
     if not cells:
-        raise UsageError(f"--cell {options.cell}: not in the grid; its first cell is {grid.cells[0].name}")
+        names = [cell.name for cell in grid.cells]
+        near = closest(str(options.cell), names)
+        raise UsageError(f"--cell {options.cell}: {refusal('not in the grid', near, f'its first cell is {names[0]}')}")
     return cells
 
 

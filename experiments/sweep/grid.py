@@ -25,6 +25,7 @@ from common.settings.names import MethodName
 from common.settings.overrides import leaves, merged, nested, of_method
 from common.settings.renamed import current
 from common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
+from common.suggestions import closest, refusal
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 
@@ -119,7 +120,8 @@ def _text(name: str) -> str:
     if name in shipped_grids():
         return files("experiments").joinpath("grids", f"{name}.toml").read_text(encoding="utf-8")
     if not name.endswith(".toml"):
-        raise UsageError(f"unknown; give a .toml file or one of {', '.join(shipped_grids())}")
+        hint = f"give a .toml file or one of {', '.join(shipped_grids())}"
+        raise UsageError(refusal("unknown", closest(name, shipped_grids()), hint))
     return Path(name).read_text(encoding="utf-8")
 
 

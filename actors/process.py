@@ -1,0 +1,100 @@
+"""The process of an actor: joins a run, plays until the stop, and leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import zenoh
+
+from actors.cli import ActorOptions
+from actors.policy import Policy
+from actors.service import ActorService
+from common.envs.make import make_vector_env
+from common.errors import JoinError
+from common.imports import check_allowed
+from common.messaging.joining import Membership, join, leave_run
+from common.messaging.messages.join import Join, Joined
+from common.messaging.route import ReplayRoute
+from common.messaging.transport import Node, new_incarnation, open_session
+from common.networks.network import FlatNetwork, build_network
+from common.process.console import Console, counted
+from common.process.lifecycle import Stop
+from common.process.memory import keep_freed_memory
+from common.process.threads import use_threads
+
+
+def play(options: ActorOptions) -> None:
+    """Join a run and play emulators for it until the stop."""
+    use_threads(1)
+    keep_freed_memory()
+    stop = Stop()
+    stop.on_signals()
+    stop.on_thread_failures()
+    incarnation, console = new_incarnation(), Console()
+    session = open_session((), options.connect, options.zenoh_config, options.shared_memory)
+    with Node(session, options.run, "actor", incarnation) as node:
+        node.follow_stop(stop)
+        request = Join("actor", incarnation, [])
+        try:
+            joined = join(
+                node, stop, request, options.connect, options.join_timeout, need_replay=True, event=console.event
+            )
+            if joined is not None:
+                _play(node, stop, options, request, joined, console)
+        finally:
+            leave_run(node, request)
+    stop.leave()
+
+
+def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined, console: Console) -> None:
+    """Play until the stop.
+
+    Raises:
+        JoinError: the run needs a module that this process may not import, or this process's environment or network
+            differs from the learner's.
+    """
+    config = joined.config
+    for field, path in config.imports.items():
+        check_allowed(path, options.allow_import, field)
+    # The learner gives each number once per run, also across restarts, so no two processes play the same seeds.
+    seed = np.random.SeedSequence([config.seed, 3, joined.index])
+    env_seed, policy_seed = seed.spawn(2)
+    env = make_vector_env(config.env, options.envs or config.actor.envs, int(env_seed.generate_state(1)[0]))
+    policy = Policy(_networks(joined), joined.spec, np.random.default_rng(policy_seed))
+    if env.spec != joined.spec:
+        raise JoinError(f"environment here {env.spec}, the learner's {joined.spec}")
+
+    def open_route(endpoints: Sequence[str]) -> zenoh.Session:
+        return open_session((), (*options.connect, *endpoints), options.zenoh_config, options.shared_memory)
+
+    with ReplayRoute(options.run, request.incarnation, open_route, joined.replay_endpoints) as route:
+
+        def learned(answer: Joined, _: float) -> None:
+            route.follow(answer.replay_endpoints)
+
+        console.event(
+            f"joined run {options.run!r} on {joined.learner} as actor {joined.index}; "
+            f"plays {counted(env.num_envs, 'emulator')} of {config.env.id} for the replay service on {joined.replay}"
+        )
+        service = ActorService(node, route, stop, config, env, policy, request.incarnation, console)
+        with Membership(node, stop, request, joined, options.patience, learned, console.event, lambda: route.is_up):
+            service.run()
+    console.event(f"{stop.reason}; {service.progress()}")
+    env.close()
+
+
+def _networks(joined: Joined) -> tuple[FlatNetwork, FlatNetwork]:
+    """Networks of the run's layout, whose parameters the learner will send.
+
+    Raises:
+        JoinError: this process builds another layout than the learner does.
+    """
+    settings = joined.config.network
+    modules = [build_network(settings.kind, joined.spec, settings.hidden, seed=0) for _ in range(2)]
+    dtype = torch.bfloat16 if settings.dtype == "bfloat16" else torch.float32
+    first, second = (FlatNetwork(module.to(dtype)) for module in modules)
+    if first.layout_digest() != joined.layout:
+        raise JoinError(f"network layout here {first.layout_digest()}, the learner's {joined.layout}")
+    return first, second

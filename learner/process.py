@@ -1,0 +1,89 @@
+"""The process of a run's learner: begins the training or continues it from an epoch, and ends it properly."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from common.errors import RunError, UsageError
+from common.messaging.clients import SampleClient
+from common.messaging.transport import Node, locators, new_incarnation, open_session
+from common.process.console import Console, say
+from common.process.lifecycle import Stop
+from common.process.locks import RunLock
+from common.process.threads import use_threads
+from common.settings.config import RunConfig
+from common.settings.options import beginning
+from common.types import EnvSpec
+from learner.agent import Agent
+from learner.checkpoints import Checkpoints
+from learner.cli import LearnerOptions
+from learner.join_service import JoinService
+from learner.records.epochs import intact_epochs, load_learner, rewind
+from learner.records.run_directory import RunDirectory, claim_run_directory
+from learner.roster import Roster
+from learner.service import LearnerService
+from learner.shared_epochs import SharedEpochs
+from learner.trainer import Trainer
+
+
+def learn(options: LearnerOptions, config: RunConfig, spec: EnvSpec) -> None:
+    """Train a run, whose config has been checked, in the run directory that the options name."""
+    use_threads(config.learner.threads)
+    stop = Stop()
+    stop.on_signals()
+    stop.on_thread_failures()
+    path = options.directory()
+    with RunLock(path, "coop-learner", ("learner",)):
+        _train(options, config, spec, path, stop)
+
+
+def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path, stop: Stop) -> None:
+    """Train a run from its beginning, or from an epoch, to its end."""
+    console = Console()
+    held = intact_epochs(path) if options.resume else []
+    if options.resume and not held:
+        console.event(beginning(path))
+    if held:
+        _check_origin(path / "checkpoints" / str(held[-1]))
+    trainer = Trainer(Agent(config, spec), time.monotonic())
+    agent = trainer.agent
+    epochs = SharedEpochs(held, str(path), restart=options.restart)
+    incarnation = new_incarnation()
+    session = open_session(options.listen, (), options.zenoh_config, options.shared_memory)
+    with Node(session, config.run, "learner", incarnation) as node:
+        run_id = claim_run_directory(path, config)
+        roster = Roster(path, time.monotonic())
+        layout = agent.networks[0].layout_digest()
+        join_service = JoinService(node, config, spec, layout, run_id, epochs, roster, console.event)
+        console.event(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}")
+        if held:
+            console.event("waiting for the replay service's list of epochs")
+        number = epochs.wait(stop)
+        if number is None:
+            stop.leave()
+            return
+        state = rewind(path, number)
+        if state is not None:
+            trainer.load_state(state, time.monotonic())
+            console.event(f"goes on from epoch {number}")
+        elif held:
+            console.event("begins anew: no epoch is held by both")
+        settings, episodes_received = config.learner, 0 if state is None else state["told"]
+        samples = SampleClient(
+            node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, episodes_received
+        )
+        checkpoints = Checkpoints(node, path, samples, epochs, console.event)
+        with RunDirectory(path, config, None if state is None else state["sizes"]) as directory:
+            summary = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console).run()
+    say(str(summary))
+    if trainer.diverged:
+        raise RunError(trainer.diverged)
+    if stop.failed or summary.exit == stop.reason:  # otherwise the run was complete before the signal
+        stop.leave()
+
+
+def _check_origin(epoch: Path) -> None:
+    """Raise UsageError for an epoch of a lockstep run, before anything is deleted or written."""
+    if "told" not in load_learner(epoch):
+        raise UsageError(f"{epoch}: saved by a lockstep run; coop-lockstep --resume goes on with it")
