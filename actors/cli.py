@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from common.process import cli
+from common.process.importing import importing
 from common.process.lifecycle import run_main
 from common.settings.options import RoleOptions
 
@@ -26,6 +27,7 @@ def main() -> None:
 
 def _run() -> None:
     options = cli.parse(ActorOptions, "coop-actor", "Play emulators for a run; its learner sends the config.")
-    from actors.process import play  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+    with importing():
+        from actors.process import play  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
     play(options)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import gc
 import importlib
 
+from common.process.importing import importing
 from common.process.lifecycle import end_on_signals
 
 
@@ -45,8 +45,6 @@ def sweep() -> None:
 
 def _begin(program: str, module: str) -> None:
     end_on_signals(program)
-    gc.disable()  # imports leave no garbage, and looking for it takes a tenth of their time
-    main = importlib.import_module(module).main
-    gc.freeze()
-    gc.enable()
+    with importing():
+        main = importlib.import_module(module).main
     main()

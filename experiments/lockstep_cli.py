@@ -7,6 +7,7 @@ from contextlib import closing
 
 from common.errors import RunError
 from common.process.console import say
+from common.process.importing import importing
 from common.process.lifecycle import Stop, run_main
 from common.settings.options import RunOptions, beginning, parse_run
 
@@ -21,7 +22,8 @@ def _run() -> None:
     options = parse_run(RunOptions, "coop-lockstep", description, lockstep=True)
     config = options.run_config()
     path = options.directory()
-    from experiments.lockstep_run import LockstepRun  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+    with importing():
+        from experiments.lockstep_run import LockstepRun  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
     stop = Stop()
     stop.on_signals()

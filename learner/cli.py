@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from common.envs.make import env_spec
 from common.errors import UsageError
+from common.process.importing import importing
 from common.process.lifecycle import run_main
 from common.settings.capacity import check_messages
 from common.settings.config import check_distributed
@@ -37,6 +38,7 @@ def _run() -> None:
     check_distributed(config)
     spec = env_spec(config.env)
     check_messages(config, spec)
-    from learner.process import learn  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+    with importing():
+        from learner.process import learn  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
     learn(options, config, spec)
