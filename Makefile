@@ -7,7 +7,7 @@ READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: run test check results fuzz netns soak chaos
+.PHONY: run test check results fuzz netns soak chaos slurm-test
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -38,6 +38,10 @@ chaos: $(READY)
 
 soak: $(READY)
 	@$(BIN)/python benchmarks/soak.py
+
+# A Slurm controller and three nodes on this machine; root installs what is missing.
+slurm-test: $(READY)
+	@BIN=$(BIN) deploy/slurm/check.sh
 
 mutants: $(READY)
 	@$(PIP) --editable '.[dev,mutants]' > $(VENV)/mutants.log 2>&1 || { cat $(VENV)/mutants.log; exit 1; }

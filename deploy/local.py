@@ -31,7 +31,7 @@ class LocalOptions(RunOptions):
     """Flags of `coop-local`."""
 
     actors: int = 1
-    """Actor processes."""
+    """Actor processes; 0 with --listen, for actors that all run elsewhere."""
     restart: bool = False
     """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
     listen: str | None = None
@@ -137,8 +137,8 @@ def main() -> None:
 
 def _run() -> None:
     options = parse_run(LocalOptions, "coop-local", "Run a learner, a replay service and actors on this machine.")
-    if options.actors < 1:
-        raise UsageError(f"--actors {options.actors}: must be at least 1")
+    if options.actors < (0 if options.listen else 1):
+        raise UsageError(f"--actors {options.actors}: must be at least 1, or 0 with --listen")
     config = options.run_config()
     check_distributed(config)
     spec = env_spec(config.env)  # refuses invalid environments before anything starts

@@ -1,13 +1,10 @@
 """What can't be played or held is refused at the start, in one line with the numbers, through the console command."""
 
 import os
-import subprocess
-import sysconfig
 from pathlib import Path
 
 import pytest
-
-LOCAL = Path(sysconfig.get_path("scripts")) / "coop-local"
+from commands import run_command
 
 
 @pytest.mark.parametrize(
@@ -20,6 +17,8 @@ LOCAL = Path(sysconfig.get_path("scripts")) / "coop-local"
             "--replay.capacity 1000000000 --total-steps 1000000000",
             ["replay.capacity = 1,000,000,000: needs up to 6640.3 GiB, this machine has"],
         ),
+        ("--actors 0", ["--actors 0: must be at least 1, or 0 with --listen"]),
+        ("--actors=-1 --listen tcp/127.0.0.1:0", ["--actors -1: must be at least 1, or 0 with --listen"]),
     ],
 )
 def test_refused(flags: str, words: list[str], tmp_path: Path) -> None:
@@ -31,10 +30,8 @@ def test_a_missing_rom_is_refused(tmp_path: Path) -> None:
 
 
 def check(flags: list[str], run_dir: Path, words: list[str], environment: dict[str, str] | None = None) -> None:
-    command = [str(LOCAL), "--preset", "breakout", *flags, "--run-dir", str(run_dir)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=60, check=False, env={**os.environ, **(environment or {})}
-    )
+    variables = {**os.environ, **(environment or {})}
+    done = run_command("coop-local", "--preset", "breakout", *flags, "--run-dir", run_dir, environment=variables)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("coop-local: error: ")

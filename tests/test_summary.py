@@ -1,7 +1,12 @@
-"""The line with which a run ends."""
+"""The summary with which a run ends."""
+
+from pathlib import Path
 
 import pytest
 
+from common.settings.config import RunConfig
+from common.settings.environment import EnvSettings
+from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary
 
 
@@ -17,3 +22,14 @@ from learner.records.summary import Summary
 def test_it_says_how_many_episodes_the_return_is_of(episodes: int, returns: str) -> None:
     summary = Summary("dqn", "CartPole-v0", 0, 1000, 900, episodes, 22.6, 20.8, 3.4, 1000, 0, 0, "complete")
     assert str(summary) == f"complete: 1,000 steps, 900 updates, {returns}, 3 s"
+
+
+def test_a_run_that_goes_on_has_none(tmp_path: Path) -> None:
+    config = RunConfig(env=EnvSettings(id="CartPole-v0"))
+    with RunDirectory(tmp_path / "run", config) as directory:
+        directory.conclude(
+            Summary("dqn", "CartPole-v0", 0, 1000, 900, 10, 22.6, 20.8, 3.4, 1000, 0, 0, "complete"), "a run"
+        )
+    assert (tmp_path / "run" / "summary.json").exists()
+    with RunDirectory(tmp_path / "run", config, sizes={}):
+        assert not (tmp_path / "run" / "summary.json").exists()

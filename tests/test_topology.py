@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from commands import run_command
 
 from experiments.reexecute import reexecute
 from learner.records.epochs import load_learner
@@ -50,7 +51,7 @@ def running(name: str, *flags: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def run(name: str, *flags: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(SCRIPTS / name), *flags], capture_output=True, text=True, timeout=90, check=False)
+    return run_command(name, *flags, timeout=90)
 
 
 def wait_for(what: str, reached: object, seconds: float = 60.0) -> None:
@@ -122,6 +123,14 @@ def test_coop_local_end_to_end(tmp_path: Path) -> None:
     assert again.returncode == 2
     assert again.stderr.count("\n") == 1
     assert "holds a run already" in again.stderr
+
+
+def test_actors_that_all_run_elsewhere(tmp_path: Path, endpoint: str) -> None:
+    local = ("--actors", "0", "--listen", endpoint, "--total-steps", "600", "--run-dir", str(tmp_path / "run"))
+    with running("coop-local", *local) as head, running("coop-actor", "--connect", endpoint) as actor:
+        out, err = head.communicate(timeout=80)
+        assert (head.returncode, err, actor.wait(20)) == (0, "", 0)
+        assert re.search(r"complete: 600 steps, \d+ updates", out)
 
 
 def test_three_shells_a_late_actor_and_a_kill(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ class RunDirectory:
             claim_run_directory(path, config)
             for name, size in (sizes or {}).items():
                 truncate(path / name, size)
+            (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
             self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
             self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
             self._tensorboard = TensorBoardWriter(path / "tb")

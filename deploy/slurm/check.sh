@@ -1,0 +1,112 @@
+#!/bin/bash
+# Runs head.sbatch, actors.sbatch and coop-sweep --slurm on a real Slurm controller with three nodes on this machine: `make slurm-test`.
+# Parts of the run are requeued, cancelled and added in its middle. Takes about six minutes, as Slurm holds requeued jobs for two. Needs root, and installs slurm-wlm where it is missing.
+set -eu
+here=$(cd "$(dirname "$0")" && pwd)
+bin=${BIN:?is not set: the folder with coop-local and coop-sweep}
+PATH=$(cd "$bin" && pwd):$PATH
+
+skip() { echo "SKIP: $*"; exit 0; }
+[ "$(id -u)" = 0 ] || skip "a Slurm controller of one's own needs root"
+if ! command -v slurmctld slurmd munged > /dev/null; then
+    apt-get install --yes --quiet slurm-wlm > /dev/null 2>&1 || skip "slurm-wlm is not installed, and apt-get can't install it"
+fi
+
+work=$(mktemp -d)
+chmod 755 "$work"
+export SLURM_CONF=$work/slurm.conf OMP_NUM_THREADS=1
+finish() {
+    scancel --quiet --user=root 2> /dev/null || true
+    sleep 2
+    for file in "$work"/*.pid; do kill "$(cat "$file")" 2> /dev/null || true; done
+    [ "${failed:-1}" = 1 ] && tail -n 5 "$work"/*.log "$work"/*.out || rm -rf "$work"
+}
+trap finish EXIT
+fail() { echo "FAILED: $*"; exit 1; }
+
+mkdir -p "$work/munge" "$work/state"
+dd if=/dev/urandom of="$work/munge/key" bs=1 count=1024 status=none
+chmod 400 "$work/munge/key"
+munged --force --socket="$work/munge/socket" --key-file="$work/munge/key" --pid-file="$work/munge.pid" \
+    --log-file="$work/munge/log" --seed-file="$work/munge/seed"
+host=$(hostname -s)
+cat > "$SLURM_CONF" <<CONF
+ClusterName=check
+SlurmctldHost=$host(127.0.0.1)
+SlurmctldPort=16817
+AuthType=auth/munge
+AuthInfo=socket=$work/munge/socket
+SlurmUser=root
+StateSaveLocation=$work/state
+SlurmctldPidFile=$work/slurmctld.pid
+SlurmctldLogFile=$work/slurmctld.log
+SlurmdPidFile=$work/slurmd-%n.pid
+SlurmdLogFile=$work/slurmd-%n.log
+SlurmdSpoolDir=$work/spool-%n
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_CPU
+ReturnToService=2
+MinJobAge=3600
+SlurmdParameters=config_overrides
+SchedulerParameters=sched_interval=1
+NodeName=n[1-3] NodeHostname=$host NodeAddr=127.0.0.1 Port=[16818-16820] CPUs=4 State=UNKNOWN
+PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+CONF
+slurmctld
+for node in n1 n2 n3; do slurmd -N "$node"; done
+
+wait_for() { # SECONDS WHAT COMMAND...: until the command succeeds
+    local until=$((SECONDS + $1)) what=$2
+    shift 2
+    until "$@" > /dev/null 2>&1; do
+        [ $SECONDS -lt $until ] || fail "no $what"
+        sleep 0.5
+    done
+}
+state() { scontrol show job "$1" | grep -o 'JobState=[A-Z]*' | head -n 1; }
+steps() { tail -n 1 "$RUN_DIR/metrics.jsonl" | grep -o '"env_step": [0-9]*' | grep -o '[0-9]*'; }
+reached() { [ "$(steps)" -ge "$1" ]; }
+running() { [ "$(squeue --noheader --states=running --array | wc -l)" -ge "$1" ]; }
+finished() { [ -z "$(squeue --noheader)" ]; }
+complete() { grep -q '"exit": "complete"' "$RUN_DIR/summary.json"; }
+
+wait_for 60 "three idle nodes" bash -c '[ "$(sinfo --noheader --states=idle --format=%D)" = 3 ]'
+
+echo "a distributed run: head on one node, three actors"
+export RUN_DIR=$work/run
+head=$(sbatch --parsable --output="$work/head.out" "$here/head.sbatch" --preset cartpole --method coop --total-steps 6000 --checkpoint-every 500)
+actors=$(sbatch --parsable --array=1-3 --output="$work/actor-%a.out" "$here/actors.sbatch")
+wait_for 120 "500 steps" reached 500
+echo "one actor requeued, one cancelled, two added: $(steps) steps"
+scontrol requeue "${actors}_1"
+scancel "${actors}_2"
+sbatch --parsable --array=4-5 --output="$work/actor-%a.out" "$here/actors.sbatch" > /dev/null
+wait_for 120 "1500 steps" reached 1500
+echo "head requeued: $(steps) steps"
+scontrol requeue "$head"
+wait_for 400 "2500 steps after the head is back" reached 2500
+grep -q "goes on with the run in" "$work/head.out" || fail "the head began anew"
+echo "head cancelled: $(steps) steps"
+scancel "$head"
+wait_for 60 "end of the head" bash -c "[ ! -e '$RUN_DIR/endpoint' ]"
+grep -q '"exit": "interrupted"' "$RUN_DIR/summary.json" || fail "no summary of a clean stop"
+head=$(sbatch --parsable --output="$work/head-2.out" "$here/head.sbatch" --preset cartpole --method coop --total-steps 6000 --checkpoint-every 500)
+wait_for 240 "end of the run" complete
+wait_for 60 "end of its jobs" finished
+grep -E '"(env_steps|transitions_accepted|transitions_lost|duplicates_refused|exit)"' "$RUN_DIR/summary.json"
+grep -q '"transitions_lost": 0' "$RUN_DIR/summary.json" || fail "transitions are lost"
+
+echo "a sweep of four cells, one requeued"
+printf 'title = "four"\npreset = "cartpole"\nmethods = ["dqn", "coop"]\nseeds = [0, 1]\n[fixed]\ntotal_steps = 3000\n' > "$work/four.toml"
+coop-sweep "$work/four.toml" --slurm --dir "$work/four"
+wait_for 60 "running cells" running 2
+wait_for 60 "cell with episodes" bash -c "ls '$work'/four/*/episodes.csv"
+cell=$(squeue --noheader --states=running --format=%i | head -n 1)
+scontrol requeue "$cell"
+coop-sweep "$work/four.toml" --slurm --dir "$work/four"
+wait_for 300 "end of the sweep" finished
+[ "$(grep -l '"exit": "complete"' "$work"/four/*/summary.json | wc -l)" = 4 ] || fail "not all four cells are complete"
+echo "passed: run complete, nothing lost; 4 of 4 cells complete"
+failed=0
