@@ -18,9 +18,14 @@ export SLURM_CONF=$work/slurm.conf OMP_NUM_THREADS=1
 finish() {
     scancel --quiet --user=root 2> /dev/null || true
     sleep 2
-    for file in "$work"/*.pid; do kill "$(cat "$file")" 2> /dev/null || true; done
-    [ "${failed:-1}" = 1 ] && tail -n 5 "$work"/*.log "$work"/*.out || rm -rf "$work"
+    local pids
+    pids=$(cat "$work"/*.pid) || true
+    kill $pids 2> /dev/null || true
+    for pid in $pids; do while kill -0 "$pid" 2> /dev/null; do sleep 0.2; done; done
+    [ "$failed" = 0 ] || tail -n 5 "$work"/*.log "$work"/*.out
+    rm -rf "$work"
 }
+failed=1
 trap finish EXIT
 fail() { echo "FAILED: $*"; exit 1; }
 
