@@ -7,7 +7,7 @@ READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: run test check results fuzz netns soak chaos slurm-test
+.PHONY: run test check results fuzz netns soak chaos slurm-test mutants dist
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -46,6 +46,11 @@ slurm-test: $(READY)
 mutants: $(READY)
 	@$(PIP) --editable '.[dev,mutants]' > $(VENV)/mutants.log 2>&1 || { cat $(VENV)/mutants.log; exit 1; }
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/mutants.py
+
+# Wheel and sdist in dist/; the wheel is tried in a fresh environment.
+dist: $(READY)
+	@$(PIP) --editable '.[dev,dist]' > $(VENV)/dist.log 2>&1 || { cat $(VENV)/dist.log; exit 1; }
+	@BUILDER="$(CURDIR)/$(BIN)/python" PYTHON="$(PYTHON)" deploy/check_dist.sh
 
 $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV)"

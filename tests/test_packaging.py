@@ -1,0 +1,63 @@
+"""What is installed and what goes with the source: packages, their data, license, citation and links of pages."""
+
+import re
+import tomllib
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PACKAGES: list[str] = PROJECT["tool"]["setuptools"]["packages"]
+IN_CHECKOUTS_ONLY = ("deploy/Dockerfile", "deploy/compose.yaml", "deploy/*.sh", "deploy/slurm/*", "deploy/zenoh/*")
+PAGES = ("README.md", "CONTRIBUTING.md", "SECURITY.md", *(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
+
+
+def test_every_package_is_installed() -> None:
+    tops = {package.partition(".")[0] for package in PACKAGES}
+    folders = {init.parent.relative_to(ROOT) for top in tops for init in (ROOT / top).rglob("__init__.py")}
+    assert {".".join(folder.parts) for folder in folders} == set(PACKAGES)
+    assert tops == set(PROJECT["tool"]["importlinter"]["root_packages"])
+
+
+def test_every_data_file_is_installed() -> None:
+    data = PROJECT["tool"]["setuptools"]["package-data"]
+    allowed = [f"{package.replace('.', '/')}/{pattern}" for package, patterns in data.items() for pattern in patterns]
+    tops = {package.partition(".")[0] for package in PACKAGES}
+    files = [path.relative_to(ROOT).as_posix() for top in tops for path in (ROOT / top).rglob("*") if path.is_file()]
+    others = [path for path in files if not path.endswith(".py") and "__pycache__" not in path]
+    assert others
+    assert not [path for path in others if not any(fnmatch(path, rule) for rule in (*allowed, *IN_CHECKOUTS_ONLY))]
+
+
+def test_the_citation_names_the_software_and_the_paper() -> None:
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert {"cff-version", "message", "title", "authors"} <= cited.keys()
+    assert cited["license"] == PROJECT["project"]["license"] == "MIT"
+    assert [author["name"] for author in PROJECT["project"]["authors"]] == [each["name"] for each in cited["authors"]]
+    (paper,) = cited["references"]
+    assert paper["title"] == "Cooperative Deep Q-learning Framework for Environments Providing Image Feedback"
+    assert [f"{each['given-names']} {each['family-names']}" for each in paper["authors"]] == [
+        "Krishnan Raghavan",
+        "Vignesh Narayanan",
+        "Sarangapani Jagannathan",
+    ]
+    assert paper["identifiers"] == [{"type": "other", "value": "arXiv:2110.15305"}]
+
+
+@pytest.mark.parametrize("form", ["bug", "feature"])
+def test_forms_of_issues(form: str) -> None:
+    shown = yaml.safe_load((ROOT / ".github" / "ISSUE_TEMPLATE" / f"{form}.yml").read_text(encoding="utf-8"))
+    assert {"name", "description", "body"} <= shown.keys()
+    assert all(field["type"] == "textarea" and field["attributes"]["label"] for field in shown["body"])
+    assert any(field.get("validations", {}).get("required") for field in shown["body"])
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_to_files(page: str) -> None:
+    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", (ROOT / page).read_text(encoding="utf-8"))
+    missing = [link for link in links if "://" not in link and not (ROOT / page).parent.joinpath(link).exists()]
+    assert not missing
