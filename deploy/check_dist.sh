@@ -7,11 +7,12 @@ constraints=$PWD/constraints.txt
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 rm -rf dist
-"${BUILDER:-python3}" -m build --outdir dist . >"$folder/build.log" 2>&1 || { tail -n 20 "$folder/build.log" >&2; exit 1; }
+quietly() { "$@" >"$folder/log" 2>&1 || { tail -n 20 "$folder/log" >&2; exit 1; }; }
+quietly "${BUILDER:-python3}" -m build --outdir dist .
 wheel=$(readlink -f dist/*.whl)
 cd "$folder"
 "${PYTHON:-python3}" -m venv venv
-venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint "$constraints" "$wheel"
+quietly venv/bin/python -m pip install --disable-pip-version-check --constraint "$constraints" "$wheel"
 version=$(basename "$wheel" | cut -d- -f2)
 for command in venv/bin/coop-*; do
   test "$("$command" --version)" = "$(basename "$command") $version" || { echo "$command: not version $version" >&2; exit 1; }
