@@ -104,7 +104,7 @@ class Agent:
         tape = online.forward(inputs if settings.double else inputs[:size])
         values, next_values = on_host(tape.output), target.values(inputs[size:])
         bootstrap = self.rule.bootstrap(next_values, values[size:] if settings.double else next_values)
-        errors = td_errors(batch, values, bootstrap, settings.gamma)
+        errors = td_errors(batch, values, bootstrap, settings.gamma, settings.value_bound)
         online.backward(tape.head(size), output_error(batch, self.loss.slope(errors), next_values), s)
         self.rule.add_cost(online, target, inputs, self.updates)
         if self._weight_decay is not None:

@@ -65,7 +65,7 @@ class Diagnostics:
         bootstrap = agent.rule.bootstrap(next_values, preferred)
         generator.state = before
         q = q[:, :size]
-        errors = td_errors(archive, q[acting], bootstrap, settings.gamma)
+        errors = td_errors(archive, q[acting], bootstrap, settings.gamma, settings.value_bound)
         return {
             "q_gap": float(np.linalg.norm(q[0] - q[1], axis=1).mean()),
             "q1_mean": float(q[0].mean()),

@@ -63,13 +63,17 @@ class Huber:
 LOSSES: dict[str, Loss] = {"squared": SquaredError(), "mse": MeanSquaredError(), "huber": Huber()}
 
 
-def td_errors(batch: Batch, values: Values, bootstrap: Values, gamma: float) -> Values:
+def td_errors(
+    batch: Batch, values: Values, bootstrap: Values, gamma: float, value_bound: float | None = None
+) -> Values:
     """e[a] = y[a] - (r + gamma^k (1 - terminated) V(x')) of the actions taken, float32 [batch].
 
     k: the steps that a transition spans, 1 except for n-step returns.
 
-    values: y = Q(x), float32 [batch, actions]. bootstrap: V(x'), float32 [batch].
+    values: y = Q(x), float32 [batch, actions]. bootstrap: V(x'), float32 [batch], clipped to +-value_bound.
     """
+    if value_bound is not None:
+        bootstrap = bootstrap.clip(-value_bound, value_bound)
     discounts = _powers(gamma)[batch.span] * ~batch.terminated
     errors: Values = values[np.arange(len(batch)), batch.actions] - (batch.rewards + discounts * bootstrap)
     return errors

@@ -82,11 +82,11 @@ def test_coop_without_s_is_g_coop() -> None:
     assert edl.exploration_rate() > 0
 
 
-@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize(("double", "bound"), [(False, None), (True, None), (True, 0.01)])
 @pytest.mark.parametrize("loss", ["squared", "mse", "huber"])
-def test_an_update_by_autograd(double: bool, loss: str) -> None:
+def test_an_update_by_autograd(double: bool, bound: float | None, loss: str) -> None:
     """One step of SGD on 1/2 e^2 (or Huber's) with the targets written out."""
-    agent = Agent(_config("g-coop", optimizer="sgd", double=double, loss=loss, gamma=0.9), SPEC)
+    agent = Agent(_config("g-coop", optimizer="sgd", double=double, loss=loss, gamma=0.9, value_bound=bound), SPEC)
     batch = batches(1)[0]
     batch = replace(batch, rewards=batch.rewards * 3, weights=np.linspace(0.5, 1.5, 32, dtype=np.float32))
     online, target = agent.networks
@@ -95,6 +95,7 @@ def test_an_update_by_autograd(double: bool, loss: str) -> None:
     with torch.no_grad():
         best = (online if double else target)(next_obs).argmax(1, keepdim=True)
         value = target(next_obs).gather(1, best)[:, 0]
+        value = value if bound is None else value.clip(-bound, bound)
         discounts = 0.9 ** torch.tensor(batch.span) * ~torch.tensor(batch.terminated)
         targets = torch.tensor(batch.rewards) + discounts * value
     errors = online.module(obs).gather(1, actions)[:, 0] - targets

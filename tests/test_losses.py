@@ -55,6 +55,15 @@ def test_td_errors() -> None:
     assert errors.tolist() == [-1.0, 1.0, 0.5, 3.0]
 
 
+def test_targets_take_no_value_beyond_the_bound() -> None:
+    """r + 0.5 V with V clipped to +-4: 1 + 2, 1 - 2, 1 + 1; the network's own value, 9, is not clipped."""
+    batch = make_batch(actions=[0, 0, 0], rewards=[1.0, 1.0, 1.0])
+    values, bootstrap = np.full((3, 1), 9, np.float32), np.array([6.0, -6.0, 2.0], np.float32)
+    errors = td_errors(batch, values, bootstrap, gamma=0.5, value_bound=4.0)
+    assert errors.dtype == np.float32
+    assert errors.tolist() == [6.0, 10.0, 7.0]
+
+
 def test_only_the_actions_taken_have_an_error() -> None:
     batch = make_batch(actions=[1, 0], weights=[1.0, 0.5])
     error = output_error(batch, np.array([4.0, 6.0], np.float32), np.empty((2, 3), np.float32))

@@ -68,6 +68,8 @@ class LearnerSettings:
     """squared: 1/2 e^2 (paper); mse: e^2 (authors' code; halves the weight of s); huber: slope clipped to [-1, 1]."""
     double: bool = False
     """Double Q-learning: the trained network chooses the action at which the target network is evaluated."""
+    value_bound: PositiveFloat | None = None
+    """Targets take no value of a next state beyond +-this. (Largest |reward|) / (1 - gamma) excludes no true value."""
     optimizer: OptimizerName = "rmsprop"
     """Optimizer; rmsprop-mnih: centred, eps inside the square root, gradients summed over the batch; else PyTorch's."""
     learning_rate: PositiveFloat = 1e-3
