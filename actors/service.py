@@ -11,14 +11,17 @@ from actors.segments import SegmentAssembler
 from actors.weights import WeightsFollower
 from common.envs.protocol import VectorEnv
 from common.messaging.clients import InsertClient
+from common.messaging.messages.status import ActorStatus
 from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node
 from common.process.console import Console
 from common.process.lifecycle import Stop
+from common.process.rates import Rate
 from common.settings import schedules
 from common.settings.config import RunConfig
 
 STATUS_EVERY = 0.5  # seconds
+SPEED_OVER = 2.0  # seconds
 
 
 class ActorService:
@@ -52,6 +55,7 @@ class ActorService:
         )
         self._turn: Turn | None = None
         self._status_due = 0.0
+        self._speed = Rate(SPEED_OVER)
 
     def run(self) -> None:
         """Play until the stop; steps that have not filled a segment by then are dropped."""
@@ -85,9 +89,8 @@ class ActorService:
         if now < self._status_due:
             return
         self._status_due = now + STATUS_EVERY
-        self._node.publish_status(
-            {"steps": self._player.steps, "acked": self._inserts.acked, "waiting": self._waiting()}
-        )
+        speed = self._speed.at(now, self._player.steps)
+        self._node.publish_status(ActorStatus(self._player.steps, self._inserts.acked, speed, self._waiting()))
         self._console.progress(self._inserts.acked, self._waiting(), self.progress)
 
     def progress(self) -> str:

@@ -9,6 +9,7 @@ MAX_PRIORITIES = 50_000  # priority updates in one request for a batch; its head
 MAX_AHEAD = 1024  # draws by which a learner may be ahead of its base
 MAX_STREAMS = 65_536  # emulators of one actor process
 MAX_GAPS = 1024  # segments of a stream that may be missing while later ones have arrived
+MAX_POINTS = 128  # values of a run's history of returns in a status
 MAX_STACK = 64  # frames of an observation
 MAX_ENV_ID = 256  # characters
 MAX_KWARGS = 65_536  # bytes of an environment's keyword arguments in a message

@@ -71,7 +71,7 @@ class ChaosMonkey:
         now = time.monotonic()
         self._status.refresh()
         learner = self._status.learner
-        progress = (learner.get("env_steps", 0), learner.get("updates", 0))
+        progress = (0, 0) if learner is None else (learner.env_steps, learner.updates)
         if progress != self._progress:
             if self._progress[1]:
                 self.longest_stall = max(self.longest_stall, now - self._moved)

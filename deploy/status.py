@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
-from rich.console import Group, RenderableType
-from rich.progress_bar import ProgressBar
-from rich.table import Table
+from rich.console import RenderableType
 
 from common.errors import BadMessage
 from common.messaging.keys import status_key
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.transport import Node, open_session
-from common.process.console import PeerMonitor, connected, progress_line, returns, stamped
+from common.process.console import PeerMonitor, progress_line, stamped
 from common.process.display import LiveDisplay
 from common.process.lifecycle import Stop
+from deploy.screen import RunScreen
 
 PLAIN_EVERY = 5.0  # seconds between lines if the output is no terminal
 
@@ -28,21 +27,26 @@ class RunStatus:
     Args:
         endpoint: of the learner, or of a router connected to it.
         zenoh_config: like the run's roles.
+
+    Attributes:
+        run: its name.
+        learner: the learner's newest status; None before the first.
     """
 
     def __init__(self, run: str, endpoint: str, incarnation: int, zenoh_config: Path | None = None) -> None:
+        self.run = run
+        self.learner: LearnerStatus | None = None
         self._node = Node(open_session((), (endpoint,), zenoh_config), run, "watch", incarnation)
-        self._learner = self._node.latest(status_key(self._node, "learner"))
+        self._statuses = self._node.latest(status_key(self._node, "learner"))
         self._updated_at = time.monotonic()
-        self.learner: dict[str, Any] = {}
 
     def refresh(self) -> None:
         """Read the statuses published since the last call."""
-        message = self._learner.poll()
+        message = self._statuses.poll()
         if message is None:
             return
         try:
-            self.learner = msgspec.structs.asdict(LearnerStatus.decode(message))
+            self.learner = LearnerStatus.decode(message)
         except BadMessage:
             return  # an invalid status; the next one may be valid
         self._updated_at = time.monotonic()
@@ -57,11 +61,13 @@ class RunStatus:
 
     def line(self) -> str:
         """The status in one line."""
-        return stamped(progress_line(self.learner)) if self.learner else "waiting for the learner"
+        if self.learner is None:
+            return "waiting for the learner"
+        return stamped(progress_line(msgspec.structs.asdict(self.learner)))
 
-    def events(self) -> list[tuple[int, str]]:
+    def events(self) -> Sequence[tuple[int, str]]:
         """The newest lines of the learner's console, with increasing numbers."""
-        return list(self.learner.get("events", []))
+        return self.learner.events if self.learner is not None else []
 
     def learner_is_there(self) -> bool:
         """True while a learner is connected."""
@@ -76,7 +82,7 @@ class Display(LiveDisplay):
     """Displays a status."""
 
     def __init__(self, status: RunStatus) -> None:
-        super().__init__(PLAIN_EVERY, refreshes=4)
+        super().__init__(PLAIN_EVERY, refreshes=4, screen=True)
         self._status = status
         self._shown = 0
         self._learner = PeerMonitor("the learner")
@@ -91,8 +97,8 @@ class Display(LiveDisplay):
                 self._shown = number
                 self.say(line)
         learner = self._status.learner
-        if learner and not self._over.is_set():
-            text = self._learner.check(self._status.learner_is_there(), learner["origin"])
+        if learner is not None and not self._over.is_set():
+            text = self._learner.check(self._status.learner_is_there(), learner.origin)
             if text:
                 self.say(stamped(text))
         super().update()
@@ -102,27 +108,5 @@ class Display(LiveDisplay):
         return self._status.line()
 
     def picture(self) -> RenderableType:
-        """The status as a panel."""
-        learner = self._status.learner
-        table = Table(show_header=False, box=None)
-        table.add_column(style="dim")
-        table.add_column()
-        if not learner:
-            table.add_row("status", "waiting for the learner")
-            return table
-        rows = {
-            "step": f"{learner['env_steps']:,} of {learner['total_steps']:,}",
-            "episodes": returns(learner["return_mean_100"], learner["episodes"]),
-            "updates": f"{learner['updates']:,}, {learner['updates_per_s']:.0f}/s",
-            "acting": f"network {learner['acting']}, epsilon {learner['epsilon']:.3f}, s {learner['s']:.3f}",
-            "connected": connected(learner["connected"]),
-        }
-        if learner["warning"]:
-            rows["warning"] = str(learner["warning"])
-        if learner["missing"]:
-            rows["lost"] = ", ".join(learner["missing"])
-        if learner["waiting"]:
-            rows["waiting"] = str(learner["waiting"])
-        for name, value in rows.items():
-            table.add_row(name, value)
-        return Group(table, ProgressBar(total=learner["total_steps"], completed=learner["env_steps"], width=60))
+        """The status as a screen."""
+        return RunScreen(self._status.run, self._status.learner, self.said(), self._status.silent_for())

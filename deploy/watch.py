@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from common.errors import JoinError, PeerLost
+import msgspec
+from rich.console import Console
+
+from common.errors import JoinError, PeerLost, UsageError
+from common.messaging.messages.status import LearnerStatus
 from common.messaging.transport import new_incarnation
 from common.process.cli import parse
 from common.process.lifecycle import Stop, run_main
+from deploy.screen import RunScreen
 from deploy.status import Display, RunStatus
 
 TICK = 0.1  # seconds
@@ -28,6 +35,10 @@ class WatchOptions:
     """Seconds to wait for a lost learner before giving up."""
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoint given as a flag still applies."""
+    once: bool = False
+    """Print the present status and end."""
+    json: bool = False
+    """With --once: print one JSON object instead of the screen; docs/watching.md lists its fields."""
 
 
 def main() -> None:
@@ -37,28 +48,58 @@ def main() -> None:
 
 def _run() -> None:
     options = parse(WatchOptions, "coop-watch", "Show the live status of a run until it ends.")
-    ctrl_c, ended = Stop(), Stop()
+    if options.json and not options.once:
+        raise UsageError("--json: needs --once")
+    ctrl_c = Stop()
     ctrl_c.on_signals()
     status = RunStatus(options.run, options.connect, new_incarnation(), options.zenoh_config)
-    status.follow_stop(ended)
     try:
-        with Display(status) as display:
-            while not ended.is_set() and not ctrl_c.wait(TICK):
-                display.update()
-                _check(status, options)
-            if status.learner:
-                display.say(status.line())
-            if ended.is_set():
-                display.say(f"the run has ended: {ended.reason}")
+        if options.once:
+            _print_once(status, options, ctrl_c)
+        else:
+            _follow(status, options, ctrl_c)
     finally:
         status.close()
+
+
+def _follow(status: RunStatus, options: WatchOptions, ctrl_c: Stop) -> None:
+    """Show the status until the run ends."""
+    ended = Stop()
+    status.follow_stop(ended)
+    with Display(status) as display:
+        while not ended.is_set() and not ctrl_c.wait(TICK):
+            display.update()
+            _check(status, options)
+        if status.learner is not None:
+            display.say(status.line())
+        if ended.is_set():
+            display.say(f"the run has ended: {ended.reason}")
+
+
+def _print_once(status: RunStatus, options: WatchOptions, ctrl_c: Stop) -> None:
+    """Wait for a status, and print it."""
+    while status.learner is None:
+        if ctrl_c.wait(TICK):
+            ctrl_c.leave()
+        status.refresh()
+        _check(status, options)
+    if options.json:
+        print(json.dumps(report(status.run, status.learner)))
+    else:
+        lines = [line for _, line in status.events()]
+        Console().print(RunScreen(status.run, status.learner, lines, whole=True))
+
+
+def report(run: str, status: LearnerStatus) -> dict[str, Any]:
+    """The status as plain values: `LearnerStatus`'s fields, with the run's name, and of the events the lines alone."""
+    return {"run": run, **msgspec.to_builtins(status), "events": [line for _, line in status.events]}
 
 
 def _check(status: RunStatus, options: WatchOptions) -> None:
     """Raise JoinError or PeerLost if the learner has been silent for too long."""
     silent = status.silent_for()
-    if not status.learner and silent > options.join_timeout:
+    if status.learner is None and silent > options.join_timeout:
         where = f"found at {options.connect} within {options.join_timeout:g} s"
         raise JoinError(f"no learner of run {options.run!r} {where}")
-    if status.learner and silent > options.patience:
+    if status.learner is not None and silent > options.patience:
         raise PeerLost(f"the learner of run {options.run!r} has been silent for {options.patience:g} s")

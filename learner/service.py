@@ -10,7 +10,6 @@ import msgspec
 from common.errors import RunError
 from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key, stop_key
-from common.messaging.members import Origin
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.transport import NoAnswer, Node
@@ -21,6 +20,7 @@ from learner.checkpoints import Checkpoints
 from learner.join_service import JoinService
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
+from learner.status import StatusReporter
 from learner.trainer import Effects, Trainer
 
 STATUS_EVERY = 0.5  # seconds
@@ -55,10 +55,9 @@ class LearnerService:
         self._checkpoints = checkpoints
         self._broadcaster = Broadcaster(node, trainer.agent)
         self._status_due = 0.0
-        self._status: dict[str, Any] = {}
+        self._reporter = StatusReporter(node, trainer, samples, join_service, console)
         self._join_service = join_service
         self._console = console
-        self._speed = (time.monotonic(), trainer.agent.updates, 0.0)
         node.presence.on_change(self._on_presence_change)
 
     def run(self) -> Summary:
@@ -108,45 +107,17 @@ class LearnerService:
 
     def _publish_status(self) -> None:
         """Publish the status for displays, and repeat the role for actors that missed it."""
-        now, telemetry = time.monotonic(), self._trainer.telemetry
-        then, updates, speed = self._speed
-        if now - then >= STATUS_EVERY:
-            speed = (self._agent.updates - updates) / (now - then)
-            self._speed = (now, self._agent.updates, speed)
+        now = time.monotonic()
         self._status_due = now + STATUS_EVERY
         self._broadcaster.publish_role()
-        self._status = {
-            "env_steps": self._trainer.drawn.inserted,
-            "total_steps": self._trainer.config.total_steps,
-            "updates": self._agent.updates,
-            "updates_per_s": speed,
-            "acting": self._agent.acting + 1,
-            "episodes": telemetry.episodes,
-            "return_mean_100": telemetry.return_mean,
-            "epsilon": self._trainer.epsilon(),
-            "s": self._agent.exploration_rate(),
-            "waiting": self._samples.waiting,
-            "warning": telemetry.warning(self._agent),
-            "bad_messages": self._node.bad_messages,
-            "faults": self._node.faults.count,
-            "origin": str(Origin.here()),
-            **self._members(),
-        }
-        self._node.publish_status(self._status)
-        self._console.progress(self._agent.updates, self._samples.waiting, lambda: progress_line(self._status))
-
-    def _members(self) -> dict[str, Any]:
-        return {
-            "connected": self._join_service.connected(),
-            "missing": self._join_service.members.missing(time.monotonic()),
-            "events": self._console.recent(),
-        }
+        status = self._reporter.publish(now)
+        self._console.progress(status.updates, status.waiting, lambda: progress_line(msgspec.structs.asdict(status)))
 
     def _on_presence_change(self, incarnation: int, there: bool) -> None:
         """Report at once that a member has come or gone: the loop may be waiting for it."""
-        self._join_service.members.token(incarnation, there, time.monotonic())
-        if self._status:
-            self._node.publish_status({**self._status, **self._members()})
+        now = time.monotonic()
+        self._join_service.members.token(incarnation, there, now)
+        self._reporter.publish_members(now)
 
     def _save_for_departure(self) -> None:
         """Save an epoch for a replay service that waits for it before leaving."""

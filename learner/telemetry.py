@@ -14,18 +14,20 @@ from common.types import Array, Batch
 from learner.agent import Update
 from learner.diagnostics import Diagnostics
 from learner.protocol import Agent
+from learner.return_history import ReturnHistory
 
 
 class Telemetry:
     """Collects from each update the values for a row of metrics.jsonl.
 
-    returns: of the last 100 episodes. diagnostics: what is measured on the first 64 transitions drawn.
-    largest_reward: the largest |reward| of all batches. q_abs_mean: mean |Q| of both networks over the states of those
-    transitions at the last row. now: seconds of a monotonic clock.
+    returns: of the last 100 episodes. history: their mean over the whole run. largest_reward: the largest |reward| of
+    all batches. diagnostics: what is measured on the first 64 transitions drawn. q_abs_mean: mean |Q| of both networks
+    over the states of those transitions at the last row. now: seconds of a monotonic clock.
     """
 
     def __init__(self, now: float) -> None:
         self.returns: deque[float] = deque(maxlen=RETURN_WINDOW)
+        self.history = ReturnHistory()
         self.episodes = 0
         self.diagnostics = Diagnostics()
         self.largest_reward = 0.0
@@ -70,8 +72,9 @@ class Telemetry:
             "terminal_share": drawn.terminal / max(1, drawn.size),
             "sample_age_mean": float(age.mean()),
             "sample_age_p95": float(np.percentile(age, 95)),
+            "sample_age_histogram": powers_of_two(age),
             "reuse_mean": float(reuse.mean()),
-            "reuse_histogram": reuse_histogram(reuse),
+            "reuse_histogram": powers_of_two(reuse)[1:],
             "distinct_share": distinct / len(reuse),
             "evicted_unsampled": drawn.evicted_unsampled / max(1, drawn.evicted),
             "weight_lag_mean": float(lag.mean()),
@@ -97,6 +100,7 @@ class Telemetry:
         """The state for `load_state`; torch.load reads it with weights_only."""
         return {
             "returns": list(self.returns),
+            "history": self.history.state(),
             "episodes": self.episodes,
             "diagnostics": self.diagnostics.state(),
             "largest_reward": self.largest_reward,
@@ -106,13 +110,15 @@ class Telemetry:
         """Restore a state from `state`."""
         self.returns.extend(state["returns"])
         self.episodes = state["episodes"]
-        self.diagnostics.load_state(state.get("diagnostics", {}))  # earlier versions did not save it
+        self.history.load_state(state.get("history", {}))  # earlier versions saved neither this nor the next
+        self.diagnostics.load_state(state.get("diagnostics", {}))
         self.largest_reward = state.get("largest_reward", 0.0)
 
     def episode(self, episode_return: float) -> int:
         """Note a finished episode; return its number, from 0."""
         self.returns.append(episode_return)
         self.episodes += 1
+        self.history.add(self.episodes, self.return_mean)
         return self.episodes - 1
 
     @property
@@ -126,10 +132,10 @@ class Telemetry:
         return float(np.std(self.returns)) if self.returns else 0.0
 
 
-def reuse_histogram(reuse: NDArray[np.integer[Any]]) -> list[int]:
-    """Count samples by how often each has been drawn, including this draw: once, 2 to 3 times, 4 to 7, 8 to 15...
+def powers_of_two(values: NDArray[np.integer[Any]]) -> list[int]:
+    """Count values by size: 0, 1, 2 to 3, 4 to 7, 8 to 15, ...
 
-    reuse: int [batch], at least 1. Entry b counts samples drawn 2^b to 2^(b + 1) - 1 times; the last is not 0.
+    values: int [n], at least 0. Entry b counts those of b binary digits, 2^(b - 1) to 2^b - 1; the last is not 0.
     """
-    counts: list[int] = np.bincount(np.frexp(reuse)[1] - 1).tolist()
+    counts: list[int] = np.bincount(np.frexp(values)[1]).tolist()
     return counts

@@ -56,6 +56,7 @@ class Trainer:
 
     Attributes:
         drawn: the replay side's counters as last received, without episodes.
+        metrics: the newest row of an interval; None before the first.
         diverged: which values are no longer finite, in words; empty if all are finite.
     """
 
@@ -64,6 +65,7 @@ class Trainer:
         self.config = agent.config
         self.telemetry = Telemetry(now)
         self.drawn = NOTHING_DRAWN
+        self.metrics: dict[str, Any] | None = None
         self._began = now
         self.diverged = ""
         self._next_epoch = agent.updates + self._epoch_every
@@ -168,4 +170,7 @@ class Trainer:
         bad = [name for name, value in row.items() if isinstance(value, float) and not math.isfinite(value)]
         if bad and not self.diverged:
             self.diverged = f"diverged: {bad[0]} is not finite at update {self.agent.updates}"
-        return None if bad else row
+        if bad:
+            return None
+        self.metrics = row
+        return row

@@ -60,6 +60,7 @@ class _Account:
 class ReplayCore:
     """A table with its limiter and counters. One owner makes all calls.
 
+    batch_size: transitions of a draw. segment_steps: of a segment, at most.
     drawn: batches drawn, as the learner counts them: a learner restored from an epoch also resets this count.
     problem: why no segment can be inserted although the limiter admits it, in words; empty if there is no problem.
     """
@@ -72,6 +73,7 @@ class ReplayCore:
         )
         self.recorder: Recorder = recorder or NullRecorder()
         self.batch_size = config.learner.batch_size
+        self.segment_steps = config.actor.segment_steps
         self._total_steps = config.total_steps
         self.drawn = 0
         self.duplicates = 0

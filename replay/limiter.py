@@ -65,8 +65,8 @@ class RateLimiter:
         """None if an insert is admitted, otherwise the reason for refusing it."""
         if self.total is not None and inserted >= self.total:
             return self._complete()
-        ahead = self._ahead(inserted, drawn)
-        if inserted < self.start or ahead <= self._slack:
+        ahead = self.ahead(inserted, drawn)
+        if inserted < self.start or ahead <= self.slack:
             return None
         return f"inserts are {ahead:,.0f} steps ahead of updates"
 
@@ -79,8 +79,8 @@ class RateLimiter:
         left = None if self.draws_total is None else self.draws_total - drawn
         if self.total is not None and inserted >= self.total:
             return None if left is None or left > 0 else self._complete()
-        ahead = self._ahead(inserted, drawn)
-        short = 1 / self.ratio - self._slack - ahead
+        ahead = self.ahead(inserted, drawn)
+        short = 1 / self.ratio - self.slack - ahead
         if short <= 0 and (left is None or left > 0):
             return None
         updates = -ahead * self.ratio
@@ -105,10 +105,17 @@ class RateLimiter:
         )
 
     @property
-    def _slack(self) -> float:
+    def slack(self) -> float:
+        """Steps by which inserts may be ahead of updates, or behind them; see the promise above."""
         return max(self.tolerance, 0.5 / self.ratio)
 
-    def _ahead(self, inserted: int, drawn: int) -> float:
+    def measured(self, inserted: int, drawn: int) -> float | None:
+        """Updates per environment step since the ratio holds; None before the first such step."""
+        origin_inserted, origin_drawn = self.origin or (self.start, 0)
+        steps = inserted - origin_inserted
+        return (drawn - origin_drawn) / steps if steps > 0 else None
+
+    def ahead(self, inserted: int, drawn: int) -> float:
         """Environment steps by which inserts are ahead of updates."""
         origin_inserted, origin_drawn = self.origin or (self.start, 0)
         return (inserted - origin_inserted) - (drawn - origin_drawn) / self.ratio

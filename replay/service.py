@@ -21,30 +21,21 @@ from common.messaging.messages.insert import SegmentReader
 from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
 from common.messaging.messages.sample import DrawRequest, encode_batch
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
+from common.messaging.messages.status import Ratio, ReplayStatus
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 from common.process.console import Console
 from common.process.lifecycle import Stop
 from replay.core import ReplayCore, Wait
+from replay.gate import HOLD, Gate
 from replay.persistence.epochs import ReplayEpochs
 
-HOLD = 1.0  # seconds
 LEAVING = "the replay service is stopping"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"
 STATUS_EVERY = 0.5  # seconds
 INSERT_QUEUE = 256
 
 T = TypeVar("T")
-
-
-class _Gate:
-    """The gate at which requests of one kind wait for the limiter.
-
-    The deadline counts from the moment when the gate closed, so that the waits of queued requests do not add up.
-    """
-
-    def __init__(self) -> None:
-        self.closed_at: float | None = None
 
 
 class ReplayService:
@@ -63,8 +54,8 @@ class ReplayService:
         self._confirmed = confirmed
         self._read_segment = SegmentReader(core.table.spec)
         self._changed = threading.Condition()
-        self._inserts = _Gate()
-        self._draws = _Gate()
+        self._inserts = Gate(time.monotonic())
+        self._draws = Gate(time.monotonic())
         self._leaving = False
         self._broken = ""  # why the core must no longer be used
         self._batch = bytearray()  # the last answer; the next one reuses it: one thread answers, and sending copies
@@ -90,17 +81,7 @@ class ReplayService:
             stats = self.stats()
             waiting = stats.inserts_wait_for or stats.samples_wait_for
             console.progress(stats.inserted + stats.drawn, waiting, self.progress)
-            self._node.publish_status(
-                {
-                    "size": stats.size,
-                    "inserted": stats.inserted,
-                    "drawn": stats.drawn,
-                    "inserts_wait_for": stats.inserts_wait_for,
-                    "samples_wait_for": stats.samples_wait_for,
-                    "bad_messages": stats.bad_messages,
-                    "faults": stats.faults,
-                }
-            )
+            self._node.publish_status(self._status(time.monotonic()))
         with self._changed:
             self._leaving = True
             self._changed.notify_all()
@@ -139,6 +120,21 @@ class ReplayService:
                 faults=self._node.faults.count,
             )
 
+    def _status(self, now: float) -> ReplayStatus:
+        with self._changed:
+            inserted, drawn, limiter = self._core.table.inserted, self._core.drawn, self._core.limiter
+            band = -limiter.slack, limiter.slack + self._core.segment_steps
+            return ReplayStatus(
+                size=len(self._core.table),
+                inserted=inserted,
+                drawn=drawn,
+                ratio=Ratio(limiter.ratio, limiter.measured(inserted, drawn), limiter.ahead(inserted, drawn), *band),
+                inserts=self._inserts.held(now),
+                samples=self._draws.held(now),
+                bad_messages=self._node.bad_messages,
+                faults=self._node.faults.count,
+            )
+
     def _insert(self, message: Message) -> bytearray:
         segment = self._read_segment(message)
         outcome = self._admit(self._inserts, lambda: self._core.insert(segment, message.payload))
@@ -163,20 +159,18 @@ class ReplayService:
         batch, drawn = reply
         return encode_batch(self._node.run, batch.frames, batch.columns, drawn, into=self._batch)
 
-    def _admit(self, gate: _Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
+    def _admit(self, gate: Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
         """Try, and repeat whenever the core has changed, until the gate's deadline."""
         with self._changed:
             if self._broken:  # senders repeat their requests to the next replay service
                 return Wait(self._broken)
         with self._changing():
             while isinstance(outcome := self._not_serving() or attempt(), Wait):
-                now = time.monotonic()
-                gate.closed_at = gate.closed_at or now
-                left = gate.closed_at + HOLD - now
+                left = gate.refuse(outcome.reason, time.monotonic())
                 if left <= 0 or self._leaving:
                     return outcome
                 self._changed.wait(left)
-            gate.closed_at = None
+            gate.admit(time.monotonic())
             self._changed.notify_all()
             return outcome
 

@@ -76,8 +76,8 @@ def test_episodes_metrics_and_scalars_wait_for_space(small_disk: Path, capsys: p
     assert capsys.readouterr().out == f"{path}: No space left on device\n"
     assert (path / "learning_curve.png").stat().st_size
     board = EventAccumulator(str(path / "tb")).Reload()
-    assert len(board.Scalars("episode/return")) == summary.episodes
-    assert len(board.Scalars("train/td_error")) == rows
+    assert len(board.Scalars("charts/episodic_return")) == summary.episodes
+    assert len(board.Scalars("losses/td_error")) == rows
 
 
 def test_a_lockstep_run_goes_on_without_its_epochs(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:

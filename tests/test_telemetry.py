@@ -1,4 +1,4 @@
-"""What metrics.jsonl says of the samples of an interval."""
+"""What metrics.jsonl says of the samples of an interval, and what TensorBoard's file says of a run."""
 
 import json
 from dataclasses import replace
@@ -6,24 +6,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
-from learner.telemetry import reuse_histogram
+from learner.telemetry import powers_of_two
 
 
 @pytest.mark.parametrize(
-    ("reuse", "histogram"),
+    ("values", "counts"),
     [
-        ([1, 1, 1], [3]),
-        ([1, 2, 3, 4, 7, 8], [1, 2, 2, 1]),
-        ([16], [0, 0, 0, 0, 1]),
-        ([2**31 - 1, 1], [1, *[0] * 29, 1]),
+        ([0, 0], [2]),
+        ([1, 1, 1], [0, 3]),
+        ([0, 1, 2, 3, 4, 7, 8], [1, 1, 2, 2, 1]),
+        ([16], [0, 0, 0, 0, 0, 1]),
+        ([2**31 - 1, 1], [0, 1, *[0] * 29, 1]),
     ],
 )
-def test_reuse_histogram(reuse: list[int], histogram: list[int]) -> None:
-    assert reuse_histogram(np.array(reuse, np.int32)) == histogram
+def test_counts_by_powers_of_two(values: list[int], counts: list[int]) -> None:
+    assert powers_of_two(np.array(values, np.int64)) == counts
 
 
 @pytest.mark.parametrize("replacement", [True, False])
@@ -40,7 +42,8 @@ def test_reuse_and_distinct_samples_of_a_small_table(replacement: bool, tmp_path
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == 2
     for row in rows:
-        assert sum(row["reuse_histogram"]) == 200 * 32
+        assert sum(row["reuse_histogram"]) == sum(row["sample_age_histogram"]) == 200 * 32
+        assert len(row["sample_age_histogram"]) <= 7, "fifo evicts what is older than 40 steps"
         if replacement:
             assert 21.5 < 32 * row["distinct_share"] < 23
         else:
@@ -49,3 +52,35 @@ def test_reuse_and_distinct_samples_of_a_small_table(replacement: bool, tmp_path
     first, *_, last = rows[1]["reuse_histogram"]
     assert 200 * 0.5 < first <= 260
     assert last > 0
+
+
+def test_tensorboard_has_the_usual_names(tmp_path: Path) -> None:
+    run = Lockstep(base_config(["--method", "coop"]))
+    with RunDirectory(tmp_path, run.config) as directory:
+        rows = []
+        while len(rows) < 2:
+            for effects in run.play():
+                directory.record(effects.episodes, effects.metrics)
+                rows += [effects.metrics] if effects.metrics else []
+    run.env.close()
+    board = EventAccumulator(str(tmp_path / "tb"), size_guidance={"scalars": 0, "histograms": 0, "tensors": 0}).Reload()
+    episodes = [line.split(",") for line in (tmp_path / "episodes.csv").read_text().splitlines()[1:]]
+    for tag, column in (("charts/episodic_return", 5), ("charts/episodic_length", 6)):
+        told = [(event.step, event.value) for event in board.Scalars(tag)]
+        assert told == [(int(episode[1]), float(episode[column])) for episode in episodes]
+    for tag, name in (
+        ("charts/SPS", "env_steps_per_s"),
+        ("charts/epsilon", "epsilon"),
+        ("losses/td_loss", "loss"),
+        ("losses/q_values", f"q{rows[-1]['acting']}_mean"),
+        ("train/q_gap", "q_gap"),
+    ):
+        event = board.Scalars(tag)[-1]
+        assert (event.step, event.value) == (rows[-1]["env_step"], pytest.approx(rows[-1][name]))
+    age, reuse = (board.Histograms(tag)[-1].histogram_value for tag in ("replay/sample_age", "replay/reuse"))
+    assert list(age.bucket) == rows[-1]["sample_age_histogram"]
+    assert list(age.bucket_limit) == [2.0**power for power in range(len(age.bucket))]
+    assert list(reuse.bucket) == rows[-1]["reuse_histogram"]
+    assert list(reuse.bucket_limit) == [2.0 ** (1 + power) for power in range(len(reuse.bucket))]
+    (text,) = board.Tensors("hyperparameters")
+    assert b"|method|coop|\n|seed|0|\n" in text.tensor_proto.string_val[0]

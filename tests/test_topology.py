@@ -27,7 +27,15 @@ METRICS = [
     *("time", "env_step", "update", "acting", "td_error", "loss", "s", "epsilon", "q_gap", "q1_mean", "q2_mean"),
     *("q_abs_mean", "archive_td_error", "archive_drift", "policy_churn", "dormant_share", "dormant_by_layer"),
     *("effective_rank", "effective_rank_by_layer", "q_bound", "updates_per_s", "env_steps_per_s", "replay_size"),
-    *("terminal_share", "sample_age_mean", "sample_age_p95", "reuse_mean", "reuse_histogram", "distinct_share"),
+    *(
+        "terminal_share",
+        "sample_age_mean",
+        "sample_age_p95",
+        "sample_age_histogram",
+        "reuse_mean",
+        "reuse_histogram",
+        "distinct_share",
+    ),
     *("evicted_unsampled", "weight_lag_mean"),
 ]
 SILENT = r"(?m)^\d\d:\d\d:\d\d replay service on \S+ \(pid \d+\) does not answer$"

@@ -25,7 +25,7 @@ from common.messaging.faults import Faults
 from common.messaging.keys import run_key, stop_key
 from common.messaging.links import never_linger
 from common.messaging.messages.answers import Error
-from common.messaging.messages.status import encode_status
+from common.messaging.messages.status import Status
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.presence import LEASE, Presence
 from common.messaging.wire import Message
@@ -229,9 +229,9 @@ class Node:
         """Broadcast a value that should reach all subscribers; may block for a moment."""
         self.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
-    def publish_status(self, status: dict[str, Any]) -> None:
+    def publish_status(self, status: Status) -> None:
         """Publish this process's status for displays."""
-        self._status.put(encode_status(self.run, status))
+        self._status.put(status.encode(self.run))
 
     def latest(self, key: str) -> Latest:
         """Subscribe to a key of which only the latest value matters."""

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
 from typing import Self
 
 from rich.console import Console, RenderableType
 from rich.live import Live
+
+KEPT = 200  # lines said while the picture fills the screen
 
 
 class LiveDisplay(ABC):
@@ -15,36 +19,55 @@ class LiveDisplay(ABC):
 
     plain_every: seconds between lines if the output is no terminal; a line is never repeated.
     refreshes: pictures per second on a terminal.
+    screen: the picture fills the terminal; the lines said meanwhile are printed at the end.
     """
 
-    def __init__(self, plain_every: float, refreshes: float) -> None:
+    def __init__(self, plain_every: float, refreshes: float, *, screen: bool = False) -> None:
         self._console = Console()
-        self._live = Live(console=self._console, refresh_per_second=refreshes, transient=True)
-        self._plain_every = plain_every
-        self._due = time.monotonic() + plain_every
+        self._draws = self._console.is_terminal and not self._console.is_dumb_terminal
+        self._live = Live(console=self._console, auto_refresh=False, transient=True, screen=screen)
+        self._screen = screen
+        self._said: deque[str] = deque(maxlen=KEPT)
+        self._every = 1 / refreshes if self._draws else plain_every
+        self._due = time.monotonic() + (0 if self._draws else plain_every)
         self._plain = ""
 
     def __enter__(self) -> Self:
-        if self._console.is_terminal:
+        if self._draws:
             self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._live.stop()
+        if self._live.is_started:
+            self._live.stop()
+            for text in self._said if self._screen else ():
+                self._print(text)
 
     def update(self) -> None:
-        """Show the present state."""
-        if self._console.is_terminal:
-            self._live.update(self.picture())
-        elif time.monotonic() >= self._due:
-            self._due = time.monotonic() + self._plain_every
+        """Show the present state, if it is time."""
+        now = time.monotonic()
+        if now < self._due:
+            return
+        self._due = now + self._every
+        if self._draws:
+            self._live.update(self.picture(), refresh=True)
+        else:
             before, self._plain = self._plain, self.line()
             if self._plain != before:
                 self.say(self._plain)
 
     def say(self, text: str) -> None:
         """Print a permanent line."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        self._said.append(text)
+        if not (self._screen and self._live.is_started):
+            self._print(text)
+
+    def said(self) -> Sequence[str]:
+        """The newest permanent lines."""
+        return self._said
+
+    def _print(self, text: str) -> None:
+        self._console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     @abstractmethod
     def picture(self) -> RenderableType:
@@ -53,3 +76,8 @@ class LiveDisplay(ABC):
     @abstractmethod
     def line(self) -> str:
         """The present state in one line."""
+
+
+def printable(text: str) -> str:
+    """A text without control characters, which other machines could use to change the terminal."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)

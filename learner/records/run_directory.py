@@ -17,7 +17,8 @@ from common.process.files import LineFile, truncate, write_atomic
 from common.process.run_ids import draw_run_id, read_run_id
 from common.process.summaries import SUMMARY
 from common.settings.config import RunConfig
-from common.settings.tables import to_toml
+from common.settings.overrides import leaves
+from common.settings.tables import to_tables, to_toml
 from learner.records.curve import draw_learning_curve
 from learner.records.summary import Summary
 from learner.records.tensorboard import TensorBoardWriter
@@ -43,6 +44,7 @@ class RunDirectory:
             self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
             self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
             self._tensorboard = TensorBoardWriter(path / "tb")
+            self._tensorboard.hyperparameters({".".join(place): value for place, value in leaves(to_tables(config))})
         except OSError as error:
             raise RunError(f"run directory {path}: {error.strerror or error}") from error
         self._csv = csv.writer(self._episodes, lineterminator="\n")
@@ -67,14 +69,12 @@ class RunDirectory:
         place = (row.number, record.env_step, row.update, f"{record.actor:x}", record.stream)
         values = (f"{value:.6g}" for value in (end.epsilon, row.s, end.q1_mean, end.q2_mean))
         self._csv.writerow((*place, f"{end.episode_return:g}", end.length, *values, end.param_version))
-        self._tensorboard.add("episode/return", end.episode_return, record.env_step)
+        self._tensorboard.episode(end.episode_return, end.length, record.env_step)
 
     def _metrics_row(self, row: dict[str, Any]) -> None:
         """Add a line to metrics.jsonl, and its numbers to TensorBoard."""
         self._metrics.write(json.dumps({"time": time.time(), **row}) + "\n")
-        for name, value in row.items():
-            if name != "env_step" and isinstance(value, int | float):
-                self._tensorboard.add(f"train/{name}", value, row["env_step"])
+        self._tensorboard.metrics(row)
 
     def conclude(self, summary: Summary, title: str) -> None:
         """Write the kept lines, then summary.json, and try to draw the learning curve.

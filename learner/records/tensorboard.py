@@ -1,17 +1,30 @@
-"""Writes a run's TensorBoard file."""
+"""Writes a run's TensorBoard file, under the names that the field uses."""
 
 from __future__ import annotations
 
 import os
 import socket
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from tensorboard.compat.proto.event_pb2 import Event
-from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.compat.proto.summary_pb2 import HistogramProto, Summary, SummaryMetadata
+from tensorboard.compat.proto.tensor_pb2 import TensorProto
+from tensorboard.compat.proto.types_pb2 import DT_STRING
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 from common.process.files import LineFile
+
+TAGS = {
+    "env_steps_per_s": "charts/SPS",
+    "updates_per_s": "charts/updates_per_second",
+    "epsilon": "charts/epsilon",
+    "loss": "losses/td_loss",
+    "td_error": "losses/td_error",
+}
+"""Names of columns of metrics.jsonl; the other numbers are at train/NAME."""
 
 
 class TensorBoardWriter:
@@ -33,9 +46,39 @@ class TensorBoardWriter:
         """Why scalars are being kept; empty if none are."""
         return self._file.problem
 
-    def add(self, name: str, value: float, step: int) -> None:
-        """Add one value."""
-        summary = Summary(value=[Summary.Value(tag=name, simple_value=value)])
+    def hyperparameters(self, values: Mapping[str, Any]) -> None:
+        """Add the settings by name, as a table."""
+        rows = "".join(f"|{name}|{value}|\n" for name, value in values.items())
+        text = f"|setting|value|\n|-|-|\n{rows}"
+        value = Summary.Value(
+            tag="hyperparameters",
+            metadata=SummaryMetadata(plugin_data=SummaryMetadata.PluginData(plugin_name="text")),
+            tensor=TensorProto(dtype=DT_STRING, string_val=[text.encode()]),
+        )
+        self._add(Event(wall_time=time.time(), step=0, summary=Summary(value=[value])))
+
+    def episode(self, episode_return: float, length: int, step: int) -> None:
+        """Add a finished episode; step: the run's environment steps at its end, and below."""
+        self._scalars({"charts/episodic_return": episode_return, "charts/episodic_length": length}, step)
+
+    def metrics(self, row: Mapping[str, Any]) -> None:
+        """Add the numbers of a row of metrics.jsonl, and the histograms of its samples."""
+        step, q_values = row["env_step"], row[f"q{row['acting']}_mean"]
+        numbers = {name: value for name, value in row.items() if name != "env_step" and isinstance(value, int | float)}
+        scalars = {TAGS.get(name, f"train/{name}"): value for name, value in numbers.items()}
+        self._scalars({"losses/q_values": q_values, **scalars}, step)
+        self._histogram("replay/sample_age", 0, row["sample_age_histogram"], step)
+        self._histogram("replay/reuse", 1, row["reuse_histogram"], step)
+
+    def _scalars(self, values: Mapping[str, float], step: int) -> None:
+        summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()])
+        self._add(Event(wall_time=time.time(), step=step, summary=summary))
+
+    def _histogram(self, name: str, least: int, counts: Sequence[int], step: int) -> None:
+        """Add counts of integers; least: 0 or 1, the smallest. counts: entry b ends below 2^(least + b)."""
+        limits = [2.0 ** (least + number) for number in range(len(counts))]
+        histogram = HistogramProto(min=least, max=limits[-1], num=sum(counts), bucket_limit=limits, bucket=counts)
+        summary = Summary(value=[Summary.Value(tag=name, histo=histogram)])
         self._add(Event(wall_time=time.time(), step=step, summary=summary))
 
     def close(self) -> None:

@@ -1,31 +1,143 @@
-"""The status of a role, for displays: plain values by name, of which a display uses those that it knows."""
+"""The status that each role publishes twice a second, for displays; readers ignore fields that they do not know."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import msgspec
 from msgspec import Meta
 
 from common.bounded import Counter, Name, Real, Share, Text
+from common.bounds import MAX_POINTS
 from common.messaging import wire
+from common.messaging.members import ROLES
 from common.messaging.messages.body import bad_field, check_kind
 from common.messaging.messages.weights import Network
 from common.messaging.wire import Message
 
 KIND = "status"
+MAX_MEMBERS = 256  # listed in one status
+
+Returns = Annotated[list[Real], Meta(max_length=MAX_POINTS)]
+RoleName = Annotated[str, Meta(pattern=f"^({'|'.join(ROLES)})$")]
+State = Annotated[str, Meta(pattern="^(training|serving|playing|waiting|lost)$")]
 
 
-def encode_status(run: str, status: dict[str, Any]) -> bytearray:
-    """Build a status."""
-    return wire.encode(KIND, run, status)
+class Status(msgspec.Struct, frozen=True):
+    """The status of one process."""
+
+    def encode(self, run: str) -> bytearray:
+        """Build the message."""
+        return wire.encode(KIND, run, self)
+
+    @classmethod
+    def decode(cls, message: Message) -> Self:
+        """Read it, ignoring other fields; raises BadMessage."""
+        check_kind(message, KIND)
+        try:
+            return msgspec.convert(message.fields, cls, strict=True)
+        except msgspec.ValidationError as error:
+            raise bad_field(error, message.fields) from error
 
 
-class LearnerStatus(msgspec.Struct, frozen=True):
-    """The part of the learner's status that displays need.
+class ActorStatus(Status, frozen=True):
+    """An actor's status.
+
+    steps: played by this process. acked: of them acknowledged by the replay service. waiting: why it waits, in words.
+    """
+
+    steps: Counter
+    acked: Counter
+    steps_per_s: Real = 0.0
+    waiting: Text = ""
+
+
+class Held(msgspec.Struct, frozen=True):
+    """How the limiter has held up requests of one kind since the last status.
+
+    share: of the time in which one waited. reason: why the last one waited, in words; empty if none did.
+    """
+
+    share: Share = 0.0
+    reason: Text = ""
+
+
+class Ratio(msgspec.Struct, frozen=True):
+    """The replay ratio, in updates per environment step.
+
+    target: as set. measured: since the first update was due; null before. ahead: environment steps by which acting is
+    ahead of learning, negative if it is behind. least, most: the band in which the limiter keeps `ahead`.
+    """
+
+    target: Real
+    measured: Real | None
+    ahead: Real
+    least: Real
+    most: Real
+
+
+class ReplayStatus(Status, frozen=True):
+    """The replay service's status; counters as in `ReplayStats`, which it answers on request."""
+
+    size: Counter
+    inserted: Counter
+    drawn: Counter
+    ratio: Ratio
+    inserts: Held = Held()
+    samples: Held = Held()
+    bad_messages: Counter = 0
+    faults: Counter = 0
+
+
+class Member(msgspec.Struct, frozen=True):
+    """A process of the run.
+
+    name: role, and an actor's number. steps_per_s: of an actor. reason: why it waits, in words; otherwise empty.
+    """
+
+    name: Name
+    role: RoleName
+    host: Name
+    pid: Counter
+    state: State
+    steps_per_s: Real | None = None
+    reason: Text = ""
+
+
+class Wait(msgspec.Struct, frozen=True):
+    """Who waits for whom, the share of the last half second in which it did, and the reason in words."""
+
+    who: Name
+    for_whom: Name
+    share: Share
+    reason: Text
+
+
+class Measured(msgspec.Struct, frozen=True):
+    """Columns of the newest row of metrics.jsonl."""
+
+    td_error: Real
+    loss: Real
+    q_gap: Real
+    q_abs_mean: Real
+    sample_age_mean: Real
+    sample_age_p95: Real
+    reuse_mean: Real
+    evicted_unsampled: Real
+    weight_lag_mean: Real
+    q_bound: Real | None = None
+
+
+class LearnerStatus(Status, frozen=True):
+    """The status of the learner, which also reports on the other roles: displays reach the learner only.
 
     connected: number of processes by role, of the replay services only the one that serves. missing: lost processes.
-    events: the newest lines of its console, with increasing numbers. origin: its host and process id.
+    events: the newest lines of its console, with increasing numbers. origin: its host and process id. seconds: that
+    the run has taken. seconds_left: estimated from the present speed; null while unknown. updates_to_swap: until
+    the roles swap, or until the network is copied to its target if `two_networks` is false. size, capacity: of the
+    table, in transitions. return_history: the 100-episode mean at evenly spaced episodes of the whole run, at most
+    128 values. members: lost ones first. ratio: null until the replay service has reported. measured: null before the
+    first row of metrics.jsonl.
     """
 
     env_steps: Counter
@@ -43,12 +155,20 @@ class LearnerStatus(msgspec.Struct, frozen=True):
     missing: Annotated[list[Text], Meta(max_length=1024)]
     events: Annotated[list[tuple[int, Text]], Meta(max_length=64)]
     origin: Text
-
-    @classmethod
-    def decode(cls, message: Message) -> Self:
-        """Read it, ignoring other fields; raises BadMessage."""
-        check_kind(message, KIND)
-        try:
-            return msgspec.convert(message.fields, cls, strict=True)
-        except msgspec.ValidationError as error:
-            raise bad_field(error, message.fields) from error
+    env: Name = ""
+    method: Name = ""
+    seed: Counter = 0
+    seconds: Real = 0.0
+    seconds_left: Real | None = None
+    env_steps_per_s: Real = 0.0
+    two_networks: bool = True
+    updates_to_swap: Counter = 0
+    size: Counter = 0
+    capacity: Counter = 0
+    return_history: Returns = []
+    ratio: Ratio | None = None
+    waits: Annotated[list[Wait], Meta(max_length=8)] = []
+    members: Annotated[list[Member], Meta(max_length=MAX_MEMBERS)] = []
+    measured: Measured | None = None
+    bad_messages: Counter = 0
+    faults: Counter = 0
