@@ -169,8 +169,8 @@ def _ratio(status: LearnerStatus) -> str:
         return "not known without the replay service"
     if ratio.measured is None:
         return f"target {ratio.target:g} updates per step; no update yet"
-    ahead = f"acting ahead by {ratio.ahead:,.0f} steps ({ratio.least:,.0f} to {ratio.most:,.0f})"
-    return f"{ratio.measured:.3f} updates per step, target {ratio.target:g}; {ahead}"
+    ahead = f"acting {ratio.ahead:,.0f} steps ahead ({ratio.least:,.0f} to {ratio.most:,.0f})"
+    return f"{ratio.measured:.3f} updates per step (target {ratio.target:g}); {ahead}"
 
 
 def _waits(status: LearnerStatus) -> Text:

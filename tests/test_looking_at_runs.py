@@ -1,17 +1,31 @@
 """`coop-eval` plays a checkpoint greedily; `coop-watch` follows a run that it has no part in, to its end."""
 
+import contextlib
+import fcntl
+import json
+import os
+import pty
 import re
 import signal
 import socket
+import struct
 import subprocess
 import sysconfig
+import termios
+import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from commands import run_command
 
+from common.messaging.messages.status import LearnerStatus
+from common.messaging.transport import new_incarnation
+from common.process.processes import free_endpoint
 from common.settings.sources import base_config
+from deploy.status import RunStatus
 from experiments import evaluation_cli
 from experiments.evaluation import evaluate_checkpoint
 from experiments.lockstep import Lockstep
@@ -75,37 +89,119 @@ def test_eval_on_the_command_line(
         assert told.err.count("\n") == 1
 
 
+class Terminal:
+    """A terminal of 80 x 24, and all that is written to it."""
+
+    def __init__(self) -> None:
+        self._reading, self.writing = pty.openpty()
+        fcntl.ioctl(self.writing, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        self._written = bytearray()
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):  # the last process that wrote has gone
+            while part := os.read(self._reading, 65536):
+                self._written += part
+
+    def text(self) -> str:
+        return self._written.decode(errors="ignore")
+
+    def pictures(self) -> list[list[str]]:
+        """The lines of each whole picture, without colours."""
+        return [re.sub(r"\x1b\[[\d;?]*\w", "", part).split("\r\n") for part in self.text().split("\x1b[H")[1:-1]]
+
+    def close(self) -> None:
+        os.close(self.writing)
+        self._thread.join()
+        os.close(self._reading)
+
+
+@contextlib.contextmanager
+def ended(*processes: subprocess.Popen[str]) -> Iterator[None]:
+    """End the processes, where the test has failed to."""
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.terminate()
+
+
+def wait_for(status: RunStatus, reached: Callable[[LearnerStatus], bool]) -> LearnerStatus:
+    deadline = time.monotonic() + 60
+    while (status.refresh() or status.learner) is None or not reached(status.learner):
+        assert time.monotonic() < deadline, status.learner
+        time.sleep(0.05)
+    return status.learner
+
+
+def states(status: LearnerStatus) -> dict[str, str]:
+    return {member.name: member.state for member in status.members}
+
+
 def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     watch = [str(SCRIPTS / "coop-watch"), "--connect", endpoint]
-    nobody = subprocess.run([*watch, "--join-timeout", "0.5"], capture_output=True, text=True, check=False)
-    assert nobody.returncode == 1
+    nobody = run_command("coop-watch", "--connect", endpoint, "--join-timeout", "0.5", "--once")
+    assert (nobody.returncode, nobody.stdout) == (1, "")
     assert nobody.stderr == f"coop-watch: error: no learner of run 'coop' found at {endpoint} within 0.5 s\n"
-    local = [
-        str(SCRIPTS / "coop-local"),
-        "--listen",
-        endpoint,
-        "--total-steps",
-        "900",
-        "--run-dir",
-        str(tmp_path / "r"),
-    ]
+    flags = ("--listen", endpoint, "--actors", "2", "--total-steps", "1000000", "--run-dir", str(tmp_path / "r"))
+    local = [str(SCRIPTS / "coop-local"), *flags]
+    environment = {**os.environ, "TERM": "xterm"}
+    status, terminal = RunStatus("coop", endpoint, new_incarnation()), Terminal()
     with (
-        subprocess.Popen(local, stdout=subprocess.DEVNULL) as run,
+        contextlib.closing(terminal),
+        contextlib.closing(status),
+        subprocess.Popen(local, stdout=terminal.writing, env=environment, text=True) as run,
         subprocess.Popen(watch, stdout=subprocess.PIPE, text=True) as first,
         subprocess.Popen([*watch, "--patience", "90"], stdout=subprocess.PIPE, text=True) as second,
         subprocess.Popen([*watch, "--patience", "0.1"], stderr=subprocess.PIPE, text=True) as hasty,
+        ended(run, first, second, hasty),
     ):
-        while not (tmp_path / "r" / "metrics.jsonl").exists():
-            assert run.poll() is None
-            time.sleep(0.1)
+        before = wait_for(status, lambda now: now.measured is not None and "actor 1" in states(now))
+        assert states(before) == {
+            "learner": "training", "replay service": "serving", "actor 0": "playing", "actor 1": "playing"
+        }  # fmt: skip
+        assert {member.host for member in before.members} == {socket.gethostname()}
+
+        done = run_command("coop-watch", "--connect", endpoint, "--once", "--json", check=True)
+        now = json.loads(done.stdout)
+        assert (now["run"], now["env"], now["method"], now["capacity"]) == ("coop", "CartPole-v0", "coop", 5000)
+        assert [member["name"] for member in now["members"]] == ["learner", "replay service", "actor 0", "actor 1"]
+        assert now["size"] <= now["env_steps"]
+        assert 0 < now["updates_to_swap"] <= 100
+        assert now["ratio"]["measured"] == pytest.approx(1, abs=0.2)
+        assert now["ratio"]["least"] <= now["ratio"]["ahead"] <= now["ratio"]["most"]
+        assert now["measured"]["q_abs_mean"] <= now["measured"]["q_bound"] == pytest.approx(100)
+        assert now["seconds_left"] > 0
+        assert now["return_history"][-1] > 0
+        assert sum("actor" in line and line.endswith("joined") for line in now["events"]) == 2
+
+        victim = next(member.pid for member in before.members if member.name == "actor 1")
+        os.kill(victim, signal.SIGKILL)
+        lost = wait_for(status, lambda now: states(now).get("actor 1") == "lost")
+        assert [member.state for member in lost.members] == ["lost", "training", "serving", "playing"]
+        assert lost.connected["actor"] == 1
+        wait_for(status, lambda _: "starting it again" in " ".join(map(str.strip, terminal.pictures()[-1])))
+
         second.send_signal(signal.SIGINT)
+        run.send_signal(signal.SIGINT)
         assert "the run has ended" not in second.communicate(timeout=110)[0]
         # A learner tells its status twice a second.
         assert hasty.communicate(timeout=110)[1].endswith("the learner of run 'coop' has been silent for 0.1 s\n")
         out, _ = first.communicate(timeout=110)
-        assert (first.returncode, second.returncode, hasty.returncode, run.wait(110)) == (0, 0, 1, 0)
-    assert re.search(r"step \d+/900  return [\d.]+ \((last 100 of )?\d+ episodes?\)", out)
-    assert out.endswith("the run has ended: complete\n")
+        assert (first.returncode, second.returncode, hasty.returncode, run.wait(110)) == (0, 0, 1, 130)
+    assert re.search(r"step [\d,]+/1,000,000  return [\d.]+ \((last 100 of )?\d+ episodes?\)", out)
+    assert out.endswith("the run has ended: interrupted\n")
+
+    pictures = [lines for lines in terminal.pictures() if lines[0].startswith("coop  CartPole-v0, coop, seed 0")]
+    assert all(len(lines) == 24 for lines in pictures)
+    assert any("lost      does not answer" in line for lines in pictures for line in lines)
+    left = terminal.text().partition("\x1b[?1049l")[2]
+    assert "killed by SIGKILL" in left, "the events remain when the screen has gone"
+    assert left.rstrip().endswith("--resume goes on")
+
+
+def test_watch_refuses_json_for_a_live_screen() -> None:
+    refused = run_command("coop-watch", "--json")
+    assert (refused.returncode, refused.stderr) == (2, "coop-watch: error: --json: needs --once\n")
