@@ -10,6 +10,7 @@ import msgspec
 from rich.console import RenderableType
 
 from common.errors import BadMessage
+from common.messaging.joining import no_learner
 from common.messaging.keys import status_key
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.transport import Node, open_session
@@ -36,6 +37,7 @@ class RunStatus:
     def __init__(self, run: str, endpoint: str, incarnation: int, zenoh_config: Path | None = None) -> None:
         self.run = run
         self.learner: LearnerStatus | None = None
+        self._endpoint = endpoint
         self._node = Node(open_session((), (endpoint,), zenoh_config), run, "watch", incarnation)
         self._statuses = self._node.latest(status_key(self._node, "learner"))
         self._updated_at = time.monotonic()
@@ -54,6 +56,14 @@ class RunStatus:
     def silent_for(self) -> float:
         """Seconds since the learner's last status, or since the start if there was none."""
         return time.monotonic() - self._updated_at
+
+    def why_nothing(self, waited: float) -> str:
+        """Why there has been no status for `waited` seconds, in words."""
+        if self.learner_is_there():
+            return (
+                f"the learner of run {self.run!r} has told nothing within {waited:g} s; it may wait for the other roles"
+            )
+        return no_learner(self._node, (self._endpoint,), waited)
 
     def follow_stop(self, stop: Stop) -> None:
         """Set `stop` when the learner ends the run."""

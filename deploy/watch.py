@@ -99,7 +99,6 @@ def _check(status: RunStatus, options: WatchOptions) -> None:
     """Raise JoinError or PeerLost if the learner has been silent for too long."""
     silent = status.silent_for()
     if status.learner is None and silent > options.join_timeout:
-        where = f"found at {options.connect} within {options.join_timeout:g} s"
-        raise JoinError(f"no learner of run {options.run!r} {where}")
+        raise JoinError(status.why_nothing(options.join_timeout))
     if status.learner is not None and silent > options.patience:
         raise PeerLost(f"the learner of run {options.run!r} has been silent for {options.patience:g} s")

@@ -177,6 +177,9 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
         assert now["return_history"][-1] > 0
         assert sum("actor" in line and line.endswith("joined") for line in now["events"]) == 2
 
+        other = run_command("coop-watch", "--run", "my", "--connect", endpoint, "--join-timeout", "0.5")
+        assert other.stderr.endswith("within 0.5 s; there is run 'coop'\n")
+
         victim = next(member.pid for member in before.members if member.name == "actor 1")
         os.kill(victim, signal.SIGKILL)
         lost = wait_for(status, lambda now: states(now).get("actor 1") == "lost")

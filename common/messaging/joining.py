@@ -45,7 +45,7 @@ def join(
         JoinError: no learner (or no replay service) answered within `timeout` seconds, the learner refused this
             process, or another replay service serves the run.
     """
-    where = ", ".join(connect) or "no endpoint (give --connect)"
+    where = _where(connect)
     deadline = time.monotonic() + timeout
     stall = StallDetector()
     vacant_by: float | None = None
@@ -64,12 +64,9 @@ def join(
             elif answer.replay_endpoints or not need_replay:
                 return answer
         if time.monotonic() > deadline and vacant_by is None:
-            missing = "replay service" if answered else "learner"
-            text = f"no {missing} of run {node.run!r} found at {where} within {timeout:g} s"
-            if not answered and (unknown := unknown_hosts(connect)):
-                text = f"{text}; the host {unknown[0]!r} is not known"
-            others = [] if answered else other_runs(node)
-            raise JoinError(f"{text}; there is run {', '.join(map(repr, others))}" if others else text)
+            if answered:
+                raise JoinError(f"no replay service of run {node.run!r} found at {where} within {timeout:g} s")
+            raise JoinError(no_learner(node, connect, timeout))
         awaited = f"a replay service of run {node.run!r}" if answered else f"the learner of run {node.run!r} at {where}"
         if text := stall.check(time.monotonic(), 0, f"waiting for {awaited}"):
             event(text)
@@ -108,6 +105,19 @@ def leave_run(node: Node, request: Join) -> None:
         except (Refused, BadMessage):
             return
         time.sleep(RETRY_PAUSE)
+
+
+def no_learner(node: Node, connect: Sequence[str], timeout: float) -> str:
+    """That no learner was found within `timeout` seconds, and why that may be."""
+    text = f"no learner of run {node.run!r} found at {_where(connect)} within {timeout:g} s"
+    if unknown := unknown_hosts(connect):
+        text = f"{text}; the host {unknown[0]!r} is not known"
+    others = other_runs(node)
+    return f"{text}; there is run {', '.join(map(repr, others))}" if others else text
+
+
+def _where(connect: Sequence[str]) -> str:
+    return ", ".join(connect) or "no endpoint (give --connect)"
 
 
 def other_runs(node: Node) -> list[str]:
