@@ -14,8 +14,9 @@ from common.process.console import connected, counted
 from common.process.display import printable
 from common.returns import RETURN_WINDOW
 
-WIDE = 120  # columns from which members and events stand beside the figures
-FIGURES_WIDTH = 76  # columns of the figures then, at most
+FIGURES_WIDTH = 80  # columns of the figures where members and events stand beside them
+WIDE = 136  # columns from which they do
+GAP = "  "
 LABEL = 12  # columns
 SHORTEST = 8  # columns of a value, however narrow the terminal
 SILENT_AFTER = 3.0  # seconds without a status
@@ -49,9 +50,9 @@ class RunScreen:
             lines = self._figures(console, options, width)
             lines += self._members_and_events(console, width, None if height is None else height - len(lines))
         else:
-            left = min(FIGURES_WIDTH, width // 2)
-            figures = self._figures(console, options, left)
-            lines = _beside(figures, self._members_and_events(console, width - left - 2, height), left)
+            figures = self._figures(console, options, FIGURES_WIDTH)
+            others = self._members_and_events(console, width - FIGURES_WIDTH - len(GAP), height)
+            lines = _beside(figures, others)
         for line in lines[:height]:
             line.truncate(width, overflow="crop")
             yield line
@@ -208,13 +209,13 @@ def _members(members: Sequence[Member], shown: int, status: LearnerStatus | None
     return [*lines, Text(f"and {more:,} more", "dim")] if more else lines
 
 
-def _beside(left: Lines, right: Lines, width: int) -> Lines:
-    """Two columns, the left one of a given width."""
+def _beside(left: Lines, right: Lines) -> Lines:
+    """Two columns, the left one `FIGURES_WIDTH` wide."""
     lines = []
     for first, second in zip_longest(left, right, fillvalue=Text()):
         line = first.copy()
-        line.truncate(width, overflow="crop", pad=True)
-        lines.append(Text.assemble(line, "  ", second))
+        line.truncate(FIGURES_WIDTH, overflow="crop", pad=True)
+        lines.append(Text.assemble(line, GAP, second))
     return lines
 
 

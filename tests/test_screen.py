@@ -101,7 +101,7 @@ def test_a_wide_screen_has_two_columns() -> None:
     assert lines[36].endswith(EVENTS[-1]), "all events, each on a line of its own"
 
 
-@pytest.mark.parametrize("width", [1, 12, 30, 79, 119, 120, 400])
+@pytest.mark.parametrize("width", [1, 12, 30, 79, 135, 136, 400])
 @pytest.mark.parametrize("height", [1, 5, 13, 24])
 def test_any_terminal(width: int, height: int) -> None:
     for status in (STATUS, None):
