@@ -9,7 +9,7 @@ from functools import partial
 
 from common.errors import BadMessage
 from common.messaging.keys import join_key
-from common.messaging.members import JOINING, Origin
+from common.messaging.members import JOINING, ROLES, Origin
 from common.messaging.messages.answers import Retry
 from common.messaging.messages.join import Farewell, Join, Joined, Leave
 from common.messaging.transport import Node
@@ -92,7 +92,8 @@ class JoinService:
 
     def connected(self) -> dict[str, int]:
         """Number of connected processes by role; a replay service that was not admitted does not count."""
-        return {**self._node.presence.counts(), "replay": int(self._roster.serving in self._replays_there())}
+        counts = {**dict.fromkeys(ROLES, 0), **self._node.presence.counts()}
+        return {**counts, "replay": int(self._roster.serving in self._replays_there())}
 
     def _answer(self, key: str, message: Message) -> bytearray:
         if message.kind == Leave.kind:
