@@ -97,3 +97,5 @@ def test_members_are_listed_with_their_states() -> None:
     assert members.listed(1.0 + FORGOTTEN) == [service]
     members.token(2, True, 2.0)
     assert members.listed(2.0) == [service, first]
+    members.joined(Join("actor", 99, [], origin=Origin("act", 10)), "actor 2")
+    assert members.listed(2.0)[2] == Member("actor 2", "actor", "act", 10, "playing"), "nothing from before its join"
