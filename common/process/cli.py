@@ -17,6 +17,7 @@ from common.process.help import full_help, short_help
 from common.suggestions import closest, not_among, refusal
 
 PACKAGE = "coop-rl"
+ANSWERS = ("--help", "--help-all", "--version", "--completion")
 
 T = TypeVar("T")
 
@@ -83,7 +84,7 @@ def _problem(event: tyro_errors.ParseErrorEvent, kind: type[Any]) -> str:
     """Describe a parse error in one line."""
     match event:
         case tyro_errors.UnrecognizedArgs(tokens=[first, *_]):
-            return f"{first}: {_unknown(first.partition('=')[0].replace('_', '-'), kind)}"
+            return f"{first}: {_unknown(first, kind)}"
         case tyro_errors.InvalidChoice(argument=argument, value=value, choices=choices):
             return f"{argument.display_name()} {value}: {not_among(choices, value)}"
         case tyro_errors.MissingArgs(missing_arguments=missing):
@@ -104,12 +105,12 @@ def _reason(message: str) -> str:
     return f"can't read {value[1]}" if value else first
 
 
-def _unknown(flag: str, kind: type[Any]) -> str:
-    """What to say of an unknown flag, with the one that it resembles, with or without its section."""
+def _unknown(token: str, kind: type[Any]) -> str:
+    """What to say of an unknown word; of a flag with the one that it resembles, with or without its section."""
+    if not token.startswith("-"):
+        return "unknown; it follows no flag that takes it"
     known = {name: name for part in sections(kind) for each in part.flags for name in (each.name, each.negative)}
-    if flag in known:
-        return "takes no value"
     without = {f"--{name.rpartition('.')[2]}": name for name in reversed(known) if "." in name}
-    known = {**without, **known}
-    near = closest(flag, known)
+    known = {**without, **known, **{name: name for name in ANSWERS}}
+    near = closest(token.partition("=")[0].replace("_", "-"), known)
     return refusal("unknown", near and known[near], "--help-all lists every flag")
