@@ -86,7 +86,9 @@ def test_coop_without_s_is_g_coop() -> None:
 @pytest.mark.parametrize("loss", ["squared", "mse", "huber"])
 def test_an_update_by_autograd(double: bool, bound: float | None, loss: str) -> None:
     """One step of SGD on 1/2 e^2 (or Huber's) with the targets written out."""
-    agent = Agent(_config("g-coop", optimizer="sgd", double=double, loss=loss, gamma=0.9, value_bound=bound), SPEC)
+    agent = Agent(
+        _config("g-coop", optimizer="sgd", double=double, loss=loss, gamma=0.9, reward_bound=bound and bound / 10), SPEC
+    )
     batch = batches(1)[0]
     batch = replace(batch, rewards=batch.rewards * 3, weights=np.linspace(0.5, 1.5, 32, dtype=np.float32))
     online, target = agent.networks

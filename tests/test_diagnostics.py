@@ -70,10 +70,10 @@ def test_td_error_of_two_transitions(acting: int, double: bool, error: float) ->
     assert "dormant_share" not in row  # no hidden layer
 
 
-@pytest.mark.parametrize(("double", "bound", "error"), [(True, None, 2.25), (False, None, 1.75), (False, 2.0, 2.5)])
+@pytest.mark.parametrize(("double", "bound", "error"), [(True, None, 2.25), (False, None, 1.75), (False, 1.0, 2.5)])
 def test_the_targets_are_those_of_an_update(double: bool, bound: float | None, error: float) -> None:
     """4 - (1 + 0.25 * 3), 4 - (1 + 0.25 * 5) with the other network's own action, 4 - (1 + 0.25 * 2) with the bound."""
-    agent = Agent(replace(CONFIG, learner=replace(CONFIG.learner, double=double, value_bound=bound)), SPEC)
+    agent = Agent(replace(CONFIG, learner=replace(CONFIG.learner, double=double, reward_bound=bound)), SPEC)
     constant(agent, 0, (4, 1))
     constant(agent, 1, (3, 5))
     diagnostics = Diagnostics()

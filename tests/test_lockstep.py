@@ -87,7 +87,7 @@ def test_resume_starts_goes_on_or_refuses(tmp_path: Path) -> None:
     assert "another run's, whose seed is 0; here it is 9" in err
     status, _, err = resume(*short, "--learner.gamma", "0.5")
     assert (status, err.count("\n")) == (2, 1)
-    assert "--resume: learner.gamma = 0.5, but 0.99" in err
+    assert "--resume: learner.gamma = 0.5, but 0.95" in err
 
 
 def test_roles_swap_by_steps_and_start_anew_with_each_episode(tmp_path: Path) -> None:

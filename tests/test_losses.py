@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from common.settings.config import LearnerSettings
 from common.types import Batch
 from learner.losses import LOSSES, output_error, td_errors
 
@@ -62,6 +63,13 @@ def test_targets_take_no_value_beyond_the_bound() -> None:
     errors = td_errors(batch, values, bootstrap, gamma=0.5, value_bound=4.0)
     assert errors.dtype == np.float32
     assert errors.tolist() == [6.0, 10.0, 7.0]
+
+
+def test_rewards_bound_values() -> None:
+    bounds = [LearnerSettings(gamma=gamma, reward_bound=reward).value_bound for gamma, reward in ((0.75, 3), (0, 3))]
+    assert bounds == [12, 3]
+    assert LearnerSettings(gamma=0.75).value_bound is None
+    assert LearnerSettings(gamma=1, reward_bound=3).value_bound is None
 
 
 def test_only_the_actions_taken_have_an_error() -> None:

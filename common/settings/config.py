@@ -68,8 +68,8 @@ class LearnerSettings:
     """squared: 1/2 e^2 (paper); mse: e^2 (authors' code; halves the weight of s); huber: slope clipped to [-1, 1]."""
     double: bool = False
     """Double Q-learning: the trained network chooses the action at which the target network is evaluated."""
-    value_bound: PositiveFloat | None = None
-    """Targets take no value of a next state beyond +-this. (Largest |reward|) / (1 - gamma) excludes no true value."""
+    reward_bound: PositiveFloat | None = None
+    """Largest |reward| possible, if known: targets then take no value of a next state beyond +-this / (1 - gamma)."""
     optimizer: OptimizerName = "rmsprop"
     """Optimizer; rmsprop-mnih: centred, eps inside the square root, gradients summed over the batch; else PyTorch's."""
     learning_rate: PositiveFloat = 1e-3
@@ -104,6 +104,11 @@ class LearnerSettings:
     """Number of sample requests in flight."""
     publish_every: Positive = 10
     """Updates between broadcasts of the acting network; every swap is broadcast too."""
+
+    @property
+    def value_bound(self) -> float | None:
+        """The largest |value| that `reward_bound` allows; None if there is no bound."""
+        return None if self.reward_bound is None or self.gamma == 1 else self.reward_bound / (1 - self.gamma)
 
 
 @dataclass(frozen=True)
