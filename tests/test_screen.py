@@ -205,9 +205,11 @@ def test_lines_said_while_the_picture_fills_the_screen(
         display.update()
         display.say("an event\x1b[2J")
         assert list(display.said()) == ["an event\x1b[2J"]
-    out = capsys.readouterr().out
-    assert "the picture" in out.partition("\x1b[?1049l")[0], "on the second screen, which is left at the end"
-    assert out.endswith("an event?[2J\n")
+    before, left, after = capsys.readouterr().out.partition("\x1b[?1049l")
+    assert left, "the second screen"
+    assert "the picture" in before
+    assert "an event" not in before
+    assert after.endswith("an event?[2J\n")
     monkeypatch.setenv("TERM", "dumb")
     with Pictures(0.0, 1000, screen=True) as display:
         display.update()
