@@ -73,6 +73,9 @@ class LearnerService:
                 self._turn()
             self._save()
             outcome = self._trainer.diverged or outcome
+        except KeyboardInterrupt:
+            outcome = "interrupted"
+            raise
         except Exception as error:
             outcome = f"failed: {error}"
             raise

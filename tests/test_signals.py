@@ -82,3 +82,19 @@ def test_the_first_reason_tells_the_status() -> None:
     lost.set("the learner has gone", failed=True)
     with pytest.raises(PeerLost, match="the learner has gone"):
         lost.leave()
+
+
+def test_only_a_second_sigint_interrupts_at_once() -> None:
+    """A scheduler sends SIGTERM to all processes of a job, and a supervisor among them passes it on as SIGINT."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    stop = Stop()
+    try:
+        stop.on_signals()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM):
+            signal.raise_signal(number)
+        assert (stop.reason, stop.exit_status) == ("interrupted", 143)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

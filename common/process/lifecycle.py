@@ -48,11 +48,17 @@ class Stop:
         return self.is_set()
 
     def on_signals(self) -> None:
-        """Make SIGINT and SIGTERM request a clean stop; a second SIGINT interrupts at once."""
+        """Make SIGINT and SIGTERM request a clean stop; a second SIGINT interrupts at once.
+
+        A first SIGINT never does, whatever else has requested the stop: a supervisor may pass on by SIGINT what a
+        scheduler has told all processes by SIGTERM.
+        """
+        received: set[int] = set()
 
         def handle(number: int, frame: FrameType | None) -> None:
-            if number == signal.SIGINT and self.is_set():
+            if number == signal.SIGINT and number in received:
                 raise KeyboardInterrupt
+            received.add(number)
             self.set("interrupted", exit_status=status_after(number))
 
         for number in SIGNALS:
