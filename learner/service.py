@@ -73,15 +73,12 @@ class LearnerService:
                 self._turn()
             self._save()
             outcome = self._trainer.diverged or outcome
-        except KeyboardInterrupt:
-            outcome = "interrupted"
-            raise
         except Exception as error:
             outcome = f"failed: {error}"
             raise
         finally:
             self._checkpoints.wait()
-            summary = self._finish(outcome)
+            summary = self._finish(outcome or "interrupted")  # by a second SIGINT
         return summary
 
     def _turn(self) -> None:
