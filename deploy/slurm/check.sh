@@ -1,6 +1,6 @@
 #!/bin/bash
 # Runs head.sbatch, actors.sbatch and coop-sweep --slurm on a real Slurm controller with three nodes on this machine: `make slurm-test`.
-# Parts of the run are requeued, cancelled and added in its middle. Takes about six minutes, as Slurm holds requeued jobs for two. Needs root, and installs slurm-wlm where it is missing.
+# Parts of the run are requeued, cancelled and added in its middle. Takes about nine minutes, as Slurm holds requeued jobs for two. Needs root, and installs slurm-wlm where it is missing.
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 bin=${BIN:?is not set: the folder with coop-local and coop-sweep}
@@ -83,31 +83,35 @@ echo "a distributed run: head on one node, three actors"
 export RUN_DIR=$work/run
 head=$(sbatch --parsable --output="$work/head.out" "$here/head.sbatch" --preset cartpole --method coop --total-steps 6000 --checkpoint-every 500)
 actors=$(sbatch --parsable --array=1-3 --output="$work/actor-%a.out" "$here/actors.sbatch")
-wait_for 120 "500 steps" reached 500
+wait_for 240 "500 steps" reached 500
 echo "one actor requeued, one cancelled, two added: $(steps) steps"
 scontrol requeue "${actors}_1"
 scancel "${actors}_2"
 sbatch --parsable --array=4-5 --output="$work/actor-%a.out" "$here/actors.sbatch" > /dev/null
-wait_for 120 "1500 steps" reached 1500
+wait_for 240 "1500 steps" reached 1500
 echo "head requeued: $(steps) steps"
 scontrol requeue "$head"
 wait_for 400 "2500 steps after the head is back" reached 2500
 grep -q "goes on with the run in" "$work/head.out" || fail "the head began anew"
+echo "head told that its time is nearly up: $(steps) steps"
+scancel --batch --signal=USR1 "$head"
+wait_for 400 "3500 steps after the head has requeued itself" reached 3500
+[ "$(grep -c "goes on with the run in" "$work/head.out")" = 2 ] || fail "the head did not go on twice"
 echo "head cancelled: $(steps) steps"
 scancel "$head"
-wait_for 60 "end of the head" bash -c "[ ! -e '$RUN_DIR/endpoint' ]"
+wait_for 180 "end of the head" bash -c "[ ! -e '$RUN_DIR/endpoint' ]"
 grep -q '"exit": "interrupted"' "$RUN_DIR/summary.json" || fail "no summary of a clean stop"
 head=$(sbatch --parsable --output="$work/head-2.out" "$here/head.sbatch" --preset cartpole --method coop --total-steps 6000 --checkpoint-every 500)
 wait_for 240 "end of the run" complete
-wait_for 60 "end of its jobs" finished
+wait_for 180 "end of its jobs" finished
 grep -E '"(env_steps|transitions_accepted|transitions_lost|duplicates_refused|exit)"' "$RUN_DIR/summary.json"
 grep -q '"transitions_lost": 0' "$RUN_DIR/summary.json" || fail "transitions are lost"
 
 echo "a sweep of four cells, one requeued"
 printf 'title = "four"\npreset = "cartpole"\nmethods = ["dqn", "coop"]\nseeds = [0, 1]\n[fixed]\ntotal_steps = 3000\n' > "$work/four.toml"
 coop-sweep "$work/four.toml" --slurm --dir "$work/four"
-wait_for 60 "running cells" running 2
-wait_for 60 "cell with episodes" bash -c "ls '$work'/four/*/episodes.csv"
+wait_for 180 "running cells" running 2
+wait_for 180 "cell with episodes" bash -c "ls '$work'/four/*/episodes.csv"
 cell=$(squeue --noheader --states=running --format=%i | head -n 1)
 scontrol requeue "$cell"
 coop-sweep "$work/four.toml" --slurm --dir "$work/four"
