@@ -59,11 +59,11 @@ BREAKOUT = {"id": "breakout", "stack": 4, "clip_rewards": True}
 @pytest.mark.parametrize(
     ("options", "num_envs", "steps", "segment_steps"),
     [
-        (BREAKOUT, 1, 500, 64),
-        (BREAKOUT | {"episodic_life": True}, 1, 500, 7),
-        (BREAKOUT | {"max_episode_steps": 5}, 8, 64, 10),
-        (BREAKOUT | {"episodic_life": True, "max_episode_steps": 60}, 8, 200, 64),
-        (BREAKOUT | {"episodic_life": True, "max_episode_steps": 29, "noop_max": 3}, 32, 100, 16),
+        (BREAKOUT, 1, 300, 64),
+        (BREAKOUT | {"episodic_life": True}, 1, 300, 7),
+        (BREAKOUT | {"max_episode_steps": 5}, 4, 33, 10),
+        (BREAKOUT | {"episodic_life": True, "max_episode_steps": 60}, 4, 130, 64),
+        (BREAKOUT | {"episodic_life": True, "max_episode_steps": 29, "noop_max": 3}, 9, 61, 16),
         (BREAKOUT | {"stack": 1, "max_episode_steps": 20}, 2, 50, 16),
         ({"id": "coop/Catch-v0", "stack": 4}, 1, 200, 16),
         ({"id": "coop/Catch-v0", "stack": 2}, 3, 100, 1),
