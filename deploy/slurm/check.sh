@@ -17,7 +17,8 @@ chmod 755 "$work"
 export SLURM_CONF=$work/slurm.conf OMP_NUM_THREADS=1
 finish() {
     scancel --quiet --user=root 2> /dev/null || true
-    sleep 2
+    # A job's end is told to the controller; without one, its node would wait for ever.
+    for _ in $(seq 60); do [ -n "$(squeue --noheader 2> /dev/null)" ] || break; sleep 1; done
     local pids
     pids=$(cat "$work"/*.pid) || true
     kill $pids 2> /dev/null || true
@@ -91,18 +92,18 @@ sbatch --parsable --array=4-5 --output="$work/actor-%a.out" "$here/actors.sbatch
 wait_for 240 "1500 steps" reached 1500
 echo "head requeued: $(steps) steps"
 scontrol requeue "$head"
-wait_for 400 "2500 steps after the head is back" reached 2500
+wait_for 600 "2500 steps after the head is back" reached 2500
 grep -q "goes on with the run in" "$work/head.out" || fail "the head began anew"
 echo "head told that its time is nearly up: $(steps) steps"
 scancel --batch --signal=USR1 "$head"
-wait_for 400 "3500 steps after the head has requeued itself" reached 3500
+wait_for 600 "3500 steps after the head has requeued itself" reached 3500
 [ "$(grep -c "goes on with the run in" "$work/head.out")" = 2 ] || fail "the head did not go on twice"
 echo "head cancelled: $(steps) steps"
 scancel "$head"
 wait_for 180 "end of the head" bash -c "[ ! -e '$RUN_DIR/endpoint' ]"
 grep -q '"exit": "interrupted"' "$RUN_DIR/summary.json" || fail "no summary of a clean stop"
 head=$(sbatch --parsable --output="$work/head-2.out" "$here/head.sbatch" --preset cartpole --method coop --total-steps 6000 --checkpoint-every 500)
-wait_for 240 "end of the run" complete
+wait_for 600 "end of the run" complete
 wait_for 180 "end of its jobs" finished
 grep -E '"(env_steps|transitions_accepted|transitions_lost|duplicates_refused|exit)"' "$RUN_DIR/summary.json"
 grep -q '"transitions_lost": 0' "$RUN_DIR/summary.json" || fail "transitions are lost"
@@ -115,7 +116,7 @@ wait_for 180 "cell with episodes" bash -c "ls '$work'/four/*/episodes.csv"
 cell=$(squeue --noheader --states=running --format=%i | head -n 1)
 scontrol requeue "$cell"
 coop-sweep "$work/four.toml" --slurm --dir "$work/four"
-wait_for 300 "end of the sweep" finished
+wait_for 600 "end of the sweep" finished
 [ "$(grep -l '"exit": "complete"' "$work"/four/*/summary.json | wc -l)" = 4 ] || fail "not all four cells are complete"
 echo "passed: run complete, nothing lost; 4 of 4 cells complete"
 failed=0
