@@ -20,6 +20,7 @@ from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.networks.network import FlatNetwork, build_network
 from common.process.console import Console, counted
+from common.process.health import answering
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
 from common.process.threads import use_threads
@@ -34,7 +35,7 @@ def play(options: ActorOptions) -> None:
     stop.on_thread_failures()
     incarnation, console = new_incarnation(), Console()
     session = open_session((), options.connect, options.zenoh_config, options.shared_memory)
-    with Node(session, options.run, "actor", incarnation) as node:
+    with Node(session, options.run, "actor", incarnation) as node, answering(options.health, console):
         node.follow_stop(stop)
         request = Join("actor", incarnation, [])
         try:

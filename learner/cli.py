@@ -19,6 +19,8 @@ class LearnerOptions(RunOptions):
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints to listen on; tcp/0.0.0.0:7447 opens the run to other machines."""
+    health: str | None = None
+    """Answer HTTP on this HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
     restart: bool = False
     """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
 

@@ -9,6 +9,7 @@ from common.errors import RunError, UsageError
 from common.messaging.clients import SampleClient
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process.console import Console, say
+from common.process.health import answering
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
 from common.process.threads import use_threads
@@ -51,7 +52,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
     epochs = SharedEpochs(held, str(path), restart=options.restart)
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory)
-    with Node(session, config.run, "learner", incarnation) as node:
+    with Node(session, config.run, "learner", incarnation) as node, answering(options.health, console):
         run_id = claim_run_directory(path, config)
         roster = Roster(path, time.monotonic())
         layout = agent.networks[0].layout_digest()

@@ -15,6 +15,7 @@ from common.messaging.presence import LEASE
 from common.messaging.transport import Node, locators, new_incarnation, open_session
 from common.process import cli
 from common.process.console import Console
+from common.process.health import answering
 from common.process.lifecycle import Stop, run_main
 from common.process.memory import keep_freed_memory
 from common.settings.options import RoleOptions
@@ -36,6 +37,8 @@ class ReplayOptions(RoleOptions):
     """Folder for this service's part of the epochs; runs/RUN-replay-ID if not given, with the run's name and id."""
     resume: bool = False
     """Continue from the state in --run-dir; start afresh if it holds nothing of this run yet."""
+    health: str | None = None
+    """Answer HTTP on this HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
 def main() -> None:
@@ -49,11 +52,10 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     stop.on_thread_failures()
-    incarnation = new_incarnation()
+    incarnation, console = new_incarnation(), Console()
     session = open_session(options.listen, options.connect, options.zenoh_config, options.shared_memory)
-    with Node(session, options.run, "replay", incarnation) as node:
+    with Node(session, options.run, "replay", incarnation) as node, answering(options.health, console):
         node.follow_stop(stop)
-        console = Console()
         joining = partial(join, node, stop, connect=options.connect, timeout=options.join_timeout, event=console.event)
         known = joining(Join("replay", incarnation, []))
         if known is not None:

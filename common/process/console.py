@@ -16,9 +16,13 @@ RECENT = 16  # events kept for displays in other processes
 
 
 class Console:
-    """The standard output of a role; thread-safe."""
+    """The standard output of a role; thread-safe.
+
+    reported: when the role's main loop last reported its progress, on the monotonic clock; None before the first time.
+    """
 
     def __init__(self) -> None:
+        self.reported: float | None = None
         self._lock = threading.Lock()
         self._recent: deque[tuple[int, str]] = deque(maxlen=RECENT)
         self._progress_due = time.monotonic() + PROGRESS_EVERY
@@ -42,7 +46,7 @@ class Console:
 
         While it does not grow, no progress line is printed.
         """
-        now = time.monotonic()
+        now = self.reported = time.monotonic()
         if text := self._stall.check(now, count, reason):
             self.event(text)
         if now >= self._progress_due:
