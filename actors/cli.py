@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from common.process import cli
 from common.process.importing import importing
@@ -14,6 +15,8 @@ from common.settings.options import RoleOptions
 class ActorOptions(RoleOptions):
     """Flags of `coop-actor`."""
 
+    mode: Literal["peer", "client"] = "peer"
+    """client: --connect names a router, and this process has no other link."""
     envs: int | None = None
     """Emulators in this process; the run's actor.envs if not given."""
     health: str | None = None

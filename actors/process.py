@@ -16,7 +16,7 @@ from common.errors import JoinError
 from common.imports import check_allowed
 from common.messaging.joining import Membership, join, leave_run
 from common.messaging.messages.join import Join, Joined
-from common.messaging.route import ReplayRoute
+from common.messaging.route import ReplayRoute, RoutedReplay, open_client
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.networks.network import FlatNetwork, build_network
 from common.process.console import Console, counted
@@ -34,7 +34,10 @@ def play(options: ActorOptions) -> None:
     stop.on_signals()
     stop.on_thread_failures()
     incarnation, console = new_incarnation(), Console()
-    session = open_session((), options.connect, options.zenoh_config, options.shared_memory)
+    session = _open(options, stop)
+    if session is None:
+        stop.leave()
+        return
     with Node(session, options.run, "actor", incarnation) as node, answering(options.health, console):
         node.follow_stop(stop)
         request = Join("actor", incarnation, [])
@@ -47,6 +50,14 @@ def play(options: ActorOptions) -> None:
         finally:
             leave_run(node, request)
     stop.leave()
+
+
+def _open(options: ActorOptions, stop: Stop) -> zenoh.Session | None:
+    """Open the session; None if a stop was requested before there was a router. Raises JoinError."""
+    connection = options.connect, options.zenoh_config, options.shared_memory
+    if options.mode == "client":
+        return open_client(*connection, options.join_timeout, stop)
+    return open_session((), *connection)
 
 
 def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined, console: Console) -> None:
@@ -70,7 +81,11 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
     def open_route(endpoints: Sequence[str]) -> zenoh.Session:
         return open_session((), (*options.connect, *endpoints), options.zenoh_config, options.shared_memory)
 
-    with ReplayRoute(options.run, request.incarnation, open_route, joined.replay_endpoints) as route:
+    with (
+        RoutedReplay(node)
+        if options.mode == "client"
+        else ReplayRoute(options.run, request.incarnation, open_route, joined.replay_endpoints)
+    ) as route:
 
         def learned(answer: Joined, _: float) -> None:
             route.follow(answer.replay_endpoints)

@@ -10,9 +10,8 @@ from actors.policy import Policy
 from actors.segments import SegmentAssembler
 from actors.weights import WeightsFollower
 from common.envs.protocol import VectorEnv
-from common.messaging.clients import InsertClient
+from common.messaging.clients import InsertClient, QuerySender
 from common.messaging.messages.status import ActorStatus
-from common.messaging.route import ReplayRoute
 from common.messaging.transport import Node
 from common.process.console import Console
 from common.process.lifecycle import Stop
@@ -30,7 +29,7 @@ class ActorService:
     def __init__(
         self,
         node: Node,
-        route: ReplayRoute,
+        route: QuerySender,
         stop: Stop,
         config: RunConfig,
         env: VectorEnv,

@@ -9,10 +9,12 @@ from pathlib import Path
 import msgspec
 
 from common.errors import RunError
+from common.messaging.endpoints import check_endpoints
 from common.messaging.joining import Membership, join, leave_run
+from common.messaging.links import locators
 from common.messaging.messages.join import MOST_EPOCHS, Join, Joined
 from common.messaging.presence import LEASE
-from common.messaging.transport import Node, locators, new_incarnation, open_session
+from common.messaging.transport import Node, new_incarnation, open_session
 from common.process import cli
 from common.process.console import Console
 from common.process.health import answering
@@ -33,6 +35,8 @@ class ReplayOptions(RoleOptions):
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
     """Endpoints to listen on; port 0 chooses a free port."""
+    advertise: tuple[str, ...] = ()
+    """Endpoints to tell actors, for example tls/replay:7448; those that it listens on, by address, if not given."""
     run_dir: Path | None = None
     """Folder for this service's part of the epochs; runs/RUN-replay-ID if not given, with the run's name and id."""
     resume: bool = False
@@ -54,6 +58,7 @@ def _run() -> None:
     stop.on_thread_failures()
     incarnation, console = new_incarnation(), Console()
     session = open_session(options.listen, options.connect, options.zenoh_config, options.shared_memory)
+    check_endpoints(options.advertise)
     with Node(session, options.run, "replay", incarnation) as node, answering(options.health, console):
         node.follow_stop(stop)
         joining = partial(join, node, stop, connect=options.connect, timeout=options.join_timeout, event=console.event)
@@ -63,7 +68,8 @@ def _run() -> None:
             console.event(folder.check(resume=options.resume))
             with folder.lock():
                 held = ReplayEpochs(folder.path, known.run_id).intact()
-                request = Join("replay", incarnation, locators(session), epochs=held[-MOST_EPOCHS:])
+                endpoints = list(options.advertise) or locators(session)
+                request = Join("replay", incarnation, endpoints, epochs=held[-MOST_EPOCHS:])
                 joined = joining(request)
                 if joined is not None:
                     _serve(node, stop, options, folder, request, joined, console)

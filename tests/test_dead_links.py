@@ -9,9 +9,10 @@ from contextlib import ExitStack
 
 import pytest
 
+from common.messaging.links import locators
 from common.messaging.messages.answers import Ack
 from common.messaging.messages.weights import Current
-from common.messaging.transport import Node, locators, new_incarnation, open_session
+from common.messaging.transport import Node, new_incarnation, open_session
 
 FROZEN = 3  # more than the threads that Zenoh receives with, left to itself
 LISTENER = """

@@ -20,6 +20,7 @@ from common.process.help import EXIT_STATUSES
 from common.settings.methods import METHODS
 from common.settings.options import COMMON, RunOptions, parse_run
 from deploy.local import LocalOptions
+from deploy.router import RouterOptions
 from deploy.watch import WatchOptions
 from experiments.evaluation_cli import EvalOptions
 from experiments.export_cli import ExportOptions
@@ -37,6 +38,7 @@ OPTIONS: dict[str, type[Any]] = {
     "coop-replay": ReplayOptions,
     "coop-limits": LimitsOptions,
     "coop-actor": ActorOptions,
+    "coop-router": RouterOptions,
     "coop-lockstep": RunOptions,
     "coop-reexecute": ReexecuteOptions,
     "coop-sweep": SweepOptions,

@@ -13,12 +13,13 @@ from common.bounds import MAX_COUNT
 from common.errors import RunError
 from common.messaging.clients import InsertClient, SampleClient
 from common.messaging.keys import replay_key
+from common.messaging.links import locators
 from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, locators, new_incarnation, open_session
+from common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation, open_session
 from common.process.lifecycle import Stop
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec

@@ -1,4 +1,4 @@
-"""Keeps a dead link from blocking the others: Zenoh must not wait when it closes a TCP connection.
+"""A session's links: where it listens, and that a dead one must not block the others.
 
 Zenoh sets SO_LINGER to 10 s on its sockets. If a peer freezes or its cable is cut while data is unsent, Zenoh's closing
 thread blocks for that long, and since all links share this thread, no other peer can send or receive meanwhile. Zenoh
@@ -7,6 +7,7 @@ has no setting for it, so this module switches lingering off on each new link's 
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import stat
@@ -16,6 +17,14 @@ from pathlib import Path
 import zenoh
 
 _LINGER_OFF = struct.pack("ii", 0, 0)
+
+
+def locators(session: zenoh.Session) -> list[str]:
+    """The endpoints that this session listens on, with a port of 0 resolved."""
+    for reply in session.get(f"@/{session.zid()}/peer", timeout=2.0):
+        if reply.ok is not None:
+            return [str(locator) for locator in json.loads(reply.ok.payload.to_string())["locators"]]
+    return []
 
 
 def never_linger(session: zenoh.Session) -> None:

@@ -1,14 +1,42 @@
-"""An actor's connection to the replay service: a separate session, for Zenoh accepts no new endpoints at run time."""
+"""An actor's connection to the replay service: a session of its own, or the link that it has to a router.
+
+A session of its own, for Zenoh accepts no new endpoints at run time; behind a router, one link carries everything.
+"""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Self
 
 import zenoh
 
-from common.messaging.transport import Node, Pending
+from common.errors import JoinError
+from common.messaging.transport import NoAnswer, Node, Pending, open_session
+from common.process.lifecycle import Stop
+
+RETRY_PAUSE = 0.1  # seconds
+
+
+def open_client(
+    router: Sequence[str], zenoh_config: Path | None, shared_memory: bool, timeout: float, stop: Stop
+) -> zenoh.Session | None:
+    """Open a client's session as soon as a router answers; return None if a stop was requested first.
+
+    Raises:
+        JoinError: none has answered within `timeout` seconds.
+    """
+    deadline = time.monotonic() + timeout
+    while not stop.is_set():
+        try:
+            return open_session((), router, zenoh_config, shared_memory, mode="client")
+        except NoAnswer as error:
+            if time.monotonic() > deadline:
+                raise JoinError(f"{error} within {timeout:g} s") from error
+            stop.wait(RETRY_PAUSE)
+    return None
 
 
 class ReplayRoute:
@@ -66,3 +94,31 @@ class ReplayRoute:
 
     def _open(self, endpoints: Sequence[str]) -> Node:
         return Node(self._open_route(endpoints), self.run, "route", self._incarnation)
+
+
+class RoutedReplay:
+    """What `ReplayRoute` is, behind a router, which knows where the replay service is.
+
+    Args:
+        node: of a client's session.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.run = node.run
+        self.key = node.key
+        self.begin = node.begin
+        self._node = node
+
+    @property
+    def is_up(self) -> bool:
+        """True while a replay service is connected to the router."""
+        return bool(self._node.presence.members("replay"))
+
+    def follow(self, endpoints: Sequence[str]) -> None:
+        """Do nothing: the router follows."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing: the session is the node's."""

@@ -37,7 +37,6 @@ _QUIET = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "adminspace/enabled": True,
-    "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "listen/exit_on_failure": True,
@@ -67,12 +66,16 @@ def open_session(
     connect: Sequence[str] = (),
     zenoh_config: Path | None = None,
     shared_memory: bool = False,
+    mode: str = "peer",
 ) -> zenoh.Session:
-    """Open a peer session with explicit endpoints, no scouting and quick reconnection.
+    """Open a session with explicit endpoints, no scouting and quick reconnection.
+
+    mode: "peer"; "router", which forwards between others; "client", which has one link, to a router.
 
     Raises:
         UsageError: a Zenoh config file or an endpoint is invalid.
         RunError: it cannot listen on an endpoint, for example because the port is in use.
+        NoAnswer: mode is "client", and no router has answered within a second.
     """
     zenoh.init_log_from_env_or("off")
     check_endpoints((*listen, *connect))
@@ -80,27 +83,23 @@ def open_session(
         config = zenoh.Config.from_file(str(zenoh_config)) if zenoh_config else zenoh.Config()
         for key, value in _QUIET.items():
             config.insert_json5(key, json.dumps(value))
+        config.insert_json5("mode", json.dumps(mode))
         config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
         config.insert_json5("listen/endpoints", json.dumps(list(listen)))
         config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+        config.insert_json5("connect/timeout_ms", "1000" if mode == "client" else "-1")  # a client waits for its link
     except zenoh.ZError as error:
         raise UsageError(f"zenoh configuration: {first_line(error)}") from error
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
+        if mode == "client":
+            raise NoAnswer(f"no router at {', '.join(connect)}") from error
         raise RunError(
             f"can't listen on {', '.join(listen) or 'any endpoint'}: {explain_listen_error(listen, error)}"
         ) from error
     never_linger(session)
     return session
-
-
-def locators(session: zenoh.Session) -> list[str]:
-    """The endpoints that this session listens on, with a port of 0 resolved."""
-    for reply in session.get(f"@/{session.zid()}/peer", timeout=2.0):
-        if reply.ok is not None:
-            return [str(locator) for locator in json.loads(reply.ok.payload.to_string())["locators"]]
-    return []
 
 
 class Pending:

@@ -1,0 +1,62 @@
+"""`coop-router`: one address for any number of actors, each of which then needs a single link."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import zenoh
+
+from common.messaging.transport import open_session
+from common.process import cli
+from common.process.console import Console, counted
+from common.process.health import answering
+from common.process.lifecycle import Stop, run_main
+
+TICK = 0.5  # seconds
+
+
+@dataclass(frozen=True)
+class RouterOptions:
+    """Flags of `coop-router`."""
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints of the learner; the replay service connects to the router itself, with a second --connect."""
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7449",)
+    """Endpoints to listen on."""
+    zenoh_config: Path | None = None
+    """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
+    health: str | None = None
+    """Answer HTTP on this HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop-router", _run)
+
+
+def _run() -> None:
+    options = cli.parse(RouterOptions, "coop-router", "Forward between a run's services and actors in client mode.")
+    stop, console = Stop(), Console()
+    stop.on_signals()
+    session = open_session(options.listen, options.connect, options.zenoh_config, mode="router")
+    try:
+        with answering(options.health, console):
+            console.event(f"router listens on {', '.join(options.listen)}")
+            while not stop.wait(TICK):
+                console.progress(0, "", lambda: links(session))
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+    stop.leave()
+
+
+def links(session: zenoh.Session) -> str:
+    """How many services and actors are connected to a router, in words."""
+    kinds = [
+        link["whatami"]
+        for reply in session.get(f"@/{session.zid()}/router", timeout=2.0)
+        if reply.ok is not None
+        for link in json.loads(reply.ok.payload.to_string())["sessions"]
+    ]
+    return f"connected: {counted(kinds.count('peer'), 'service')}, {counted(kinds.count('client'), 'actor')}"

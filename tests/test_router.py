@@ -1,0 +1,103 @@
+"""Actors behind a router: one address, one link each, and nothing lost."""
+
+import json
+import signal
+import subprocess
+import sysconfig
+import time
+import urllib.request
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import pytest
+from commands import run_command
+
+from common.errors import JoinError
+from common.messaging.keys import replay_key
+from common.messaging.messages.answers import Ack
+from common.messaging.route import RoutedReplay, open_client
+from common.messaging.transport import Node, new_incarnation, open_session
+from common.process.lifecycle import Stop
+from common.process.processes import free_endpoint
+from deploy.router import links
+
+
+def wait_for(what: Callable[[], object]) -> None:
+    deadline = time.monotonic() + 60
+    while not what():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_one_link_carries_everything() -> None:
+    learner_at, replay_at, router_at = (free_endpoint() for _ in range(3))
+    with (
+        Node(open_session((learner_at,)), "test", "learner", new_incarnation()) as learner,
+        Node(open_session((replay_at,), (learner_at, router_at)), "test", "replay", new_incarnation()) as replay,
+    ):
+        replay.serve(replay_key(replay, "insert"), lambda message: Ack(7).encode("test"))
+        router = open_session((router_at,), (learner_at,), mode="router")
+        try:
+            session = open_client((router_at,), None, False, 10.0, Stop())
+            assert session is not None
+            with Node(session, "test", "actor", new_incarnation()) as node, RoutedReplay(node) as route:
+                wait_for(lambda: route.is_up and node.presence.members("learner"))
+                pending = route.begin(replay_key(route, "insert"), Ack(0).encode("test"), 5.0)
+                assert Ack.decode(pending.wait()).inserted == 7
+                assert (len(session.info.routers_zid()), len(session.info.peers_zid())) == (1, 0)
+                role = node.latest(node.key("role"))
+
+                def told() -> object:
+                    learner.announce(learner.key("role"), Ack(3).encode("test"))
+                    return role.poll()
+
+                wait_for(told)
+                wait_for(lambda: learner.presence.members("actor"))
+                assert links(router) == "connected: 2 services, 1 actor"
+        finally:
+            router.close()  # type: ignore[no-untyped-call]
+
+
+def test_no_router() -> None:
+    nowhere = free_endpoint()
+    with pytest.raises(JoinError, match=rf"^no router at {nowhere} within 0 s$"):
+        open_client((nowhere,), None, False, 0.0, Stop())
+    stop = Stop()
+    stop.set("interrupted")
+    assert open_client((nowhere,), None, False, 60.0, stop) is None
+
+
+def test_a_run_behind_a_router(tmp_path: Path) -> None:
+    learner, replay, router = (free_endpoint() for _ in range(3))
+    health = [free_endpoint().partition("/")[2] for _ in range(4)]
+    settings = ["--preset=cartpole", "--total-steps=1500", f"--run-dir={tmp_path}"]
+    serving = ["--connect", learner, router, "--listen", replay, "--advertise", "tcp/replay:1", "--health", health[1]]
+    command = [Path(sysconfig.get_path("scripts"), "coop-router"), "--connect", learner, "--listen", router]
+    with ThreadPoolExecutor() as pool:
+        playing = ["--mode=client", "--connect", router, "--health", health[2]]
+        actor = pool.submit(run_command, "coop-actor", *playing, check=True)
+        pool.submit(run_command, "coop-replay", *serving, cwd=tmp_path)
+        trained = pool.submit(run_command, "coop-learner", *settings, "--listen", learner, "--health", health[0])
+        with subprocess.Popen([*command, "--health", health[3]], stdout=subprocess.DEVNULL) as process:
+            try:
+                for address in health:
+                    wait_for(partial(is_ready, address))
+                done = trained.result()
+                assert done.returncode == 0
+                actor.result()
+            finally:
+                process.send_signal(signal.SIGINT)
+                assert process.wait(30) == 130
+    assert "joined; it listens on tcp/replay:1\n" in done.stdout
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["exit"], summary["transitions_lost"]) == ("complete", 0)
+
+
+def is_ready(address: str) -> bool:
+    try:
+        with urllib.request.urlopen(f"http://{address}/ready", timeout=30):
+            return True
+    except OSError:
+        return False
