@@ -12,7 +12,14 @@ import yaml
 ROOT = Path(__file__).parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PACKAGES: list[str] = PROJECT["tool"]["setuptools"]["packages"]
-IN_CHECKOUTS_ONLY = ("deploy/Dockerfile", "deploy/compose.yaml", "deploy/*.sh", "deploy/slurm/*", "deploy/zenoh/*")
+IN_CHECKOUTS_ONLY = (
+    "deploy/Dockerfile",
+    "deploy/*.yaml",
+    "deploy/*.sh",
+    "deploy/k8s/*",
+    "deploy/slurm/*",
+    "deploy/zenoh/*",
+)
 PAGES = ("README.md", "CONTRIBUTING.md", "SECURITY.md", *(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
 
 

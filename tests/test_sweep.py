@@ -16,7 +16,7 @@ import pytest
 from common.errors import UsageError
 from common.settings.medqn import MedqnSettings
 from common.settings.tables import resolve
-from experiments.sweep.cli import main
+from experiments.sweep.cli import SweepOptions, chosen, main
 from experiments.sweep.grid import load_grid, shipped_grids
 
 pytestmark = pytest.mark.timeout(300)  # a dozen processes, one after the other, also on a machine that is busy
@@ -54,6 +54,16 @@ def test_cells_of_the_small_buffers() -> None:
     # What the preset says for one method holds there, and what the grid says holds over it.
     assert {cell.config.learner.optimizer for cell in cells if cell.config.method == "g-coop"} == {"adam"}
     assert {cell.config.replay.learning_starts for cell in cells} == {50}
+
+
+def test_one_cell_by_name_or_number() -> None:
+    grid = load_grid("paper-buffers", quick=True)
+    names = [cell.name for cell in grid.cells]
+    for asked, number in (("0", 0), ("23", 23), (names[7], 7)):
+        (one,) = chosen(SweepOptions("paper-buffers", cell=asked), grid, Path("runs"))
+        assert one.cell.name == names[number]
+    with pytest.raises(UsageError, match="--cell 24: not in the grid"):
+        chosen(SweepOptions("paper-buffers", cell="24"), grid, Path("runs"))
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ class SweepOptions:
     dir: Path | None = None
     """Folder of the sweep; runs/sweeps/GRID if not given."""
     cell: str | None = None
-    """Run only this cell."""
+    """Run only this cell: its name, or its number in the grid, from 0."""
     slurm: bool = False
     """Submit the cells as Slurm job arrays instead of running them on this machine."""
 
@@ -51,7 +51,7 @@ def _run() -> None:
         raise UsageError(f"--jobs {options.jobs}: must be at least 1")
     grid = load_grid(options.grid, options.quick)
     folder = options.dir or default_folder(options.grid, options.quick)
-    cells = _chosen(options, grid, folder)
+    cells = chosen(options, grid, folder)
     claim_folder(grid, cells, folder)
     if options.slurm:
         left = [cell.cell.name for cell in cells if not (cell.finished() or cell.diverged())]
@@ -60,8 +60,10 @@ def _run() -> None:
     _work(Runner(grid.file, cells, options.jobs), folder)
 
 
-def _chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
-    cells = [CellFolder(folder, cell) for cell in grid.cells if options.cell in (None, cell.name)]
+def chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
+    """The cells that the options ask for; raises UsageError if there is none of that name or number."""
+    asked = options.cell
+    cells = [CellFolder(folder, cell) for n, cell in enumerate(grid.cells) if asked in (None, cell.name, str(n))]
     if not cells:
         names = [cell.name for cell in grid.cells]
         near = closest(str(options.cell), names)
