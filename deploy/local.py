@@ -18,7 +18,7 @@ from common.settings.capacity import check_memory, check_messages
 from common.settings.config import RunConfig, check_distributed
 from common.settings.options import RunOptions, beginning, holds_run, parse_run
 from common.settings.tables import to_toml
-from deploy.status import Display, RunStatus
+from deploy.status import Display, Page, RunStatus, live_page
 from deploy.supervisor import RESTARTS, RestartPolicy
 
 TICK = 0.1  # seconds
@@ -36,6 +36,8 @@ class LocalOptions(RunOptions):
     """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
     listen: str | None = None
     """Endpoint of the learner, for actors on other machines; a free port on loopback if not given."""
+    web: str = ""
+    """Show the run's screen as a web page too: PORT, on loopback, or HOST:PORT."""
 
 
 class Topology:
@@ -147,20 +149,22 @@ def _run() -> None:
     directory = options.directory()
     stop = Stop()
     stop.on_signals()
-    with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
+    with live_page(config.run, options.web) as page, RunLock(directory, "coop-local", ("learner", "replay")) as lock:
         if options.resume:
             print(f"goes on with the run in {directory}" if holds_run(directory) else beginning(directory), flush=True)
-        _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop)
+        _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)
 
 
-def _supervise(topology: Topology, options: LocalOptions, config: RunConfig, directory: Path, stop: Stop) -> None:
+def _supervise(
+    topology: Topology, options: LocalOptions, config: RunConfig, directory: Path, stop: Stop, page: Page | None
+) -> None:
     """Run the processes to the end of the run."""
     topology.start()
     status = RunStatus(config.run, topology.endpoint, new_incarnation(), options.zenoh_config)
     title = f"{config.env.id}, {config.method}, seed {config.seed}: {directory}"
     interrupted = False
     try:
-        with Display(status) as display:
+        with Display(status, page) as display:
             display.say(title)
             while not topology.check(display):
                 display.update()

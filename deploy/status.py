@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Protocol, Self
 
 import msgspec
 from rich.console import RenderableType
@@ -88,16 +90,52 @@ class RunStatus:
         self._node.close()
 
 
-class Display(LiveDisplay):
-    """Displays a status."""
+class Page(Protocol):
+    """A web page, at `url`, that shows a run."""
 
-    def __init__(self, status: RunStatus) -> None:
+    url: str
+
+    def show(self, status: LearnerStatus | None, events: Sequence[str], silent: float, ended: str) -> None:
+        """Show the newest status; events: newest last. silent: seconds since it. ended: why the run did; else empty."""
+        ...
+
+
+@contextmanager
+def live_page(run: str, address: str) -> Iterator[Page | None]:
+    """Serve a run's page at PORT or HOST:PORT; none if that is empty. Raises UsageError if that can't be done."""
+    if not address:
+        yield None
+        return
+    from deploy.live_page import LivePage  # noqa: PLC0415 (http.server takes time, and few runs need it)
+
+    with closing(LivePage(run, address)) as page:
+        yield page
+
+
+class Display(LiveDisplay):
+    """Displays a status.
+
+    page: shows it too; see `live_page`.
+    """
+
+    def __init__(self, status: RunStatus, page: Page | None = None) -> None:
         super().__init__(PLAIN_EVERY, refreshes=4, screen=True)
+        self._page = page
         self._status = status
         self._shown = 0
         self._learner = PeerMonitor("the learner")
         self._over = Stop()  # set at the end of the run
         status.follow_stop(self._over)
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        if self._page is not None:
+            self.say(stamped(f"this screen is also at {self._page.url}"))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._show_page()  # with the reason of the end
+        super().__exit__(*error)
 
     def update(self) -> None:
         """Show the present status."""
@@ -111,7 +149,13 @@ class Display(LiveDisplay):
             text = self._learner.check(self._status.learner_is_there(), learner.origin)
             if text:
                 self.say(stamped(text))
+        self._show_page()
         super().update()
+
+    def _show_page(self) -> None:
+        if self._page is not None:
+            ended = self._over.reason if self._over.is_set() else ""
+            self._page.show(self._status.learner, self.said(), self._status.silent_for(), ended)
 
     def line(self) -> str:
         """The status in one line."""

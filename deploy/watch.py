@@ -16,7 +16,7 @@ from common.messaging.transport import new_incarnation
 from common.process.cli import parse
 from common.process.lifecycle import Stop, run_main
 from deploy.screen import RunScreen
-from deploy.status import Display, RunStatus
+from deploy.status import Display, RunStatus, live_page
 
 TICK = 0.1  # seconds
 
@@ -37,6 +37,8 @@ class WatchOptions:
     """A Zenoh configuration file (TLS, access control); the endpoint given as a flag still applies."""
     once: bool = False
     """Print the present status and end."""
+    web: str = ""
+    """Show the screen as a web page too: PORT, on loopback, or HOST:PORT."""
     json: bool = False
     """With --once: print one JSON object instead of the screen; docs/watching.md lists its fields."""
 
@@ -50,6 +52,8 @@ def _run() -> None:
     options = parse(WatchOptions, "coop-watch", "Show the live status of a run until it ends.")
     if options.json and not options.once:
         raise UsageError("--json: needs --once")
+    if options.web and options.once:
+        raise UsageError("--web: shows a live run; leave out --once")
     ctrl_c = Stop()
     ctrl_c.on_signals()
     status = RunStatus(options.run, options.connect, new_incarnation(), options.zenoh_config)
@@ -66,7 +70,7 @@ def _follow(status: RunStatus, options: WatchOptions, ctrl_c: Stop) -> None:
     """Show the status until the run ends."""
     ended = Stop()
     status.follow_stop(ended)
-    with Display(status) as display:
+    with live_page(options.run, options.web) as page, Display(status, page) as display:
         while not ended.is_set() and not ctrl_c.wait(TICK):
             display.update()
             _check(status, options)

@@ -27,15 +27,15 @@ STATUS = {
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
-        ({}, "step 9,964/1,000,000  return 175.1 (last 100 of 133 episodes)  247 updates/s  network 2 acts  "
+        ({}, "step 9,964/1,000,000  return 175.1 (the last 100 of 133 episodes)  247 updates/s  network 2 acts  "
              "1 replay service, 2 actors"),
         ({"episodes": 52, "connected": {"actor": 1}, "waiting": "x"},
          "step 9,964/1,000,000  return 175.1 (52 episodes)  247 updates/s  network 2 acts  "
          "0 replay services, 1 actor  [x]"),
-        ({"warning": "w"}, "step 9,964/1,000,000  return 175.1 (last 100 of 133 episodes)  247 updates/s  "
+        ({"warning": "w"}, "step 9,964/1,000,000  return 175.1 (the last 100 of 133 episodes)  247 updates/s  "
          "network 2 acts  1 replay service, 2 actors  warning: w"),
         ({"missing": ["actor 0 on act (pid 8)"]},
-         "step 9,964/1,000,000  return 175.1 (last 100 of 133 episodes)  247 updates/s  network 2 acts  "
+         "step 9,964/1,000,000  return 175.1 (the last 100 of 133 episodes)  247 updates/s  network 2 acts  "
          "1 replay service, 2 actors  lost: actor 0 on act (pid 8)"),
         ({"episodes": 1}, "step 9,964/1,000,000  return 175.1 (1 episode)  247 updates/s  network 2 acts  "
          "1 replay service, 2 actors"),

@@ -196,7 +196,7 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
         assert run.wait(110) == 130
         done = first.result()
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(r"step [\d,]+/1,000,000  return [\d.]+ \((last 100 of )?\d+ episodes?\)", done.stdout)
+    assert re.search(r"step [\d,]+/1,000,000  return [\d.]+ \((the last 100 of )?\d+ episodes?\)", done.stdout)
     assert done.stdout.endswith("the run has ended: interrupted\n")
 
     pictures = [lines for lines in terminal.pictures() if lines[0].startswith("coop  CartPole-v0, coop, seed 0")]

@@ -16,7 +16,7 @@ from learner.records.summary import Summary
         (0, "no episode ended"),
         (1, "return of 1 episode 22.6 (20.8)"),
         (100, "return of 100 episodes 22.6 (20.8)"),
-        (1234, "return of the last 100 episodes 22.6 (20.8)"),
+        (1234, "return of the last 100 of 1,234 episodes 22.6 (20.8)"),
     ],
 )
 def test_it_says_how_many_episodes_the_return_is_of(episodes: int, returns: str) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from common.process.files import NO_SPACE
+from common.returns import RETURN_WINDOW
 
 PROGRESS_EVERY = 10.0  # seconds
 STALL_AFTER = 5.0  # seconds without progress after which a line is printed
@@ -119,12 +120,10 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
-def returns(mean: float, episodes: int, window: int = 100) -> str:
-    """The mean return over the newest episodes, in words."""
-    if not episodes:
-        return "no episode has ended yet"
-    over = f"last {window} of {counted(episodes, 'episode')}" if episodes > window else counted(episodes, "episode")
-    return f"return {mean:.1f} ({over})"
+def averaged_over(episodes: int) -> str:
+    """The episodes whose returns are averaged, in words: all, or the newest of them."""
+    newest = f"the last {RETURN_WINDOW} of " if episodes > RETURN_WINDOW else ""
+    return f"{newest}{counted(episodes, 'episode')}"
 
 
 def connected(counts: Mapping[str, int]) -> str:
@@ -134,9 +133,11 @@ def connected(counts: Mapping[str, int]) -> str:
 
 def progress_line(status: Mapping[str, Any]) -> str:
     """The status of a learner in one line."""
+    episodes = status["episodes"]
+    returns = f"return {status['return_mean_100']:.1f} ({averaged_over(episodes)})"
     text = (
         f"step {status['env_steps']:,}/{status['total_steps']:,}  "
-        f"{returns(status['return_mean_100'], status['episodes'])}  "
+        f"{returns if episodes else 'no episode has ended yet'}  "
         f"{status['updates_per_s']:.0f} updates/s  network {status['acting']} acts  {connected(status['connected'])}"
     )
     if status["warning"]:

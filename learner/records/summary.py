@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.process.console import counted
-from common.returns import RETURN_WINDOW
+from common.process.console import averaged_over
 from learner.trainer import Trainer
 
 
@@ -37,9 +36,7 @@ class Summary:
         return f"{self.env}, {self.method}, seed {self.seed}"
 
     def __str__(self) -> str:
-        some = counted(self.episodes, "episode")
-        over = f"the last {RETURN_WINDOW} episodes" if self.episodes > RETURN_WINDOW else some
-        returns = f"return of {over} {self.return_mean_100:.1f} ({self.return_sd_100:.1f})"
+        returns = f"return of {averaged_over(self.episodes)} {self.return_mean_100:.1f} ({self.return_sd_100:.1f})"
         return (
             f"{self.exit}: {self.env_steps:,} steps, {self.updates:,} updates, "
             f"{returns if self.episodes else 'no episode ended'}, {self.wall_seconds:.0f} s"

@@ -1,0 +1,17 @@
+"""Where a process serves HTTP: a port, on loopback unless a host is named."""
+
+from __future__ import annotations
+
+import re
+
+from common.errors import UsageError
+
+LOOPBACK = "127.0.0.1"
+
+
+def http_address(flag: str, text: str) -> tuple[str, int]:
+    """The host and port of PORT or HOST:PORT, as the flag was given; raises UsageError."""
+    found = re.fullmatch(r"(?:(?P<host>[^:\s]+|\[[0-9A-Fa-f:.]+\]):)?(?P<port>\d{1,5})", text)
+    if found is None or int(found["port"]) >= 2**16:
+        raise UsageError(f"{flag} {text}: PORT or HOST:PORT with a port from 0 to 65535 is needed")
+    return (found["host"] or LOOPBACK).strip("[]"), int(found["port"])
