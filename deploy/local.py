@@ -16,7 +16,7 @@ from common.process.locks import RunLock
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.capacity import check_memory, check_messages
 from common.settings.config import RunConfig, check_distributed
-from common.settings.options import RunOptions, beginning, holds_run, parse_run
+from common.settings.options import LearnerRunOptions, beginning, holds_run, parse_run
 from common.settings.tables import to_toml
 from deploy.status import Display, Page, RunStatus, live_page
 from deploy.supervisor import RESTARTS, RestartPolicy
@@ -27,13 +27,11 @@ JOIN_TIMEOUT = 3600.0  # seconds; this process notices the learner's end itself,
 
 
 @dataclass(frozen=True)
-class LocalOptions(RunOptions):
+class LocalOptions(LearnerRunOptions):
     """Flags of `coop-local`."""
 
     actors: int = 1
     """Actor processes; 0 with --listen, for actors that all run elsewhere."""
-    restart: bool = False
-    """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
     listen: str | None = None
     """Endpoint of the learner, for actors on other machines; a free port on loopback if not given."""
     web: str = ""
@@ -63,7 +61,8 @@ class Topology:
         # --resume also at the first start, so that a restarted role continues from the newest epoch.
         files = [f"--run-dir={directory}", "--resume", *common]
         learning = [f"--config={resolved}", "--listen", self.endpoint, *files]
-        learning += ["--restart"] if options.restart else []
+        learning += [flag for flag in ("--restart", "--wandb") if getattr(options, flag[2:])]
+        learning += [f"--prometheus={options.prometheus}"] if options.prometheus else []
         serving = [*joining, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}", "--resume"]
         self.learner = ChildProcess("learner", command("coop-learner", *learning), logs / "learner.log", locks)
         self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]

@@ -27,7 +27,7 @@ def _run() -> None:
 
     stop = Stop()
     stop.on_signals()
-    with closing(LockstepRun(config, path, "coop-lockstep", resume=options.resume)) as run:
+    with closing(LockstepRun(config, path, "coop-lockstep", resume=options.resume, wandb=options.wandb)) as run:
         if options.resume:
             print(beginning(path) if run.epoch is None else f"goes on from epoch {run.epoch.name}", flush=True)
         summary = run.play(stop, lambda line: say(line, end="\r" if sys.stdout.isatty() else "\n"))

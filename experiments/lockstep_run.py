@@ -26,8 +26,8 @@ class LockstepRun:
     epoch: from which it goes on; None if it starts.
     """
 
-    def __init__(self, config: RunConfig, path: Path, program: str, *, resume: bool) -> None:
-        """Prepare the run; program: named to other processes that want the directory.
+    def __init__(self, config: RunConfig, path: Path, program: str, *, resume: bool, wandb: bool = False) -> None:
+        """Prepare the run; program: named to other processes that want the directory. wandb: see `RunDirectory`.
 
         Raises:
             UsageError: the config does not fit the environment, or the directory's epoch a lockstep run.
@@ -35,6 +35,7 @@ class LockstepRun:
         """
         use_threads(config.learner.threads)
         self.path = path
+        self._wandb = wandb
         self._run = Lockstep(config)
         try:
             self._lock = RunLock(path, program, ("learner", "replay"))
@@ -53,8 +54,9 @@ class LockstepRun:
 
         Raises:
             RunError: there is no space for the closing epoch or the summary.
+            UsageError: Weights & Biases refuses.
         """
-        with RunDirectory(self.path, self._run.config, self._sizes) as directory:
+        with RunDirectory(self.path, self._run.config, self._sizes, wandb=self._wandb) as directory:
             return play_lockstep(self._run, directory, stop, progress)
 
     @property

@@ -10,19 +10,17 @@ from common.process.importing import importing
 from common.process.lifecycle import run_main
 from common.settings.capacity import check_messages
 from common.settings.config import check_distributed
-from common.settings.options import RunOptions, parse_run
+from common.settings.options import LearnerRunOptions, parse_run
 
 
 @dataclass(frozen=True)
-class LearnerOptions(RunOptions):
+class LearnerOptions(LearnerRunOptions):
     """Flags of `coop-learner`."""
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints to listen on; tcp/0.0.0.0:7447 opens the run to other machines."""
     health: str | None = None
     """Answer HTTP on this HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
-    restart: bool = False
-    """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from common.errors import RunError, UsageError
@@ -76,13 +77,25 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
             node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, episodes_received
         )
         checkpoints = Checkpoints(node, path, samples, epochs, console.event)
-        with RunDirectory(path, config, None if state is None else state["sizes"]) as directory:
-            summary = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console).run()
+        sizes = None if state is None else state["sizes"]
+        with RunDirectory(path, config, sizes, wandb=options.wandb) as directory:
+            service = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console)
+            with _exported(options.prometheus, service):
+                summary = service.run()
     say(str(summary))
     if trainer.diverged:
         raise RunError(trainer.diverged)
     if stop.failed or summary.exit == stop.reason:  # otherwise the run was complete before the signal
         stop.leave()
+
+
+def _exported(address: str, service: LearnerService) -> AbstractContextManager[object]:
+    """Serve the learner's status to Prometheus; nothing if the address is empty."""
+    if not address:
+        return nullcontext()
+    from learner.exporter import exported  # noqa: PLC0415 (an extra)
+
+    return exported(address, service.status)
 
 
 def _check_origin(epoch: Path) -> None:

@@ -11,6 +11,7 @@ from common.errors import RunError
 from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key, stop_key
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
+from common.messaging.messages.status import LearnerStatus
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.transport import NoAnswer, Node
 from common.process.console import Console, progress_line
@@ -80,6 +81,10 @@ class LearnerService:
             self._checkpoints.wait()
             summary = self._finish(outcome or "interrupted")  # by a second SIGINT
         return summary
+
+    def status(self) -> LearnerStatus | None:
+        """The newest status published; None before the first. May be called by another thread."""
+        return self._reporter.status
 
     def _turn(self) -> None:
         """Do one update if a batch is available."""

@@ -33,7 +33,10 @@ SHORTEST_WAIT = 0.05  # share of the time below which nobody counts as waiting
 
 
 class StatusReporter:
-    """Gathers the statuses of the other roles, and publishes the learner's."""
+    """Gathers the statuses of the other roles, and publishes the learner's.
+
+    status: the newest that `publish` has published; None before the first.
+    """
 
     def __init__(
         self, node: Node, trainer: Trainer, samples: SampleClient, join_service: JoinService, console: Console
@@ -43,7 +46,7 @@ class StatusReporter:
         self._samples = samples
         self._join_service = join_service
         self._console = console
-        self._status: LearnerStatus | None = None
+        self.status: LearnerStatus | None = None
         self._origin = Origin.here()
         self._steps_per_s, self._updates_per_s = Rate(SPEED_OVER), Rate(SPEED_OVER)
         self._slow_steps_per_s, self._slow_updates_per_s = Rate(TIME_LEFT_OVER), Rate(TIME_LEFT_OVER)
@@ -61,7 +64,7 @@ class StatusReporter:
         size, steps, replay = trainer.drawn.size, trainer.drawn.inserted, self._replay_status
         if replay is not None:
             size, steps = replay.size, max(steps, replay.inserted)
-        self._status = LearnerStatus(
+        self.status = LearnerStatus(
             env_steps=steps,
             total_steps=config.total_steps,
             updates=updates,
@@ -90,13 +93,13 @@ class StatusReporter:
             faults=self._node.faults.count,
             **members,
         )
-        self._node.publish_status(self._status)
-        return self._status
+        self._node.publish_status(self.status)
+        return self.status
 
     def publish_members(self, now: float) -> None:
         """Publish the last status again, with the present members; may be called by another thread."""
-        if self._status is not None:
-            self._node.publish_status(msgspec.structs.replace(self._status, **self._members(now)))
+        if self.status is not None:
+            self._node.publish_status(msgspec.structs.replace(self.status, **self._members(now)))
 
     def _members(self, now: float) -> dict[str, Any]:
         """The fields that say who is there, who waits and why."""

@@ -14,6 +14,7 @@ import sysconfig
 import termios
 import threading
 import time
+import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -148,7 +149,9 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
     nobody = run_command(*watch, "--join-timeout", "0.5", "--once")
     assert (nobody.returncode, nobody.stdout) == (1, "")
     assert nobody.stderr == f"coop-watch: error: no learner of run 'coop' found at {endpoint} within 0.5 s\n"
+    page, metrics = (free_endpoint().removeprefix("tcp/") for _ in range(2))
     local = ["coop-local", "--listen", endpoint, "--total-steps", "1000000", "--run-dir", str(tmp_path / "r")]
+    local += ["--web", page, "--prometheus", metrics]
     status, terminal = RunStatus("coop", endpoint, new_incarnation()), Terminal()
     with (
         contextlib.closing(terminal),
@@ -172,6 +175,13 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
         assert now["seconds_left"] > 0
         assert now["return_history"][-1] > 0
         assert sum("actor" in line and line.endswith("joined") for line in now["events"]) == 1
+        with urllib.request.urlopen(f"http://{page}/page.json", timeout=60) as answer:
+            shown = json.loads(answer.read())
+        assert (shown["run"], shown["settings"]) == ("coop", "CartPole-v0, coop, seed 0")
+        assert shown["points"][-1][0] > 0
+        with urllib.request.urlopen(f"http://{metrics}/metrics", timeout=60) as answer:
+            exported = answer.read().decode()
+        assert re.search(r'^coop_updates_total{env="CartPole-v0",method="coop",seed="0"} [1-9]', exported, re.MULTILINE)
         other = run_command(*watch, "--run", "my", "--join-timeout", "0.5")
         assert other.stderr.endswith("within 0.5 s; there is run 'coop'\n")
         # A learner tells its status twice a second.

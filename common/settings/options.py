@@ -14,7 +14,9 @@ import tyro
 
 from common.errors import RunError, UsageError
 from common.process import cli
+from common.process.extras import check_extra
 from common.process.notices import note_renamed, warn
+from common.process.ports import http_address
 from common.process.run_ids import has_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.effects import without_effect
@@ -67,6 +69,8 @@ class RunOptions(RunConfig):
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
     """Use shared memory for messages between processes on one machine."""
+    wandb: bool = False
+    """Mirror TensorBoard's scalars to Weights & Biases, whose own variables (WANDB_MODE, WANDB_PROJECT) apply."""
 
     def run_config(self) -> RunConfig:
         """The checked config of the run; raises UsageError."""
@@ -111,6 +115,16 @@ def beginning(path: Path) -> str:
     return f"starts in {path}: {there}"
 
 
+@dataclass(frozen=True)
+class LearnerRunOptions(RunOptions):
+    """The flags of commands that start a learner's process."""
+
+    restart: bool = False
+    """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
+    prometheus: str = ""
+    """Serve the learner's status to Prometheus at PORT, on loopback, or at HOST:PORT."""
+
+
 OptionsT = TypeVar("OptionsT", bound=RunOptions)
 
 
@@ -135,6 +149,11 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
         note_renamed({"--learner.swap-every": f"--learner.target-update-every for {options.method}"})
     for line in without_effect(options, given, lockstep=lockstep):
         warn(line)
+    if options.wandb:
+        check_extra("--wandb", "wandb", "wandb")
+    if isinstance(options, LearnerRunOptions) and options.prometheus:
+        check_extra("--prometheus", "prometheus", "prometheus_client")
+        http_address("--prometheus", options.prometheus)
     return options
 
 

@@ -20,6 +20,7 @@ from common.settings.config import RunConfig
 from common.settings.overrides import leaves
 from common.settings.tables import to_tables, to_toml
 from learner.records.curve import draw_learning_curve
+from learner.records.mirror import WandbMirror
 from learner.records.summary import Summary
 from learner.records.tensorboard import TensorBoardWriter
 from learner.trainer import EpisodeRow
@@ -33,17 +34,27 @@ EPISODE_FIELDS = (
 class RunDirectory:
     """Writes a run's files during the run; when a call returns, its lines are complete if the disk has space."""
 
-    def __init__(self, path: Path, config: RunConfig, sizes: dict[str, int] | None = None) -> None:
-        """Create a run's files, or continue them, cut back to `sizes` in bytes; raises RunError if that fails."""
+    def __init__(
+        self, path: Path, config: RunConfig, sizes: dict[str, int] | None = None, *, wandb: bool = False
+    ) -> None:
+        """Create a run's files, or continue them, cut back to `sizes` in bytes.
+
+        wandb: mirror TensorBoard's scalars to Weights & Biases.
+
+        Raises:
+            RunError: a file can't be written.
+            UsageError: Weights & Biases refuses.
+        """
         self.path = path
         try:
-            claim_run_directory(path, config)
+            run_id = claim_run_directory(path, config)
+            mirror = WandbMirror(path, run_id) if wandb else None
             for name, size in (sizes or {}).items():
                 truncate(path / name, size)
             (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
             self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
             self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
-            self._tensorboard = TensorBoardWriter(path / "tb")
+            self._tensorboard = TensorBoardWriter(path / "tb", mirror)
             self._tensorboard.hyperparameters({".".join(place): value for place, value in leaves(to_tables(config))})
         except OSError as error:
             raise RunError(f"run directory {path}: {error.strerror or error}") from error

@@ -7,7 +7,7 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import HistogramProto, Summary, SummaryMetadata
@@ -27,14 +27,31 @@ TAGS = {
 """Names of columns of metrics.jsonl; the other numbers are at train/NAME."""
 
 
+class Mirror(Protocol):
+    """Takes the scalars that TensorBoard's file gets."""
+
+    def hyperparameters(self, values: Mapping[str, Any]) -> None:
+        """Add the settings by name."""
+        ...
+
+    def scalars(self, values: Mapping[str, float], step: int) -> None:
+        """Add scalars by tag; step: the run's environment steps."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left."""
+        ...
+
+
 class TensorBoardWriter:
     """Writes scalars for TensorBoard; while the disk is full they are kept, like a run's lines.
 
     PyTorch's `SummaryWriter` writes in its own thread, which a full disk would end.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, mirror: Mirror | None = None) -> None:
         """Create a file; raises OSError if that fails."""
+        self._mirror = mirror
         folder.mkdir(parents=True, exist_ok=True)
         name = f"events.out.tfevents.{int(time.time()):010}.{socket.gethostname()}.{os.getpid()}"
         self._file = LineFile(folder / name, go_on=True)
@@ -48,6 +65,8 @@ class TensorBoardWriter:
 
     def hyperparameters(self, values: Mapping[str, Any]) -> None:
         """Add the settings by name, as a table."""
+        if self._mirror is not None:
+            self._mirror.hyperparameters(values)
         rows = "".join(f"|{name}|{value}|\n" for name, value in values.items())
         text = f"|setting|value|\n|-|-|\n{rows}"
         value = Summary.Value(
@@ -71,6 +90,8 @@ class TensorBoardWriter:
         self._histogram("replay/reuse", 1, row["reuse_histogram"], step)
 
     def _scalars(self, values: Mapping[str, float], step: int) -> None:
+        if self._mirror is not None:
+            self._mirror.scalars(values, step)
         summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()])
         self._add(Event(wall_time=time.time(), step=step, summary=summary))
 
@@ -84,6 +105,8 @@ class TensorBoardWriter:
     def close(self) -> None:
         """Write the kept scalars, and close the file."""
         self._file.close()
+        if self._mirror is not None:
+            self._mirror.close()
 
     def _add(self, event: Event) -> None:
         self._records.write(event.SerializeToString())
