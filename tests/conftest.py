@@ -39,10 +39,19 @@ SETTLE = 10.0  # seconds that threads and processes get to end
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A mutant meets the quickest tests first, as most are killed by one of these."""
+    """Files with longer limits come first, so that no worker begins one of them while the others end.
+
+    A mutant meets the quickest tests first, as most are killed by one of these.
+    """
     if STATS_OF_MUTMUT.exists():
         durations = json.loads(STATS_OF_MUTMUT.read_text(encoding="utf-8"))["duration_by_test"]
         items.sort(key=lambda item: durations.get(item.nodeid, 0.0))
+        return
+    limits: dict[Path, float] = {}
+    for item in items:
+        limit = item.get_closest_marker("timeout")
+        limits[item.path] = max(limits.get(item.path, 0.0), limit.args[0] if limit else 0.0)
+    items.sort(key=lambda item: -limits[item.path])
 
 
 def _children() -> set[int]:

@@ -15,6 +15,8 @@ from learner.agent import Agent, _decay_vector
 from learner.qnetwork import make_network
 from replay.table.table import Table
 
+pytestmark = pytest.mark.timeout(300)  # PyTorch's compiler, also on a busy machine
+
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 
 

@@ -15,6 +15,8 @@ from experiments import lockstep_cli
 from learner.losses import Values
 from learner.methods.rule import Rule
 
+pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
+
 SMALL = {"learning_starts": 50, "capacity": 200}
 
 

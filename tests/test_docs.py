@@ -11,6 +11,8 @@ import pytest
 
 import coop
 
+pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
+
 DOCS = Path(__file__).parents[1] / "docs"
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MAX_LINES = 30

@@ -19,6 +19,8 @@ from experiments.lockstep import Lockstep
 from learner.agent import Agent
 from learner.records.epochs import load_learner, newest_epoch
 
+pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
+
 CONFIG = """
 total_steps = 1200
 [env]

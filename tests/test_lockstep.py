@@ -21,6 +21,8 @@ from experiments.lockstep import Lockstep
 from learner.records.epochs import load_learner
 from learner.records.run_directory import RunDirectory
 
+pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
+
 COMMAND = str(Path(sysconfig.get_path("scripts")) / "coop-lockstep")
 
 

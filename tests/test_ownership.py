@@ -36,6 +36,8 @@ from replay.persistence.epochs import ReplayEpochs, part_path
 from replay.persistence.folder import ReplayFolder
 from replay.persistence.journal import Journal, journal_files
 
+pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
+
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 
 

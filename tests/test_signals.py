@@ -14,6 +14,8 @@ from test_topology import lines, running, wait_for
 from common.errors import PeerLost
 from common.process.lifecycle import Stop
 
+pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
+
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 ROLES = ("coop-learner", "coop-replay", "coop-actor", "coop-lockstep", "coop-local", "coop-sweep")
 

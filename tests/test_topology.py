@@ -21,6 +21,8 @@ from commands import run_command
 from experiments.reexecute import reexecute
 from learner.records.epochs import load_learner
 
+pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
+
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 EPISODES = "episode,env_step,update,actor,stream,return,length,epsilon,s,q1_mean,q2_mean,param_version"
 METRICS = [
