@@ -20,7 +20,10 @@ IN_CHECKOUTS_ONLY = (
     "deploy/slurm/*",
     "deploy/zenoh/*",
 )
-PAGES = ("README.md", "CONTRIBUTING.md", "SECURITY.md", *(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
+PAGES = sorted(
+    ["README.md", "CONTRIBUTING.md", "SECURITY.md"]
+    + [str(page.relative_to(ROOT)) for folder in ("docs", "results") for page in (ROOT / folder).rglob("*.md")]
+)
 
 
 def test_every_package_is_installed() -> None:
