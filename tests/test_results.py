@@ -1,4 +1,4 @@
-"""The numbers on the pages of results/ are those of the committed studies, as results/claims.toml ties them together."""
+"""The numbers on the pages of results/ are those of the committed studies: results/claims.toml ties them together."""
 
 import re
 import tomllib
