@@ -20,7 +20,7 @@ class ActorOptions(RoleOptions):
     envs: int | None = None
     """Emulators in this process; the run's actor.envs if not given."""
     health: str | None = None
-    """Answer HTTP on this HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
+    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
     allow_import: tuple[str, ...] = ()
     """Modules, such as my_envs, that this process may import if the run's environment or network is theirs."""
 

@@ -13,9 +13,9 @@ from typing import Any
 from common.messaging.messages.status import LearnerStatus
 from common.process.console import connected
 from common.process.display import printable
+from common.process.web import Document, WebServer
 from deploy.curves import COLUMNS, Curves
 from deploy.facts import SILENT_AFTER, detail, facts, place, progress, settings, silence, times
-from deploy.web import WebServer
 
 FOLLOWS = 3.0  # seconds within which a browser that follows the run asks again
 
@@ -48,8 +48,8 @@ class LivePage:
             "--web",
             address,
             {
-                "/": ("text/html; charset=utf-8", lambda: html),
-                "/page.json": ("application/json", lambda: json.dumps(self.told()).encode()),
+                "/": lambda: Document("text/html; charset=utf-8", html),
+                "/page.json": lambda: Document("application/json", json.dumps(self.told()).encode()),
             },
         )
         self.url = self._server.url

@@ -28,7 +28,7 @@ class RouterOptions:
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     health: str | None = None
-    """Answer HTTP on this HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
+    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ class LearnerOptions(LearnerRunOptions):
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints to listen on; tcp/0.0.0.0:7447 opens the run to other machines."""
     health: str | None = None
-    """Answer HTTP on this HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
+    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
 def main() -> None:

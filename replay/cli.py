@@ -42,7 +42,7 @@ class ReplayOptions(RoleOptions):
     resume: bool = False
     """Continue from the state in --run-dir; start afresh if it holds nothing of this run yet."""
     health: str | None = None
-    """Answer HTTP on this HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
+    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler
 from socketserver import ThreadingTCPServer
+from typing import NamedTuple
 
 from common.errors import UsageError
 from common.process.ports import http_address
@@ -15,7 +16,16 @@ from common.process.ports import http_address
 # A page carries its script and styles, and loads nothing from elsewhere.
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; connect-src 'self'"
 
-Documents = Mapping[str, tuple[str, Callable[[], bytes]]]
+
+class Document(NamedTuple):
+    """An answer. kind: its content type."""
+
+    kind: str
+    body: bytes
+    status: int = 200
+
+
+Documents = Mapping[str, Callable[[], Document]]
 
 
 class WebServer:
@@ -23,7 +33,7 @@ class WebServer:
 
     Args:
         flag, address: PORT or HOST:PORT, and the flag that gave it.
-        documents: content type and function for the content, by path; the functions are called from several threads.
+        documents: functions that give the answers, by path; they are called from several threads.
 
     Attributes:
         url: of the path "/".
@@ -77,18 +87,17 @@ class _Handler(BaseHTTPRequestHandler):
         if self.path not in self.served:
             self.send_error(404)
             return
-        kind, content = self.served[self.path]
-        body = content()
-        self.send_response(200)
+        document = self.served[self.path]()
+        self.send_response(document.status)
         for name, value in (
-            ("Content-Type", kind),
-            ("Content-Length", str(len(body))),
+            ("Content-Type", document.kind),
+            ("Content-Length", str(len(document.body))),
             ("Cache-Control", "no-store"),
             ("Content-Security-Policy", POLICY),
         ):
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(body)
+        self.wfile.write(document.body)
 
     def log_message(self, *_: object) -> None:
         """Say nothing: the terminal shows the run."""
