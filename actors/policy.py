@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from common.networks.network import FlatNetwork, q_values
+from common.networks.acting import ActingNetwork
 from common.types import Array, EnvSpec
 
 
 class Policy:
     """The two networks of a run, one of which acts.
 
-    networks: Q1 and Q2, of any floating dtype. acting: 0 or 1.
+    networks: Q1 and Q2. acting: 0 or 1.
     """
 
-    def __init__(self, networks: tuple[FlatNetwork, FlatNetwork], spec: EnvSpec, rng: np.random.Generator) -> None:
+    def __init__(self, networks: tuple[ActingNetwork, ActingNetwork], spec: EnvSpec, rng: np.random.Generator) -> None:
         self.networks = networks
         self.acting = 0
         self._spec = spec
@@ -26,12 +26,12 @@ class Policy:
         actions = np.empty(len(obs), np.int32)
         random = (self._rng.random(len(obs)) < epsilon).nonzero()[0]
         if len(random) < len(obs):
-            actions[:] = q_values(self.networks[self.acting], obs, self._spec).argmax(1)
+            actions[:] = self.networks[self.acting].q_values(obs, self._spec).argmax(1)
         if len(random):
             actions[random] = self._rng.integers(self._spec.num_actions, size=len(random), dtype=np.int32)
         return actions
 
     def mean_values(self, obs: Array) -> tuple[float, float]:
         """Mean over actions of Q1 and of Q2 at one observation <frame_dtype>[*obs_shape]."""
-        first, second = (float(q_values(network, obs[None], self._spec).mean()) for network in self.networks)
+        first, second = (float(network.q_values(obs[None], self._spec).mean()) for network in self.networks)
         return first, second

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 import zenoh
 
 from actors.cli import ActorOptions
@@ -18,7 +17,7 @@ from common.messaging.joining import Membership, join, leave_run
 from common.messaging.messages.join import Join, Joined
 from common.messaging.route import ReplayRoute, RoutedReplay, open_client
 from common.messaging.transport import Node, new_incarnation, open_session
-from common.networks.network import FlatNetwork, build_network
+from common.networks.acting import ActingNetwork, acting_network
 from common.process.console import Console, counted
 from common.process.health import answering
 from common.process.lifecycle import Stop
@@ -101,16 +100,13 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
     env.close()
 
 
-def _networks(joined: Joined) -> tuple[FlatNetwork, FlatNetwork]:
+def _networks(joined: Joined) -> tuple[ActingNetwork, ActingNetwork]:
     """Networks of the run's layout, whose parameters the learner will send.
 
     Raises:
         JoinError: this process builds another layout than the learner does.
     """
-    settings = joined.config.network
-    modules = [build_network(settings.kind, joined.spec, settings.hidden, seed=0) for _ in range(2)]
-    dtype = torch.bfloat16 if settings.dtype == "bfloat16" else torch.float32
-    first, second = (FlatNetwork(module.to(dtype)) for module in modules)
+    first, second = (acting_network(joined.config.network, joined.spec) for _ in range(2))
     if first.layout_digest() != joined.layout:
         raise JoinError(f"network layout here {first.layout_digest()}, the learner's {joined.layout}")
     return first, second

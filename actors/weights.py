@@ -26,7 +26,7 @@ class WeightsFollower:
     def __init__(self, node: Node, policy: Policy) -> None:
         self._node = node
         self._policy = policy
-        self._size = policy.networks[0].flat.numel()
+        self._size = policy.networks[0].size
         self._held = [UNKNOWN, UNKNOWN]
         self._told = [UNKNOWN, UNKNOWN]
         self._ask_at = math.inf  # monotonic time; inf while nothing is missing

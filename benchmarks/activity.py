@@ -16,7 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from common.envs.make import env_spec
-from common.networks.network import FlatNetwork, preprocess
+from common.networks.inputs import preprocess
+from common.networks.network import FlatNetwork
 from common.process.run_ids import read_run_id
 from common.process.threads import use_threads
 from common.settings.tables import load_tables, resolve

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from common.errors import CoopError
 from common.imports import describe
-from common.networks.network import FlatNetwork, preprocess, sample_observations
+from common.networks.inputs import preprocess
+from common.networks.network import FlatNetwork, sample_observations
 from common.types import EnvSpec
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.envs.make import env_spec
 from common.errors import UsageError
-from common.networks.network import FlatNetwork, q_values
+from common.networks.network import FlatNetwork
 from common.process.summaries import read_summary
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
@@ -70,7 +70,7 @@ class SavedPolicy:
         if batch.shape[1:] != self.spec.obs_shape:
             shape = "x".join(map(str, self.spec.obs_shape))
             raise UsageError(f"observation of shape {given.shape}: {self.spec.env_id} has {shape}, or a batch of these")
-        each = [q_values(network, batch, self.spec) for network in self.networks]
+        each = [network.q_values(batch, self.spec) for network in self.networks]
         values: NDArray[np.float32] = np.mean(each, axis=0)
         return values if batch is given else values[0]
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.errors import UsageError
-from common.networks.network import FlatNetwork, q_values
+from common.networks.network import FlatNetwork
 from common.process.randomness import generator_state, set_generator_state
 from common.registry import loaded
 from common.settings import schedules
@@ -136,7 +136,7 @@ class Agent:
     def q_values(self, obs: Array) -> tuple[Values, Values]:
         """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
         first, second = self.networks
-        return q_values(first, obs, self.spec), q_values(second, obs, self.spec)
+        return first.q_values(obs, self.spec), second.q_values(obs, self.spec)
 
     def state(self) -> dict[str, Any]:
         """The state for `load_state`; torch.load reads it with weights_only."""

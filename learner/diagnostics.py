@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from common.networks.network import preprocess
+from common.networks.inputs import preprocess
 from common.types import Batch
 from learner.losses import td_errors
 from learner.protocol import Agent

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from common.errors import UsageError
-from common.networks.network import FlatNetwork, preprocess, sample_inputs
+from common.networks.inputs import preprocess
+from common.networks.network import FlatNetwork, sample_inputs
 from common.registry import loaded
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS

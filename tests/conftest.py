@@ -10,6 +10,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+import torch  # noqa: F401 - `use_threads` limits what has been imported
 
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.process.threads import use_threads

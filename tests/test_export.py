@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from common.errors import RunError
-from common.networks.network import FlatNetwork, build_network, q_values, sample_observations
+from common.networks.network import FlatNetwork, build_network, sample_observations
 from common.settings.tables import resolve
 from common.types import EnvSpec
 from experiments import export_cli
@@ -141,7 +141,7 @@ def test_models_take_observations_as_the_environment_gives_them(spec: EnvSpec) -
         for batch in (1, 3):
             obs = sample_observations(spec, batch).numpy()
             (found,) = session.run(None, {"obs": obs})
-            np.testing.assert_allclose(found, q_values(network, obs, spec), rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(found, network.q_values(obs, spec), rtol=1e-4, atol=1e-5)
 
 
 def test_a_network_of_ones_own(tmp_path: Path) -> None:

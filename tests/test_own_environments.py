@@ -14,7 +14,8 @@ from common.envs import registry
 from common.envs.make import env_spec, make_vector_env
 from common.envs.pictures import grayscale, make_resizer
 from common.errors import UsageError
-from common.networks.network import FlatNetwork, build_network, preprocess
+from common.networks.inputs import preprocess
+from common.networks.network import FlatNetwork, build_network
 from common.settings.environment import EnvSettings
 from common.settings.tables import load_tables, resolve
 from common.types import Array, EnvSpec

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,11 +18,11 @@ from common.errors import UsageError
 from common.networks.convolution import ConvolutionNetwork
 from common.networks.custom import custom_network
 from common.networks.dense import Dense
+from common.networks.inputs import preprocess
+from common.networks.layout import ArrayT, Layout, digest, views
 from common.networks.normalised import NormalisedNetwork
 from common.settings.config import NETWORK_KINDS
 from common.types import EnvSpec
-
-ArrayT = TypeVar("ArrayT", Tensor, NDArray[Any])
 
 # (out channels, kernel, stride) of each convolution, then the width of the hidden linear layer.
 _CONV_NETWORKS: dict[str, tuple[tuple[tuple[int, int, int], ...], int]] = {
@@ -94,22 +92,6 @@ def _conv(kind: str, spec: EnvSpec) -> nn.Sequential:
     return nn.Sequential(layers)
 
 
-def preprocess(obs: ArrayT, spec: EnvSpec) -> ArrayT:
-    """The network's input for stored observations: <frame_dtype>[batch, *obs_shape] -> float32 [batch, *input_shape].
-
-    It stays with its library, PyTorch or numpy, and on its device. uint8 is scaled to [0, 1]; bool becomes 0 and 1.
-    Planes are ordered by frame, oldest first, then by channel.
-    """
-    xp: Any = torch if isinstance(obs, Tensor) else np
-    if spec.frame_dtype != "float32":
-        obs = xp.asarray(obs, dtype=xp.float32)
-        if spec.frame_dtype == "uint8":
-            obs *= 1 / 255
-    if len(spec.frame_shape) == 3:
-        obs = obs.swapaxes(-1, -2).swapaxes(-2, -3)  # channels first; `moveaxis` takes longer than a small network
-    return obs if obs.shape[1:] == spec.input_shape else obs.reshape(-1, *spec.input_shape)
-
-
 def sample_inputs(spec: EnvSpec, count: int) -> Tensor:
     """Made-up inputs of a network, always the same: float32 [count, *input]."""
     return preprocess(sample_observations(spec, count), spec)
@@ -166,7 +148,7 @@ class FlatNetwork:
     def __init__(self, module: nn.Module) -> None:
         parameters = list(module.named_parameters())
         self.module = module
-        self.layout: list[tuple[str, tuple[int, ...]]] = [(name, tuple(p.shape)) for name, p in parameters]
+        self.layout: Layout = [(name, tuple(p.shape)) for name, p in parameters]
         self.flat = torch.cat([p.detach().reshape(-1) for _, p in parameters])
         for (_, p), view in zip(parameters, self.views(self.flat).values(), strict=True):
             p.data = view
@@ -179,21 +161,21 @@ class FlatNetwork:
             x = function(x)
         return x
 
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.flat.numel()
+
     def views(self, flat: ArrayT) -> dict[str, ArrayT]:
         """Each parameter's part of a flat array or tensor [P], by name and in the parameter's shape."""
-        sizes = [math.prod(shape) for _, shape in self.layout]
-        stops = itertools.accumulate(sizes)
-        return {
-            name: flat[stop - size : stop].reshape(shape)
-            for (name, shape), size, stop in zip(self.layout, sizes, stops, strict=True)
-        }
+        return views(flat, self.layout)
 
     def load(self, flat: Tensor | NDArray[np.float32]) -> None:
         """Overwrite all parameters in place from float32 [P]; raises ValueError for another size."""
         # A copy, because arrays from the wire are read-only and PyTorch warns about views of those.
         source = flat if isinstance(flat, Tensor) else torch.tensor(flat)
         if source.shape != self.flat.shape:
-            raise ValueError(f"flat parameters: got shape {tuple(source.shape)}, the network has {self.flat.numel()}")
+            raise ValueError(f"flat parameters: got shape {tuple(source.shape)}, the network has {self.size}")
         self.flat.copy_(source)
 
     def finite(self) -> bool:
@@ -206,13 +188,12 @@ class FlatNetwork:
         return array
 
     def layout_digest(self) -> str:
-        """16 hex digits, equal for two networks if and only if their layouts are equal; compared when a role joins."""
-        return hashlib.sha256(repr(self.layout).encode()).hexdigest()[:16]
+        """See `common.networks.layout.digest`."""
+        return digest(self.layout)
 
-
-def q_values(network: FlatNetwork, obs: NDArray[Any], spec: EnvSpec) -> NDArray[Any]:
-    """Q-values [batch, actions] of observations <frame_dtype>[batch, *obs_shape], without gradients."""
-    if network.in_numpy is not None:
-        return network.in_numpy(preprocess(obs, spec))
-    with torch.inference_mode():
-        return network(preprocess(torch.from_numpy(obs), spec).to(network.flat)).float().cpu().numpy()
+    def q_values(self, obs: NDArray[Any], spec: EnvSpec) -> NDArray[Any]:
+        """Q-values [batch, actions] of observations <frame_dtype>[batch, *obs_shape], without gradients."""
+        if self.in_numpy is not None:
+            return self.in_numpy(preprocess(obs, spec))
+        with torch.inference_mode():
+            return self(preprocess(torch.from_numpy(obs), spec).to(self.flat)).float().cpu().numpy()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import torch
+import sys
+
 from threadpoolctl import threadpool_limits
 
 
 def use_threads(count: int) -> None:
-    """Limit PyTorch and numpy's BLAS to `count` threads; by default both use every core."""
-    torch.set_num_threads(count)
+    """Limit numpy's BLAS and, if it has been imported, PyTorch to `count` threads; by default both use every core."""
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(count)
     threadpool_limits(count, user_api="blas")

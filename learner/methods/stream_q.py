@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from common.networks.network import FlatNetwork, preprocess
+from common.networks.inputs import preprocess
+from common.networks.network import FlatNetwork
 from common.networks.normalised import NormalisedNetwork
 from common.settings import schedules
 from common.settings.config import RunConfig
