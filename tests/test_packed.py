@@ -37,6 +37,7 @@ def folder(tmp_path: Path) -> Path:
             rows[0] |= {"q_abs_mean": 0.5, "q_bound": 100.0}
             rows[1] |= {"q_abs_mean": 100.5, "q_bound": 100.0}
             rows[2] |= {"q_abs_mean": 1e6}  # gamma is 1
+            rows[1:] = [{"archive_drift": 0.5, **row} for row in rows[1:]]  # which a run's first row can't have
         lines = "".join(json.dumps(row) + "\n" for row in rows)
         write(
             tmp_path / "study" / f"dqn-seed={seed}",

@@ -34,8 +34,12 @@ def csv_text(columns: Mapping[str, Sequence[Any]]) -> str:
 def json_columns(text: str) -> Columns:
     """The values of a file with one JSON object per line. Raises ValueError for an invalid line."""
     rows = [json.loads(line) for line in text.splitlines()]
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: [row.get(name) for row in rows] for name in names}
+    return {name: [row.get(name) for row in rows] for name in in_order(rows)}
+
+
+def in_order(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The names in all rows, in the order of the longest ones: a run's first row lacks some in the middle."""
+    return list(dict.fromkeys(name for row in sorted(rows, key=len, reverse=True) for name in row))
 
 
 def json_text(columns: Mapping[str, Sequence[Any]], as_json: frozenset[str]) -> str:

@@ -21,6 +21,7 @@ from experiments.report.columns import (
     csv_text,
     csv_type,
     decimal,
+    in_order,
     json_columns,
     json_text,
     json_type,
@@ -169,7 +170,7 @@ def _read(path: Path, text: str | None) -> Columns:
 def _lists(file: str, runs: Sequence[Columns]) -> list[tuple[pa.Field, pa.Array]]:
     """Each column of a file, as one list per run; null if the run lacks it."""
     made = []
-    for name in dict.fromkeys(name for run in runs for name in run):
+    for name in in_order(runs):
         kind, convert = TYPE[file]([run[name] for run in runs if name in run])
         lists = [[None if v is None else convert(v) for v in run[name]] if name in run else None for run in runs]
         metadata = JSON if file == METRICS and kind == pa.string() else None
