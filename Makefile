@@ -7,7 +7,7 @@ READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: run test check results fuzz netns soak chaos slurm-test mutants dist
+.PHONY: run test check results fuzz netns soak chaos slurm-test mutants docs dist
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -46,6 +46,12 @@ slurm-test: $(READY)
 mutants: $(READY)
 	@$(PIP) --editable '.[dev,mutants]' > $(VENV)/mutants.log 2>&1 || { cat $(VENV)/mutants.log; exit 1; }
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/mutants.py
+
+# The documentation as a site, build/site/index.html; a broken link is an error. Says how many code blocks the tests run.
+docs: $(READY)
+	@$(PIP) --editable '.[dev,docs]' > $(VENV)/docs.log 2>&1 || { cat $(VENV)/docs.log; exit 1; }
+	@$(BIN)/python -m website.assemble build/docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build > $(VENV)/docs.log 2>&1 || { cat $(VENV)/docs.log; exit 1; }
 
 # Wheel and sdist in dist/; the wheel is tried in a fresh environment.
 dist: $(READY)

@@ -17,6 +17,52 @@ _SERVER.set_forkserver_preload(
 )
 
 
+class Command:
+    """A console command that has been started; its output goes to files in a folder of its own.
+
+    environment: all variables; those of this process if None.
+    """
+
+    def __init__(
+        self, name: str, *flags: str | Path, cwd: Path | None = None, environment: Mapping[str, str] | None = None
+    ) -> None:
+        self.arguments = [name, *map(str, flags)]
+        self._folder = tempfile.TemporaryDirectory()
+        self._files = [Path(self._folder.name, stream) for stream in ("out", "err")]
+        variables = dict(os.environ if environment is None else environment)
+        self._process = _SERVER.Process(
+            target=_run, args=(self.arguments, str(cwd or Path.cwd()), variables, list(map(str, self._files)))
+        )
+        self._process.start()
+
+    def output(self) -> tuple[str, str]:
+        """What it has written so far to standard output and to standard error."""
+        out, err = (file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files)
+        return out, err
+
+    def status(self) -> int | None:
+        """Its exit status; None while it runs."""
+        return self._process.exitcode
+
+    def interrupt(self) -> None:
+        """Send it SIGINT."""
+        if self._process.pid is not None and self.status() is None:
+            os.kill(self._process.pid, signal.SIGINT)
+
+    def end(self, timeout: float) -> subprocess.CompletedProcess[str]:
+        """Wait for its end; raises TimeoutExpired, having killed it."""
+        self._process.join(timeout)
+        status = self.status()
+        if status is None:
+            self._process.kill()
+            self._process.join()
+        out, err = self.output()
+        self._folder.cleanup()
+        if status is None:
+            raise subprocess.TimeoutExpired(self.arguments, timeout, out, err)
+        return subprocess.CompletedProcess(self.arguments, status, out, err)
+
+
 def run_command(
     name: str,
     *flags: str | Path,
@@ -27,29 +73,12 @@ def run_command(
 ) -> subprocess.CompletedProcess[str]:
     """What `subprocess.run` does with the command's script, its output captured as text.
 
-    environment: all variables; those of this process if None. check: raise CalledProcessError at another status than 0.
+    environment: see `Command`. check: raise CalledProcessError at another status than 0.
     """
-    arguments = [name, *map(str, flags)]
-    variables = dict(os.environ if environment is None else environment)
-    with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder, stream) for stream in ("out", "err")]
-        process = _SERVER.Process(
-            target=_run, args=(arguments, str(cwd or Path.cwd()), variables, list(map(str, files)))
-        )
-        process.start()
-        process.join(timeout)
-        expired = process.exitcode is None
-        if expired:
-            process.kill()
-            process.join()
-        out, err = (file.read_text(encoding="utf-8") if file.exists() else "" for file in files)
-    if expired:
-        raise subprocess.TimeoutExpired(arguments, timeout, out, err)
-    status = process.exitcode
-    assert status is not None
-    if check and status:
-        raise subprocess.CalledProcessError(status, arguments, out, err)
-    return subprocess.CompletedProcess(arguments, status, out, err)
+    done = Command(name, *flags, cwd=cwd, environment=environment).end(timeout)
+    if check and done.returncode:
+        raise subprocess.CalledProcessError(done.returncode, done.args, done.stdout, done.stderr)
+    return done
 
 
 def _run(arguments: Sequence[str], cwd: str, environment: Mapping[str, str], files: Sequence[str]) -> None:

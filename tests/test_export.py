@@ -1,7 +1,6 @@
 """`coop-export`: a run's networks as safetensors and ONNX, which play without this package."""
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -27,8 +26,8 @@ from experiments.export import export
 from experiments.export_onnx import NotExportedError, onnx_model
 from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
+from website.pages import blocks
 
-DOCS = Path(__file__).parents[1] / "docs" / "export.md"
 PACKAGES = ("actors", "common", "deploy", "experiments", "learner", "replay")
 
 
@@ -64,7 +63,7 @@ def saved(path: Path, env: dict[str, Any] | None = None, kind: str = "mlp") -> L
 
 @pytest.mark.parametrize(("example", "env"), [(0, {}), (1, {"stack": 3})])
 def test_the_documented_examples_play_without_this_package(example: int, env: dict[str, Any], tmp_path: Path) -> None:
-    snippets = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
+    snippets = [block.text for block in blocks("docs/export.md") if block.language == "python" and not block.note]
     assert len(snippets) == 2
     assert len(snippets[example].replace("\n\n", "\n").splitlines()) <= 10
     saved(tmp_path / "run", env)

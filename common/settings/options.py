@@ -139,7 +139,7 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     args = sys.argv[1:]
     base = base_config(args)
     args = current_flags(args, base.learner.optimizer)
-    extended = _with_methods(kind)
+    extended = with_methods(kind)
     given_own = {} if base.own is None else {table_of(base.method): base.own}
     default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **given_own)
     parsed = cli.parse(extended, program, description, default, args, COMMON)
@@ -157,7 +157,7 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     return options
 
 
-def _with_methods(kind: type[OptionsT]) -> type[OptionsT]:
+def with_methods(kind: type[OptionsT]) -> type[OptionsT]:
     """The options with a field for each method's own settings, and with every method in the help.
 
     A method that can't be imported is refused if it is chosen, and otherwise left out.

@@ -1,0 +1,1 @@
+"""Builds the documentation's site from the pages in the repository (`make docs`)."""

@@ -1,0 +1,163 @@
+"""The references of settings and of commands, as Markdown, from the settings' fields and the commands' parsers."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import pydantic
+
+from actors.cli import ActorOptions
+from common.bounds import MAX_INTEGER
+from common.process.flags import Flag, sections
+from common.settings.config import RunConfig
+from common.settings.methods import METHODS, table_of
+from common.settings.options import RunOptions, with_methods
+from common.settings.tables import load_tables, preset_names, resolve
+from deploy.local import LocalOptions
+from deploy.watch import WatchOptions
+from experiments.evaluation_cli import EvalOptions
+from experiments.export_cli import ExportOptions
+from experiments.reexecute_cli import ReexecuteOptions
+from experiments.report.cli import ReportOptions
+from experiments.sweep.cli import SweepOptions
+from learner.cli import LearnerOptions
+from replay.cli import ReplayOptions
+from replay.limits_cli import LimitsOptions
+
+COMMANDS: dict[str, type[Any]] = {
+    "coop-local": LocalOptions,
+    "coop-learner": LearnerOptions,
+    "coop-replay": ReplayOptions,
+    "coop-limits": LimitsOptions,
+    "coop-actor": ActorOptions,
+    "coop-lockstep": RunOptions,
+    "coop-reexecute": ReexecuteOptions,
+    "coop-sweep": SweepOptions,
+    "coop-eval": EvalOptions,
+    "coop-export": ExportOptions,
+    "coop-watch": WatchOptions,
+    "coop-report": ReportOptions,
+}
+
+
+def settings_reference() -> str:
+    """A table for each section of a run's settings: field, allowed values, default and meaning."""
+    schemas = _schemas()
+    parts = []
+    for part in filter(lambda part: part.flags, sections(with_methods(RunOptions))):
+        section = part.name.replace("-", "_")
+        known = {field_name(flag): flag for flag in part.flags if _last(field_name(flag)) in schemas[section]}
+        rows = [
+            (f"`{name}`", _allowed(flag, schemas[section][_last(name)]), _default(flag, "`true`", "`false`"), flag.text)
+            for name, flag in known.items()
+        ]
+        title = f"### `[{section}]`\n\n{part.text}" if section else "### The run"
+        parts.append(f"{title}\n\n" + _table(("field", "allowed", "default", "meaning"), rows))
+    return "\n".join(parts)
+
+
+def presets_reference() -> str:
+    """A table of the presets: what they play, their steps, and the size of their buffer."""
+    configs = {name: resolve(load_tables(name, None)) for name in preset_names()}
+    rows = [
+        (f"`{name}`", f"`{config.env.id}`", f"{config.total_steps:,}", f"{config.replay.capacity:,}")
+        for name, config in configs.items()
+    ]
+    return _table(("preset", "environment", "steps", "buffer"), rows)
+
+
+def commands_reference() -> str:
+    """A table for each command: flag, default and meaning. The settings of a run are in the reference of settings."""
+    settings = {flag.name for part in sections(RunConfig) for flag in part.flags}
+    parts = []
+    for command, kind in COMMANDS.items():
+        run = issubclass(kind, RunOptions)
+        flags = [flag for part in sections(kind) for flag in part.flags if not (run and flag.name in settings)]
+        also = "Every setting of a run is a flag as well: [configuration](configuration.md).\n\n" if run else ""
+        rows = [(_form(flag), _default(flag), flag.text) for flag in flags]
+        parts.append(f"### `{command}`\n\n{also}" + _table(("flag", "default", "meaning"), rows))
+    return "\n".join(parts)
+
+
+def field_name(flag: Flag) -> str:
+    """The field of a flag, as a TOML file has it: "learner.swap_every"."""
+    return flag.name.removeprefix("--").replace("-", "_")
+
+
+def _last(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def _schemas() -> dict[str, Mapping[str, Any]]:
+    """JSON schemas of the settings' fields, by section and field; those of the run itself are in section ""."""
+    whole = pydantic.TypeAdapter(RunConfig).json_schema()
+    found: dict[str, Mapping[str, Any]] = {"": {}}
+    for name, schema in whole["properties"].items():
+        if "$ref" in schema:
+            found[name] = whole["$defs"][schema["$ref"].rpartition("/")[2]]["properties"]
+        elif name not in ("own", "methods"):
+            found[""] = {**found[""], name: schema}
+    for method in map(METHODS.get, METHODS.names()):
+        if method.settings is not None:
+            found[table_of(method.name)] = pydantic.TypeAdapter(method.settings).json_schema()["properties"]
+    return found
+
+
+def _allowed(flag: Flag, schema: Mapping[str, Any]) -> str:
+    if flag.choices:
+        return ", ".join(f"`{choice}`" for choice in flag.choices)
+    options = [option for option in schema.get("anyOf", [schema]) if option.get("type") != "null"]
+    return " or ".join(map(_kind, options))
+
+
+def _kind(schema: Mapping[str, Any]) -> str:
+    """What a JSON schema allows, in a few words."""
+    match schema["type"]:
+        case "boolean":
+            return "`true`, `false`"
+        case "array":
+            items = schema.get("items") or schema["prefixItems"][0]
+            count = f"{schema['minItems']} of: " if schema.get("minItems") else "list of: "
+            return count + _kind(items)
+        case "object":
+            return "table"
+        case "string":
+            return "text"
+        case kind:
+            return " ".join([kind, *_bounds(schema)])
+
+
+def _bounds(schema: Mapping[str, Any]) -> Iterator[str]:
+    words = {"exclusiveMinimum": "above", "minimum": "from", "exclusiveMaximum": "below", "maximum": "to"}
+    for key, word in words.items():
+        bound = schema.get(key, MAX_INTEGER)
+        if bound != MAX_INTEGER:  # which only says that a message can hold it
+            yield f"{word} {bound:,}" if isinstance(bound, int) else f"{word} {bound:g}"
+
+
+def _form(flag: Flag) -> str:
+    """A flag as the help shows it, with the placeholder of its value."""
+    value = "NAME" if len(flag.choices) > 4 else "" if flag.value == flag.name else flag.value
+    names = [f"`{flag.name} {value}`".replace(" `", "`"), *([f"`{flag.negative}`"] if flag.negative else [])]
+    return ", ".join(names)
+
+
+def _default(flag: Flag, on: str = "on", off: str = "off") -> str:
+    if flag.required:
+        return "required"
+    if flag.negative:
+        return on if flag.default else off
+    return f"`{flag.default}`" if flag.default else "-"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join("| " + " | ".join(_cell(cell) for cell in line) + " |\n" for line in lines)
+
+
+def _cell(text: str) -> str:
+    """Text for a cell of a table; what Markdown would read as HTML or as a border is escaped."""
+    safe = text if text.startswith("`") else html.escape(text, quote=False)
+    return safe.replace("|", "\\|")
