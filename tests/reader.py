@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
+import yaml
 from commands import Command, run_command
 
 from common.process.processes import free_endpoint
@@ -59,6 +60,8 @@ class Reader:
             (self.folder / file[1]).write_text(block.text, encoding="utf-8")
         if block.language == "toml":
             _check(tomllib.loads(block.text), block)
+        elif block.language == "yaml":
+            assert yaml.safe_load(block.text)
         elif block.language == "bash":
             added = shlex.split(block.note.removeprefix(ADDED)) if block.note.startswith(ADDED) else []
             for line in block.text.replace("\\\n", "").splitlines():

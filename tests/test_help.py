@@ -14,39 +14,13 @@ from typing import Any, get_type_hints
 
 import pytest
 
-from actors.cli import ActorOptions
 from common.process.cli import PACKAGE
 from common.process.help import EXIT_STATUSES
 from common.settings.methods import METHODS
 from common.settings.options import COMMON, RunOptions, parse_run
-from deploy.local import LocalOptions
-from deploy.router import RouterOptions
-from deploy.watch import WatchOptions
-from experiments.evaluation_cli import EvalOptions
-from experiments.export_cli import ExportOptions
-from experiments.reexecute_cli import ReexecuteOptions
-from experiments.report.cli import ReportOptions
-from experiments.sweep.cli import SweepOptions
-from learner.cli import LearnerOptions
-from replay.cli import ReplayOptions
-from replay.limits_cli import LimitsOptions
+from website.reference import COMMANDS as OPTIONS
 
 ROOT = Path(__file__).parents[1]
-OPTIONS: dict[str, type[Any]] = {
-    "coop-local": LocalOptions,
-    "coop-learner": LearnerOptions,
-    "coop-replay": ReplayOptions,
-    "coop-limits": LimitsOptions,
-    "coop-actor": ActorOptions,
-    "coop-router": RouterOptions,
-    "coop-lockstep": RunOptions,
-    "coop-reexecute": ReexecuteOptions,
-    "coop-sweep": SweepOptions,
-    "coop-eval": EvalOptions,
-    "coop-export": ExportOptions,
-    "coop-watch": WatchOptions,
-    "coop-report": ReportOptions,
-}
 RUNS = [name for name, kind in OPTIONS.items() if issubclass(kind, RunOptions)]
 ASK = """
 import io, json, sys

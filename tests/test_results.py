@@ -1,4 +1,4 @@
-"""The numbers on the pages of results/ are those of the committed studies: results/claims.toml ties them together."""
+"""The numbers on the pages of results/, and on two others, are those of the committed studies: results/claims.toml ties them together."""
 
 import re
 import tomllib
@@ -15,7 +15,10 @@ from experiments.report.study import Study, load_study
 
 RESULTS = Path(__file__).parent.parent / "results"
 CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]
-PAGES = {page: " ".join((RESULTS / page).read_text().split()) for page in ("README.md", "cartpole/README.md")}
+PAGES = {
+    page: " ".join((RESULTS / page).read_text().split())
+    for page in ("README.md", "cartpole/README.md", "../README.md", "../docs/cartpole.md")
+}
 TABLES = {
     "table1": results.paper_table,
     "settings": results.settings_table,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LANGUAGES = ("bash", "python", "toml", "text")
+LANGUAGES = ("bash", "python", "toml", "yaml", "text")
 NOT_RUN = "not run: "
 # A fence, its language and its lines; a comment above it is for the tests.
 _FENCE = re.compile(r"^(?:<!-- (?P<note>.*) -->\n)?```(?P<language>.*)\n(?P<text>(?:.*\n)*?)```$", re.MULTILINE)
@@ -41,7 +41,7 @@ class Block:
 
 def page_names() -> list[str]:
     """The pages, as paths below the repository's root."""
-    folders = ("*.md", "docs/*.md", "results/*.md", "results/minatar/*.md")
+    folders = ("*.md", "docs/*.md", "results/*.md", "results/*/README.md", "results/minatar/*.md")
     return [path.relative_to(ROOT).as_posix() for folder in folders for path in sorted(ROOT.glob(folder))]
 
 

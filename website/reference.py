@@ -16,6 +16,7 @@ from common.settings.methods import METHODS, table_of
 from common.settings.options import RunOptions, with_methods
 from common.settings.tables import load_tables, preset_names, resolve
 from deploy.local import LocalOptions
+from deploy.router import RouterOptions
 from deploy.watch import WatchOptions
 from experiments.evaluation_cli import EvalOptions
 from experiments.export_cli import ExportOptions
@@ -32,6 +33,7 @@ COMMANDS: dict[str, type[Any]] = {
     "coop-replay": ReplayOptions,
     "coop-limits": LimitsOptions,
     "coop-actor": ActorOptions,
+    "coop-router": RouterOptions,
     "coop-lockstep": RunOptions,
     "coop-reexecute": ReexecuteOptions,
     "coop-sweep": SweepOptions,

@@ -1,0 +1,88 @@
+"""The source of the site: references of settings and flags, lines of quoted code, pictures, and the nav."""
+
+import dataclasses
+import inspect
+import re
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+import yaml
+
+import coop
+from common.process.cli import PACKAGE
+from common.settings.config import RunConfig
+from website import pages, pictures, places, reference
+from website.assemble import assembled
+
+API = pages.read("docs/api.md")
+
+
+def test_every_setting_is_in_the_reference() -> None:
+    table = reference.settings_reference()
+    expected = []
+    for field in dataclasses.fields(RunConfig):
+        inner = getattr(RunConfig(), field.name)
+        if dataclasses.is_dataclass(inner):
+            expected += [f"{field.name}.{each.name}" for each in dataclasses.fields(inner)]
+        elif field.name not in ("own", "methods"):
+            expected.append(field.name)
+    assert len(expected) > 70
+    assert not [name for name in (*expected, "medqn.epochs", "stream_q.step_size") if f"| `{name}` | " not in table]
+    assert "| `replay.n_step` | integer above 0 to 100 | `1` | Rewards that a transition sums" in table
+    assert "| `replay.eviction` | `fifo`, `reservoir`, `prioritized` | `fifo` |" in table
+    assert "| `learner.double` | `true`, `false` | `false` |" in table
+
+
+def test_every_command_and_preset_is_in_the_reference() -> None:
+    points = entry_points(group="console_scripts")
+    assert {point.name for point in points if point.dist and point.dist.name == PACKAGE} == set(reference.COMMANDS)
+    table = reference.commands_reference()
+    assert not [name for name in reference.COMMANDS if f"### `{name}`" not in table]
+    assert "| `--join-timeout FLOAT` | `30.0` | Seconds to search for the learner before giving up. |" in table
+    assert "--replay.capacity" not in table
+    assert "| `pong-small` | `pong` | 1,000,000 | 10,000 |" in reference.presets_reference()
+
+
+@pytest.mark.parametrize("page", [page for page in pages.page_names() if places.quotes(pages.read(page))])
+def test_quoted_lines_are_in_the_code(page: str) -> None:
+    for file, code in places.quotes(pages.read(page)):
+        line = places.line_of(file, code)
+        assert f"`{file}`, line {line}: `{code}`" in assembled(page)
+        assert code in (pages.ROOT / file).read_text(encoding="utf-8").splitlines()[line - 1]
+
+
+def test_a_quote_that_is_nowhere_or_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"learner/agent\.py: 0 lines, not one, hold `acting = 2`"):
+        places.with_lines("`learner/agent.py`: `acting = 2`")
+    with pytest.raises(ValueError, match="lines, not one, hold `return`"):
+        places.with_lines("`learner/agent.py`: `return`")
+
+
+def test_generated_parts_are_filled_in() -> None:
+    assert "| `replay.capacity` | " in assembled("docs/configuration.md")
+    assert "### `coop-watch`" in assembled("docs/commands.md")
+    assert not [page for page in pages.page_names() if "<!-- generated" in assembled(page)]
+
+
+@pytest.mark.parametrize("name", pictures.PICTURES)
+def test_the_pictures_show_the_committed_data(name: str, tmp_path: Path) -> None:
+    assert pictures.draw(name, tmp_path).read_text() == (pictures.FOLDER / f"{name}.svg").read_text()
+
+
+def test_every_page_is_in_the_nav() -> None:
+    nav = yaml.safe_load((pages.ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
+    assert sorted(re.findall(r"[\w/-]+\.md", str(nav))) == sorted(pages.page_names())
+
+
+def test_every_public_name_is_documented() -> None:
+    assert "::: coop\n" in API
+    for name in coop.__all__:
+        value = getattr(coop, name)
+        members = [member for key, member in vars(value).items() if not key.startswith("_") and callable(member)]
+        undocumented = [each for each in (value, *(members if inspect.isclass(value) else [])) if not each.__doc__]
+        assert not undocumented, name
+    for name in re.findall(r"^::: ([\w.]+)$", API, re.MULTILINE):
+        module, _, last = name.rpartition(".")
+        found = inspect.importlib.import_module(name if last.islower() else module)  # type: ignore[attr-defined]
+        assert (found if last.islower() else getattr(found, last)).__doc__, name
