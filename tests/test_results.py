@@ -1,4 +1,4 @@
-"""The numbers on the pages of results/, and on two others, are those of the committed studies: results/claims.toml ties them together."""
+"""The numbers on pages of results, docs and the README are those of the studies: results/claims.toml ties them together."""
 
 import re
 import tomllib
