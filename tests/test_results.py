@@ -1,4 +1,4 @@
-"""The numbers on pages of results, docs and the README are those of the studies: results/claims.toml ties them together."""
+"""The numbers on pages of results, docs and the README are those of the studies: results/claims.toml ties them."""
 
 import re
 import tomllib
