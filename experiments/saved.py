@@ -47,7 +47,10 @@ class Checkpoint:
 class SavedPolicy:
     """A greedy policy: the mean of the Q-values of one or two networks, and the action at which it is largest.
 
-    env: settings of the environment that the networks were trained in. spec: what the networks need to know of it.
+    Attributes:
+        env: settings of the environment that the networks were trained in.
+        spec: what the networks need to know of it.
+        networks: one or two.
     """
 
     env: EnvSettings

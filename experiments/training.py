@@ -32,7 +32,9 @@ GRACE = 90.0  # seconds for a topology's clean stop
 class TrainingRun:
     """A run in the background. When the interpreter ends normally, it waits for the run; otherwise the run is stopped.
 
-    directory: the run directory. config: of the run.
+    Attributes:
+        directory: the run directory.
+        config: of the run.
     """
 
     def __init__(self, config: RunConfig, directory: Path, work: Callable[[Stop], None]) -> None:

@@ -14,19 +14,21 @@ from common.settings.conditions import Condition
 class Method:
     """One training method.
 
-    name: as `--method` has it. summary: what it is, in a few words.
-    two_networks: two independent networks, each of which gives the other's targets; their roles swap every C updates.
-        If False, the second network is a copy of the first, made every C updates, and gives the targets.
-    error_driven: error-driven learning feeds the error back; if False, the ordinary gradient does.
-    rule: of the targets and the extra cost: a `learner.methods.rule.Rule`, or "module:Class" to import it in the
-        learner only.
-    network: makes the Q-network, with the arguments and result of `common.networks.network.build_network`;
-        "module:function" to import it where networks are made.
-    stream: for a method without a replay buffer, its agent, a class like `learner.methods.stream_q:StreamAgent`, or
-        "module:Class"; such a method runs in lockstep only. None: updates with batches from a replay table.
-    settings: a frozen dataclass of the method's own settings, which a config holds in the table `Method.table`.
-    conditions: on which these settings have an effect.
-    colour: in figures; None: the next one that is free.
+    Attributes:
+        name: as `--method` has it.
+        summary: what it is, in a few words.
+        two_networks: two independent networks, each of which gives the other's targets; their roles swap every C
+            updates. If False, the second network is a copy of the first, made every C updates, and gives the targets.
+        error_driven: error-driven learning feeds the error back; if False, the ordinary gradient does.
+        rule: of the targets and the extra cost: a `learner.methods.rule.Rule`, or "module:Class" to import it in the
+            learner only.
+        network: makes the Q-network, with the arguments and result of `common.networks.network.build_network`;
+            "module:function" to import it where networks are made.
+        stream: for a method without a replay buffer, its agent, a class like `learner.methods.stream_q:StreamAgent`,
+            or "module:Class"; such a method runs in lockstep only. None: updates with batches from a replay table.
+        settings: a frozen dataclass of the method's own settings, which a config holds in the table `Method.table`.
+        conditions: on which these settings have an effect.
+        colour: in figures; None: the next one that is free.
     """
 
     name: str

@@ -13,10 +13,11 @@ from common.registry import Registry
 class Policy:
     """A policy of a replay table.
 
-    name: as the setting has it.
-    make: its class, a function of a `replay.table.policies.TableView`, or "module:Class" to import it in the replay
-        service only.
-    priorities: it uses the priorities of transitions, which the learner then sends.
+    Attributes:
+        name: as the setting has it.
+        make: its class, a function of a `replay.table.policies.TableView`, or "module:Class" to import it in the
+            replay service only.
+        priorities: it uses the priorities of transitions, which the learner then sends.
     """
 
     name: str
@@ -28,7 +29,8 @@ class Policy:
 class EvictionPolicy(Policy):
     """Chooses the transitions that a full table evicts.
 
-    in_order: transition i is always stored in row i modulo the capacity.
+    Attributes:
+        in_order: transition i is always stored in row i modulo the capacity.
     """
 
     in_order: bool = False
@@ -38,7 +40,8 @@ class EvictionPolicy(Policy):
 class SamplingPolicy(Policy):
     """Draws batches.
 
-    without_replacement: it can draw a batch that holds no transition twice.
+    Attributes:
+        without_replacement: it can draw a batch that holds no transition twice.
     """
 
     without_replacement: bool = False

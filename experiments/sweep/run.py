@@ -25,8 +25,11 @@ TICK = 0.2  # seconds
 class SweepResult:
     """The outcome of a sweep.
 
-    folder: of its runs, which `coop-report` reads. runs: a row for each cell that has ended, by the cell's name: the
-    fields that the grid varies, then those of summary.json. failed: why a cell could not be run, by its name.
+    Attributes:
+        folder: of its runs, which `coop-report` reads.
+        runs: a row for each cell that has ended, by the cell's name: the fields that the grid varies, then those of
+            summary.json.
+        failed: why a cell could not be run, by its name.
     """
 
     folder: Path
@@ -46,7 +49,8 @@ def sweep(
     Args:
         grid: name of a grid that comes with the package, path of a TOML file, or the contents of one.
         folder: of the sweep; runs/sweeps/GRID if not given.
-        jobs: cells to run concurrently; the number of cores if None. quick: use the grid's small version.
+        jobs: cells to run concurrently; the number of cores if None.
+        quick: use the grid's small version.
 
     Raises:
         UsageError: the grid or a setting is invalid, or the folder holds other runs.

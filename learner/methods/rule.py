@@ -16,7 +16,8 @@ class Rule:
     """What a method changes in the update; this one, of the paper's four methods, changes nothing.
 
     Attributes:
-        config: of the run. rng: the agent's generator, whose state it saves.
+        config: of the run.
+        rng: the agent's generator, whose state it saves.
         passes: steps of the optimizer that one update makes with its batch.
     """
 

@@ -26,11 +26,16 @@ class TableView:
     A policy takes its random numbers from `rng` and keeps nothing that it could not compute from these arrays: then a
     restored table goes on as the saved one would have.
 
-    rng: the table's generator, a part of its state.
-    ids: int64 [capacity], the number of each transition in order of insertion. reuse: int32 [capacity], how often it
-        has been drawn. rewards: float32 [capacity]. terminated: bool [capacity].
-    priorities: float64 [capacity], empty if no policy of the table uses them.
-    priority_exponent, importance_exponent, replacement: settings of sampling.
+    Attributes:
+        rng: the table's generator, a part of its state.
+        ids: int64 [capacity], the number of each transition in order of insertion.
+        reuse: int32 [capacity], how often it has been drawn.
+        rewards: float32 [capacity].
+        terminated: bool [capacity].
+        priorities: float64 [capacity], empty if no policy of the table uses them.
+        priority_exponent: alpha of prioritized sampling.
+        importance_exponent: beta of prioritized sampling.
+        replacement: whether a batch may hold a transition twice.
     """
 
     rng: np.random.Generator
