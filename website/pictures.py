@@ -22,10 +22,6 @@ STUDIES = ROOT / "results" / "cartpole"
 FOLDER = ROOT / "docs" / "pictures"
 WINDOW = 20  # episodes of a running mean
 EVICTIONS = {"fifo": "the oldest leaves", "reservoir": "a random one leaves", "prioritized": "the least error leaves"}
-_STYLE = {
-    "svg.fonttype": "none", "svg.hashsalt": "coop", "path.simplify_threshold": 0.5, "font.size": 9,
-    "axes.spines.top": False, "axes.spines.right": False,
-}  # fmt: skip
 
 
 def run_picture() -> Figure:
@@ -77,7 +73,16 @@ def draw(name: str, folder: Path) -> Path:
     """Write a picture as SVG, whose bytes depend on the data and the version of matplotlib only."""
     mpl.use("Agg")
     path = folder / f"{name}.svg"
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(
+        {
+            "svg.fonttype": "none",
+            "svg.hashsalt": "coop",
+            "path.simplify_threshold": 0.5,
+            "font.size": 9,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+        }
+    ):
         canvas = PICTURES[name]()
         canvas.savefig(path, metadata={"Date": None})
         plt.close(canvas)
