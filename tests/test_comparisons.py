@@ -9,10 +9,11 @@ import pytest
 
 from common.errors import RunError
 from common.settings.tables import resolve
+from experiments.report.answer import answer
 from experiments.report.comparisons import common_breaking_table, interaction_table, learning_table, sizes_table
 from experiments.report.learning import area, course, end_of_running_mean, over_seeds, reward_threshold
 from experiments.report.page import page
-from experiments.report.results import runs_table, settings_table
+from experiments.report.results import runs_table, settings_table, tables
 from experiments.report.study import Run, load_study
 
 METHODS, SEEDS, CAPACITIES = ("dqn", "coop"), (0, 1, 2), (500, 600, 5000)
@@ -71,6 +72,10 @@ def score_of(method: str, seed: int, capacity: int) -> float:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    return write_runs(tmp_path)
+
+
+def write_runs(tmp_path: Path) -> Path:
     """Three capacities, two methods, three seeds, each run with one return throughout; one more run has diverged."""
     for method in METHODS:
         for seed in SEEDS:
@@ -114,7 +119,7 @@ def test_a_diverged_run_is_counted_and_averaged_nowhere(folder: Path) -> None:
     assert (row["diverged"], row["runs"], row["area"], row["seeds"]) == (1, 3, pytest.approx(101.0), "0-2")
     (row, *_) = settings_table(study).rows
     assert row[:3] == ["dqn", 500, pytest.approx(101.0)]
-    text = page(study, folder, [], [], [])
+    text = page(study, folder, answer(study, tables(study)), [], [], [])
     assert "18 of 19 runs finished, 1 diverged: " in text
     assert "<li>dqn-500-9: diverged: TD errors are not finite at update 2</li>" in text
     assert "dqn-500-9" not in {row[0] for row in runs_table(study).rows}

@@ -22,6 +22,8 @@ class ReportOptions:
     """A sweep's folder, any folder of run directories, or a file made with --pack."""
     out: Path | None = None
     """Folder of the report; RUNS/report if not given, without the suffix if RUNS is a file."""
+    baseline: str | None = None
+    """Report the differences from this method, or from the method and setting of this run, over the same seeds."""
     pack: Path | None = None
     """Instead of a report: write the folder's runs into this Parquet file."""
     curves: Path | None = None
@@ -57,5 +59,5 @@ def _run() -> None:
         from experiments.report.writer import write_report  # noqa: PLC0415
 
         beside = runs if runs.is_dir() else runs.with_suffix("")
-        index, tables = write_report(runs, options.out or beside / "report")
-        print(tables[0].markdown(), index, sep="\n")
+        index, told = write_report(runs, options.out or beside / "report", options.baseline)
+        print(*told, index, sep="\n")

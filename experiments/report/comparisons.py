@@ -24,6 +24,7 @@ from experiments.report.study import Run, Setting, Study
 from experiments.report.table import ResultTable, Value, plain
 
 MEASURES = {"return of the last 100": score, "area": area}
+BOUNDS = ("low", "high")
 LATER = "These measures were chosen after the data of the studies of CartPole had been seen."
 
 
@@ -67,7 +68,8 @@ def learning_table(study: Study) -> ResultTable:
         "the squared difference of the two mean Q-values over the last 100 episodes. diverged: runs that count nowhere "
         f"else. {LATER}"
     )
-    return ResultTable("learning", "The course of learning", columns, rows, note)
+    beside = {"area": ["sd over runs"], "running mean": ["sd of running mean"]}
+    return ResultTable("learning", "The course of learning", columns, rows, note, beside)
 
 
 def paired_table(study: Study) -> ResultTable:
@@ -83,7 +85,7 @@ def paired_table(study: Study) -> ResultTable:
                 rows.append([name, where, x, y, *estimate, len(apart)])
     columns = ["measure", "setting", "x", "y", "x - y", "low", "high", "seeds"]
     note = f"Mean over seeds that both methods have, 95 % bootstrap interval over seeds. {LATER}"
-    return ResultTable("paired", "Differences over the same seeds", columns, rows, note)
+    return ResultTable("paired", "Differences over the same seeds", columns, rows, note, {"x - y": BOUNDS})
 
 
 def sizes_table(study: Study) -> ResultTable:
@@ -97,7 +99,8 @@ def sizes_table(study: Study) -> ResultTable:
             low, high = whole[small].mean(axis="columns"), whole[large].mean(axis="columns")
             rows.append([_words(study, others), method, low.mean(), high.mean(), *over_seeds(high - low), len(whole)])
     columns = ["setting", "method", "small", "large", "large - small", "low", "high", "seeds"]
-    return ResultTable("sizes", "Small against large buffers", columns, rows, _sizes_note(study))
+    beside = {"large - small": BOUNDS}
+    return ResultTable("sizes", "Small against large buffers", columns, rows, _sizes_note(study), beside)
 
 
 def interaction_table(study: Study) -> ResultTable:
@@ -113,7 +116,8 @@ def interaction_table(study: Study) -> ResultTable:
                 where = _words(study, others)
                 rows.append([name, where, x, y, low.mean(), high.mean(), *over_seeds(low - high), len(apart)])
     columns = ["measure", "setting", "x", "y", "x - y, small", "x - y, large", "interaction", "low", "high", "seeds"]
-    return ResultTable("interaction", "Size and method", columns, rows, _sizes_note(study))
+    beside = {"interaction": BOUNDS}
+    return ResultTable("interaction", "Size and method", columns, rows, _sizes_note(study), beside)
 
 
 def common_breaking_table(study: Study) -> ResultTable:
@@ -133,7 +137,8 @@ def common_breaking_table(study: Study) -> ResultTable:
         f"capacity; 95 % bootstrap interval over runs. Empty: at none. {LATER}"
     )
     columns = [*names, "method", "best return", "breaking point", "low", "high"]
-    return ResultTable("common_breaking", "Breaking points against one threshold", columns, rows, note)
+    beside = {"breaking point": BOUNDS}
+    return ResultTable("common_breaking", "Breaking points against one threshold", columns, rows, note, beside)
 
 
 def _course(runs: Sequence[Run]) -> list[Value]:

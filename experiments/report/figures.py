@@ -15,21 +15,19 @@ from experiments.report.measures import (
     by_steps,
     diagnostic,
     diagnostics_of,
-    improvement,
     iqm_by_task,
-    iqm_overall,
     metrics_by_steps,
-    profiles,
     q_gaps,
     rows_with,
 )
 from experiments.report.plots import Figure, Line, Panel
-from experiments.report.slices import CAPACITY, along, counts, label, matrices, other_settings, pairs
+from experiments.report.slices import CAPACITY, along, counts, label, other_settings
 from experiments.report.study import Floats, Run, Setting, Study
+from experiments.report.summaries import MOST_TICKS, aggregates, final_returns
 
 RATE = "edl.rate"
 MOST_PANELS = 9
-RETURN = "return, mean of the last 100 episodes"
+RETURN = "mean return of 100 episodes"
 BANDS = " Interquartile mean over runs, band: 95 % bootstrap interval (none for a single run)."
 NETWORKS = {
     "archive_td_error": "|TD error| on old transitions",
@@ -49,18 +47,25 @@ Curve = Callable[[Sequence[Run]], tuple[Floats, Floats]]
 
 
 def figures(study: Study) -> tuple[list[Figure], list[str]]:
-    """All figures for which there are runs, and a line for each figure that cannot be shown, with the reason."""
-    made = [returns_by_episodes(study), returns_by_steps(study), exploration(study), q_gap(study)]
-    lacking = []
+    """All figures for which there are runs, and a line for each that cannot be shown, with the reason.
+
+    The first one shows what the study has found.
+    """
+    ends, lacking = [], []
+    if len(study.settings) <= MOST_TICKS:
+        ends.append(final_returns(study))
+    else:
+        lacking.append(f"Return at every setting: {len(study.settings)} settings are too many; the table has them all.")
     if study.index(CAPACITY) is None:
         lacking.append(f"Return against buffer size, breaking points: {CAPACITY} is the same in all finished runs.")
     else:
-        made += [buffers(study), diagnostics(study)]
-    made += networks(study)
+        ends = [buffers(study), *ends, diagnostics(study)]
+    made = [*ends, returns_by_steps(study), returns_by_episodes(study)]
     if len(study.environments) > 1:
         lacking.append(f"Aggregates over settings: returns of {', '.join(study.environments)} have different scales.")
     else:
         made += aggregates(study)
+    made += [exploration(study), q_gap(study), *networks(study)]
     lacking += [f"{figure.title}: no run has the data for it." for figure in made if not _has_lines(figure)]
     return [figure for figure in made if _has_lines(figure)], lacking
 
@@ -165,41 +170,6 @@ def networks(study: Study) -> list[Figure]:
         panels = _against_capacity(study, names, others)
         made.append(Figure("networks_buffers", title, text, counts(study.runs), panels))
     return [figure for figure in made if _has_lines(figure)]
-
-
-def aggregates(study: Study) -> list[Figure]:
-    """Interquartile means, probabilities of improvement and performance profiles over all shared settings."""
-    scores = matrices(study)
-    shapes = {name: (*matrix.shape, matrix.size) for name, matrix in scores.items()}
-    seeds = "; ".join(f"{name}: {n} runs (seeds x settings: {s} x {t})" for name, (s, t, n) in shapes.items())
-    means = [
-        Line(name, np.array([float(place)]), iqm_overall(matrix)) for place, (name, matrix) in enumerate(scores.items())
-    ]
-    better = [
-        Line(f"{x} > {y}", np.array([float(place)]), improvement(scores[x], scores[y]))
-        for place, (x, y) in enumerate(pairs(list(scores)))
-    ]
-    every = np.concatenate([matrix.ravel() for matrix in scores.values()]) if scores else np.zeros(1)
-    levels = np.linspace(every.min() - 1e-9, every.max(), 61)
-    shares = [Line(name, levels, interval) for name, interval in profiles(scores, levels).items()] if scores else []
-    interval = " over the settings that all methods share; 95 % stratified bootstrap intervals by rliable."
-    names = [line.label for line in better]
-    return [
-        Figure(
-            "iqm", "Interquartile mean of the return", f"Interquartile mean{interval}", seeds,
-            [Panel("", "", "return", means, marks=True, ticks=list(scores))] if means else [],
-        ),
-        Figure(
-            "improvement", "Probability of improvement",
-            f"Probability that a run of the first returns more than one of the second{interval} 0.5: no difference.",
-            seeds,
-            [Panel("", "", "P(x > y)", better, True, share=True, ticks=names)] if better else [],
-        ),
-        Figure(
-            "profiles", "Performance profiles", f"Share of runs whose return is above a level{interval}", seeds,
-            [Panel("", "return", "share of runs above", shares, share=True)] if shares else [],
-        ),
-    ]  # fmt: skip
 
 
 def _against_capacity(study: Study, names: Mapping[str, str], settings: Sequence[Setting]) -> list[Panel]:

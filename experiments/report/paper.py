@@ -10,7 +10,6 @@ TABLE_1: dict[str, dict[str, tuple[float, float]]] = {
     "spaceinvaders": {"dqn": (1139, 158), "edql": (980, 163), "g-coop": (1174, 163), "coop": (1144, 121)},
     "pong": {"dqn": (18.9, 2.12), "edql": (19.11, 1.88), "g-coop": (18.91, 1.32), "coop": (19.15, 2.1)},
 }  # fmt: skip
-PAPER_METHODS = tuple(TABLE_1["cartpole"])
 
 
 def table_1(env_id: str) -> dict[str, tuple[float, float]]:

@@ -1,4 +1,4 @@
-"""Figures as data, and how they are drawn: panels of lines, with seeds and run counts below."""
+"""Figures as data, and how they are drawn: panels of lines, as they are printed in a paper."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from common.settings.methods import METHODS
 from experiments.report.measures import Interval
@@ -20,18 +24,30 @@ from experiments.report.table import ResultTable, Value
 # For lines that are no methods, and for methods without a colour of their own.
 OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
 COLUMNS = 3  # of panels
+WIDTH = 7.2  # inches, of a page's text; a single panel has two thirds of it
+HEIGHT = 1.9  # inches, of a panel
+TICK = 0.24  # inches, of a label on the y axis
 DECADE = 10
-LETTERS = 14  # of small print per inch
+STYLE: dict[Any, Any] = {
+    "font.size": 8, "axes.titlesize": 8, "axes.labelsize": 8, "xtick.labelsize": 7, "ytick.labelsize": 7,
+    "legend.fontsize": 8, "legend.frameon": False, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "grid.alpha": 0.3, "grid.linewidth": 0.5, "axes.linewidth": 0.6, "lines.linewidth": 1.2,
+    "lines.markersize": 3.5, "pdf.fonttype": 42,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Line:
-    """Points with their intervals; x and each y are float64 [n]. An interval of nan only is not drawn."""
+    """Points with their intervals; x and each y are float64 [n]. An interval of nan only is not drawn.
+
+    faint: small dots without a line, of single runs.
+    """
 
     label: str
     x: Floats
     y: Interval
     dashed: bool = False
+    faint: bool = False
 
 
 @dataclass(frozen=True)
@@ -39,7 +55,8 @@ class Panel:
     """One pair of axes.
 
     marks: draw markers and error bars instead of bands. share: y ranges from 0 to 1. wide_x: use a logarithmic x axis
-    if the numbers span more than a decade. ticks: labels of the positions 0, 1, ... on x.
+    if the numbers span more than a decade. ticks: labels of the positions 0, 1, ... of x, which is drawn downwards,
+    and y to the right. reference: a value of y to compare with.
     """
 
     title: str
@@ -51,6 +68,7 @@ class Panel:
     log_y: bool = False
     share: bool = False
     ticks: Sequence[str] = ()
+    reference: float | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +85,16 @@ class Figure:
     panels: Sequence[Panel] = ()
     same_y: bool = False
 
+    @property
+    def columns(self) -> int:
+        """Panels beside each other."""
+        return 2 if len(self.panels) == 4 else min(COLUMNS, len(self.panels))
+
+    @property
+    def width(self) -> float:
+        """Inches on a page as wide as paper's."""
+        return WIDTH if self.columns > 1 else WIDTH * 2 / 3
+
     def points(self) -> ResultTable:
         """All points drawn, as one table."""
         rows: list[list[Value]] = [
@@ -79,48 +107,89 @@ class Figure:
 
 
 def draw(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG; the same data give the same bytes."""
+    """Write a figure as a PNG, and beside it as a PDF; the same data give the same bytes."""
     mpl.use("Agg")
-    columns = min(COLUMNS, len(figure.panels))
-    rows = math.ceil(len(figure.panels) / columns)
-    size = (max(6.4, 4.4 * columns), 3.4 * rows + 0.9)
-    canvas, grid = plt.subplots(rows, columns, squeeze=False, figsize=size, layout="constrained", sharey=figure.same_y)
-    colours: dict[str, str] = {}
-    for axes, panel in zip(grid.flat, figure.panels, strict=False):
-        _draw_panel(axes, panel, colours)
-    for axes in grid.flat[len(figure.panels) :]:
-        axes.axis("off")
-    canvas.suptitle(figure.title)
-    below = textwrap.fill(figure.counts, round(LETTERS * size[0]))
-    canvas.supxlabel(below, fontsize="small", color="#555555")
-    canvas.savefig(path, dpi=110, metadata={"Software": None})
-    plt.close(canvas)
+    number, columns = len(figure.panels), figure.columns
+    rows = math.ceil(number / columns)
+    tall = max(HEIGHT, *(0.6 + TICK * len(panel.ticks) for panel in figure.panels))
+    size = (figure.width, tall * rows + 0.4)
+    with mpl.rc_context(STYLE):
+        canvas, grid = plt.subplots(
+            rows, columns, squeeze=False, figsize=size, layout="constrained", sharey=figure.same_y
+        )
+        colours: dict[str, str] = {}
+        handles: dict[str, Line2D] = {}
+        for place, (axes, panel) in enumerate(zip(grid.flat, figure.panels, strict=False)):
+            for line in panel.lines:
+                colour = colours.setdefault(line.label, _colour(line.label, list(colours.values())))
+                _draw_line(axes, panel, line, colour)
+                if not line.faint:
+                    handles.setdefault(line.label, _handle(panel, line, colour))
+            _finish_panel(axes, panel, columns)
+            below = place + columns < number and figure.panels[place + columns].x == panel.x
+            beside = place % columns > 0 and figure.panels[place - 1].y == panel.y
+            _name_axes(axes, panel, x=not below, y=not beside)
+            if panel.ticks and place % columns and panel.ticks == figure.panels[place - 1].ticks:
+                axes.tick_params(labelleft=False)
+        for axes in grid.flat[number:]:
+            axes.axis("off")
+        if len(handles) > 1 and not any(set(panel.ticks) >= handles.keys() for panel in figure.panels):
+            canvas.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=6)
+        canvas.savefig(path, dpi=170, metadata={"Software": None})
+        canvas.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
+        plt.close(canvas)
 
 
-def _draw_panel(axes: Axes, panel: Panel, colours: dict[str, str]) -> None:
-    for line in panel.lines:
-        colour = colours.setdefault(line.label, _colour(line.label, list(colours.values())))
-        value, low, high = line.y
-        if panel.marks:
-            below, above = (value - low).clip(0), (high - value).clip(0)
-            style = "o" if panel.ticks else "o--" if line.dashed else "o-"
-            axes.errorbar(line.x, value, (below, above), fmt=style, capsize=3, color=colour, label=line.label)
+def _draw_line(axes: Axes, panel: Panel, line: Line, colour: str) -> None:
+    value, low, high = line.y
+    if line.faint:
+        axes.plot(value, line.x, "o", color=colour, alpha=0.35, markersize=2.2, markeredgewidth=0)
+    elif panel.marks:
+        bounds = np.nan_to_num(np.stack([(value - low).clip(0), (high - value).clip(0)]))
+        style = "o" if panel.ticks else "o--" if line.dashed else "o-"
+        if panel.ticks:
+            axes.errorbar(value, line.x, xerr=bounds, fmt=style, capsize=2, color=colour, elinewidth=1)
         else:
-            axes.plot(line.x, value, color=colour, label=line.label)
-            axes.fill_between(line.x, low, high, color=colour, alpha=0.2, linewidth=0)
-    axes.set(xlabel=panel.x, ylabel=panel.y, title=panel.title)
-    axes.grid(alpha=0.3)
+            axes.errorbar(line.x, value, yerr=bounds, fmt=style, capsize=2, color=colour, elinewidth=0.8)
+    else:
+        axes.plot(line.x, value, color=colour)
+        axes.fill_between(line.x, low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+def _handle(panel: Panel, line: Line, colour: str) -> Line2D:
+    """A line's sample in the legend."""
+    style: Literal["none", "--", "-"] = "none" if panel.ticks else "--" if line.dashed else "-"
+    return Line2D([], [], color=colour, linestyle=style, marker="o" if panel.marks else "none")
+
+
+def _finish_panel(axes: Axes, panel: Panel, columns: int) -> None:
+    """Set scales, limits, ticks and title."""
+    axes.set_title("\n".join(textwrap.wrap(panel.title, 100 // columns)))
+    axes.xaxis.set_major_locator(MaxNLocator(4 if columns == COLUMNS else 6))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
     if panel.wide_x:
-        _spread_x(axes, panel)
-    if panel.share:
+        _spread_x(axes, panel, columns)
+    if panel.ticks:
+        axes.set_yticks(range(len(panel.ticks)), panel.ticks)
+        axes.set_ylim(len(panel.ticks) - 0.5, -0.5)
+        axes.grid(visible=False, axis="y")
+        if panel.reference is not None:
+            axes.axvline(panel.reference, color="#555555", linewidth=0.8, linestyle="--")
+        if panel.share:
+            axes.set_xlim(-0.03, 1.03)
+    elif panel.share:
         axes.set_ylim(-0.03, 1.03)
     if panel.log_y and all((line.y.value > 0).all() for line in panel.lines):
         axes.set_yscale("log")
-    if panel.ticks:
-        axes.set_xticks(range(len(panel.ticks)), panel.ticks, rotation=20)
-        axes.set_xlim(-0.5, len(panel.ticks) - 0.5)
-    elif panel.lines:
-        axes.legend(fontsize="small")
+
+
+def _name_axes(axes: Axes, panel: Panel, *, x: bool, y: bool) -> None:
+    """Name the axes, except where the panel below or beside bears the same name."""
+    across, up = (panel.y, panel.x) if panel.ticks else (panel.x, panel.y)
+    if x or panel.ticks:
+        axes.set_xlabel(across)
+    if y or panel.ticks:
+        axes.set_ylabel("\n".join(textwrap.wrap(up, 34)))
 
 
 def _colour(label: str, taken: Sequence[str]) -> str:
@@ -129,13 +198,35 @@ def _colour(label: str, taken: Sequence[str]) -> str:
     return own or OTHERS[sum(colour in OTHERS for colour in taken) % len(OTHERS)]
 
 
-def _spread_x(axes: Axes, panel: Panel) -> None:
+def _spread_x(axes: Axes, panel: Panel, columns: int) -> None:
+    """Use a logarithmic axis if it is worth it, with the values themselves as ticks."""
     values = sorted({float(x) for line in panel.lines for x in line.x})
     sizes = [value for value in values if value]
-    if sizes and sizes[-1] >= DECADE * sizes[0]:
-        if len(sizes) == len(values):
-            axes.set_xscale("log")
+    if not sizes or sizes[-1] < DECADE * sizes[0]:
+        return
+    if len(sizes) == len(values):
+        axes.set_xscale("log")
+    else:
+        axes.set_xscale("symlog", linthresh=sizes[0], linscale=0.5)  # 0 has no place on a logarithmic axis
+    axes.set_xticks(values, _labels(axes, values, columns))
+    axes.xaxis.set_minor_locator(NullLocator())
+
+
+def _labels(axes: Axes, values: Sequence[float], columns: int) -> list[str]:
+    """Labels of ticks, of which one that would touch another is empty; the last and then the first ones stay."""
+    scale = axes.transData + axes.transAxes.inverted()
+    letter = 0.005 + 0.02 * columns  # share of the axis
+    labels = list(map(_short, values))
+    kept: list[float] = []
+    for number in (len(values) - 1, *range(len(values) - 1)):
+        place = float(scale.transform((values[number], 1.0))[0])
+        if any(abs(place - other) < letter * (1 + len(labels[number])) / 2 for other in kept):
+            labels[number] = ""
         else:
-            axes.set_xscale("symlog", linthresh=sizes[0], linscale=0.5)  # 0 has no place on a logarithmic axis
-        axes.set_xticks(values, [f"{value:g}" for value in values], rotation=45)
-        axes.minorticks_off()
+            kept.append(place)
+    return labels
+
+
+def _short(value: float) -> str:
+    """A number on an axis: 30k for 30,000."""
+    return f"{value / 1000:g}k" if abs(value) >= 1000 else f"{value:g}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -17,36 +17,40 @@ from experiments.report.measures import (
     score,
     spread,
 )
-from experiments.report.paper import PAPER_METHODS, table_1
+from experiments.report.paper import table_1
 from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
-from experiments.report.study import Floats, Run, Study
+from experiments.report.study import Floats, Run, Setting, Study
 from experiments.report.table import ResultTable, Value, plain
+
+OVER_RUNS = {"mean": ["sd over runs"], "IQM": ["IQM low", "IQM high"]}
 
 
 def tables(study: Study) -> list[ResultTable]:
-    """All tables for which there are runs."""
-    made = [paper_table(study), settings_table(study)]
-    if study.index(CAPACITY) is not None:
-        made.append(breaking_table(study))
+    """All tables for which there are runs, the ones that sum up first."""
+    made = []
     if len(study.environments) == 1:
         made.append(aggregate_table(study))
         if len(study.methods) > 1:
             made.append(improvement_table(study))
-    return [*made, *comparison_tables(study), runs_table(study)]
+    if study.index(CAPACITY) is not None:
+        made.append(breaking_table(study))
+    made.append(settings_table(study))
+    if any(method in table_1(env) for env in study.environments for method in study.methods):
+        made.append(paper_table(study))
+    return [*made, *comparison_tables(study), diagnostics_table(study), runs_table(study)]
 
 
 def paper_table(study: Study) -> ResultTable:
-    """The paper's Table 1 beside the runs at the paper's setting."""
+    """The paper's Table 1 beside the runs of its methods and of others, at the paper's setting."""
     rows: list[list[Value]] = []
     for env in study.environments:
         column = table_1(env)
         setting = tuple(
             env if axis == "env.id" else value for axis, value in zip(study.axes, study.reference, strict=True)
         )
-        for method in dict.fromkeys([*PAPER_METHODS, *study.methods]):
-            runs = study.of_beside(method, setting)
-            paper = column.get(method, (None, None))
-            rows.append([env, method, *paper, *_over_runs(runs), *_lengths(runs)])
+        for method in study.methods:
+            if runs := study.of_beside(method, setting):
+                rows.append([env, method, *column.get(method, (None, None)), *_over_runs(runs), *_lengths(runs)])
     columns = [
         *("environment", "method", "paper mean", "paper sd"),
         *("mean", "sd over runs", "sd of 100 episodes", "IQM", "IQM low", "IQM high", "runs", "seeds"),
@@ -58,27 +62,36 @@ def paper_table(study: Study) -> ResultTable:
         "within a run, then mean over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval."
         + (f" Runs at {at}, the values nearest to the preset's." if at else "")
     )
-    return ResultTable("table1", "The paper's Table 1 beside these runs", columns, rows, note)
+    beside = {"paper mean": ["paper sd"], **OVER_RUNS}
+    return ResultTable("table1", "The paper's Table 1 beside these runs", columns, rows, note, beside)
 
 
 def settings_table(study: Study) -> ResultTable:
     """Scores of every method at every setting."""
-    rows, diagnostics = [], diagnostics_of(study)
-    for method in study.methods:
-        for setting in study.settings:
-            runs = study.of(method, setting)
-            if runs:
-                means = [float(np.mean([diagnostic(run, name) for run in runs])) for name in diagnostics]
-                rows.append([method, *plain(setting), *_over_runs(runs), *means])
+    rows = [[method, *plain(setting), *_over_runs(runs)] for method, setting, runs in _groups(study)]
     columns = [
         *("method", *study.axes, "mean", "sd over runs", "sd of 100 episodes", "IQM", "IQM low", "IQM high"),
-        *("runs", "seeds", *diagnostics),
+        *("runs", "seeds"),
     ]
     note = (
-        "Return of the last 100 episodes, as above. Diagnostics: means over the second half of the runs, "
-        "evicted_unsampled at their end; sample age in environment steps."
+        "Return of the last 100 training episodes. mean, sd over runs: of the runs' means; sd of 100 episodes: within "
+        "a run, then mean over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval."
     )
-    return ResultTable("settings", "Every setting", columns, rows, note)
+    return ResultTable("settings", "Every setting", columns, rows, note, OVER_RUNS)
+
+
+def diagnostics_table(study: Study) -> ResultTable:
+    """What the buffer handed out and what became of the networks, for every method at every setting."""
+    diagnostics = diagnostics_of(study)
+    rows: list[list[Value]] = [
+        [method, *plain(setting), *(float(np.mean([diagnostic(run, name) for run in runs])) for name in diagnostics)]
+        for method, setting, runs in _groups(study)
+    ]
+    note = (
+        "Means over the second half of the runs, evicted_unsampled at their end; sample age in environment steps. "
+        "docs/policies.md explains the columns."
+    )
+    return ResultTable("diagnostics", "Diagnostics", ["method", *study.axes, *diagnostics], rows, note)
 
 
 def breaking_table(study: Study) -> ResultTable:
@@ -98,7 +111,8 @@ def breaking_table(study: Study) -> ResultTable:
         "low and high: its 95 % bootstrap interval over runs. gaps: some larger capacity falls below 95 %. Where the "
         "return at the largest is poor, nothing was learnt that could break. Empty: no run at the largest."
     )
-    return ResultTable("breaking_points", "Breaking points", columns, rows, note)
+    beside = {"breaking point": ["low", "high"]}
+    return ResultTable("breaking_points", "Breaking points", columns, rows, note, beside)
 
 
 def aggregate_table(study: Study) -> ResultTable:
@@ -109,7 +123,8 @@ def aggregate_table(study: Study) -> ResultTable:
         values = [float(interval.value[0]), float(interval.low[0]), float(interval.high[0])]
         rows.append([method, *values, len(scores), scores.shape[1], scores.size])
     columns = ["method", "IQM", "low", "high", "seeds", "settings", "runs"]
-    return ResultTable("aggregate", "Over all settings", columns, rows, _matrix_note(study))
+    note = _matrix_note(study)
+    return ResultTable("aggregate", "Over all settings", columns, rows, note, {"IQM": ["low", "high"]})
 
 
 def improvement_table(study: Study) -> ResultTable:
@@ -121,7 +136,8 @@ def improvement_table(study: Study) -> ResultTable:
         values = [float(interval.value[0]), float(interval.low[0]), float(interval.high[0])]
         rows.append([x, y, *values, len(scores[x]), len(scores[y]), scores[x].shape[1]])
     columns = ["x", "y", "P(x > y)", "low", "high", "seeds of x", "seeds of y", "settings"]
-    return ResultTable("improvement", "Probability of improvement", columns, rows, _matrix_note(study))
+    note, beside = _matrix_note(study), {"P(x > y)": ["low", "high"]}
+    return ResultTable("improvement", "Probability of improvement", columns, rows, note, beside)
 
 
 def runs_table(study: Study) -> ResultTable:
@@ -136,13 +152,20 @@ def runs_table(study: Study) -> ResultTable:
         for run in study.runs
     ]
     columns = ["run", "method", "seed", *study.axes, "last step", "episodes", "mean", "sd", *diagnostics]
-    return ResultTable("runs", "Every run", columns, rows, "mean and sd: of the returns of the last 100 episodes.")
+    note = "mean and sd: of the returns of the last 100 episodes. The CSV file has each run's diagnostics too."
+    return ResultTable("runs", "Every run", columns, rows, note, {"mean": ["sd"]}, aside=diagnostics)
+
+
+def _groups(study: Study) -> Iterator[tuple[str, Setting, list[Run]]]:
+    """The runs of every method at every setting."""
+    for method in study.methods:
+        for setting in study.settings:
+            if runs := study.of(method, setting):
+                yield method, setting, runs
 
 
 def _over_runs(runs: Sequence[Run]) -> list[Value]:
     """Compute mean, sd over runs, sd within a run, IQM, low, high, runs, seeds."""
-    if not runs:
-        return [None, None, None, None, None, None, 0, "none"]
     scores = np.array([[score(run)] for run in runs])
     interval = iqm_by_task(scores)
     sd = float(scores.std(ddof=1)) if len(runs) > 1 else None
@@ -163,8 +186,6 @@ def _breaking(capacities: list[int], scores: list[Floats], largest: int) -> list
 
 
 def _lengths(runs: Sequence[Run]) -> list[Value]:
-    if not runs:
-        return [None, None]
     return [float(np.mean([len(run.returns) for run in runs])), float(np.mean([run.end_steps[-1] for run in runs]))]
 
 

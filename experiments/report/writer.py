@@ -1,4 +1,4 @@
-"""Writes a report: the page, the figures as PNG with their points as CSV, the tables as CSV and Markdown."""
+"""Writes a report: the page, the figures as PNG and PDF with their points as CSV, the tables as CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 
 from common.errors import RunError, UsageError
 from common.process.notices import warn
+from experiments.report.answer import answer
+from experiments.report.baseline import baseline_figure, baseline_table, find_baseline
 from experiments.report.figures import figures
 from experiments.report.packed import EPISODES
 from experiments.report.page import page
@@ -15,7 +17,6 @@ from experiments.report.plots import draw
 from experiments.report.results import tables
 from experiments.report.sources import open_source
 from experiments.report.study import load_study, read_config
-from experiments.report.table import ResultTable
 from learner.records.curve import draw_curve
 
 
@@ -47,18 +48,25 @@ def draw_curves(runs: Path, out: Path) -> list[Path]:
     return drawn
 
 
-def write_report(runs: Path, out: Path) -> tuple[Path, list[ResultTable]]:
-    """Write the report of a folder of runs, and warn of untrustworthy runs; return its path and tables.
+def write_report(runs: Path, out: Path, baseline: str | None = None) -> tuple[Path, list[str]]:
+    """Write the report of a folder of runs, and warn of untrustworthy runs; return its path and what was found.
+
+    baseline: a method or a run, from which the differences of the others are reported.
 
     Raises:
-        UsageError: the folder holds no run, or the report's folder cannot be written.
+        UsageError: the folder holds no run, the report's folder cannot be written, or the baseline is not in it.
         RunError: no run is finished, or a finished one has a torn file.
     """
     study = load_study(runs)
     for line in study.warnings:
         warn(line)
-    made, lacking = figures(study)
+    compared = None if baseline is None else find_baseline(study, baseline)
     results = tables(study)
+    made, lacking = figures(study)
+    if compared is not None:
+        results.insert(0, baseline_table(study, compared))
+        made.append(baseline_figure(study, compared))
+    told = answer(study, results)
     try:
         out.mkdir(parents=True, exist_ok=True)
         drawn = []
@@ -70,7 +78,7 @@ def write_report(runs: Path, out: Path) -> tuple[Path, list[ResultTable]]:
             (out / f"table_{table.name}.csv").write_text(table.csv(), encoding="utf-8")
             (out / f"table_{table.name}.md").write_text(table.markdown(), encoding="utf-8")
         index = out / "index.html"
-        index.write_text(page(study, runs, results, drawn, lacking), encoding="utf-8")
+        index.write_text(page(study, runs, told, results, drawn, lacking), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror}") from error
-    return index, results
+    return index, told

@@ -1,0 +1,210 @@
+"""What a report says in words and against a baseline, by hand-made runs; and that its figures and page fit."""
+
+import re
+import shutil
+import subprocess
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure as Canvas
+from test_comparisons import write_runs
+
+from common.errors import UsageError
+from experiments.report.answer import answer
+from experiments.report.baseline import baseline_figure, baseline_table, find_baseline
+from experiments.report.figures import buffers
+from experiments.report.measures import Interval
+from experiments.report.page import page
+from experiments.report.plots import STYLE, WIDTH, Line, Panel, _finish_panel, draw
+from experiments.report.results import tables
+from experiments.report.study import Study, load_study
+from experiments.report.summaries import final_returns
+from experiments.report.table import ResultTable, Value
+from experiments.report.writer import write_report
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+MEASURE = """<script>
+for (const each of document.querySelectorAll("details")) each.open = true;
+const wide = [...document.querySelectorAll(".table")].filter((each) => each.scrollWidth > each.clientWidth);
+document.title = `${document.documentElement.scrollWidth} ${innerWidth} ${wide.length}`;
+</script>"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_runs(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, list[ResultTable]]:
+    """The same runs, and the tables of their report; dqn is the baseline."""
+    study = load_study(write_runs(tmp_path_factory.mktemp("runs")))
+    return study, [baseline_table(study, find_baseline(study, "dqn")), *tables(study)]
+
+
+def by_place(rows: list[dict[str, Any]], measure: str = "return of the last 100") -> dict[tuple[str, str], list[Any]]:
+    names = ("mean", "baseline", "difference", "low", "high", "seeds")
+    return {(r["method"], r["setting"]): [r[n] for n in names] for r in rows if r["measure"] == measure}
+
+
+def test_differences_from_a_method(folder: Path) -> None:
+    study = load_study(folder)
+    found = by_place(baseline_table(study, find_baseline(study, "dqn")).frame.to_dict("records"))
+    # By seed: 50, 53, 56 minus 100, 101, 102 at 500; 70, 73, 76 at 600; 200, 203, 206 at 5000.
+    assert found == {
+        ("coop", "capacity 500"): [53.0, 101.0, -48.0, -50.0, -46.0, 3],
+        ("coop", "capacity 600"): [73.0, 101.0, -28.0, -30.0, -26.0, 3],
+        ("coop", "capacity 5000"): [203.0, 101.0, 102.0, 100.0, 104.0, 3],
+        ("coop", "all"): [pytest.approx(x) for x in (329 / 3, 101, 26 / 3, 20 / 3, 32 / 3)] + [3],
+    }
+
+
+@pytest.mark.parametrize("name", ["coop-500-1", "coop-500-0"])
+def test_differences_from_a_run_are_those_from_its_setting(name: str, folder: Path) -> None:
+    study = load_study(folder)
+    table = baseline_table(study, find_baseline(study, name))
+    assert table.title == "Differences from coop, capacity 500"
+    found = by_place(table.frame.to_dict("records"))
+    assert [key for key in found if key[0] == "coop"] == [("coop", "capacity 600"), ("coop", "capacity 5000")]
+    assert found["coop", "capacity 600"] == [73.0, 53.0, 20.0, 20.0, 20.0, 3]
+    assert found["dqn", "capacity 500"] == [101.0, 53.0, 48.0, 46.0, 50.0, 3]
+    shown = baseline_figure(study, find_baseline(study, name))
+    assert [panel.y for panel in shown.panels] == ["difference of return of the last 100", "difference of area"]
+    assert shown.panels[0].ticks == ["capacity 500", "capacity 600", "capacity 5000"]
+
+
+def test_only_seeds_that_both_have_count(folder: Path) -> None:
+    shutil.rmtree(folder / "dqn-600-2")
+    study = load_study(folder)
+    found = by_place(baseline_table(study, find_baseline(study, "coop-600-0")).frame.to_dict("records"))
+    assert found["dqn", "capacity 600"] == [100.5, 71.5, 29.0, 28.0, 30.0, 2]
+
+
+def test_what_is_no_baseline(folder: Path) -> None:
+    study = load_study(folder)
+    with pytest.raises(UsageError) as refused:
+        find_baseline(study, "dqm")
+    assert str(refused.value) == (
+        "--baseline dqm: unknown; did you mean dqn? allowed: dqn, coop, or the name of a run's folder"
+    )
+    for gone in folder.glob("dqn-*"):
+        shutil.rmtree(gone)
+    study = load_study(folder)
+    with pytest.raises(UsageError, match="--baseline coop: no other runs have seeds in common with it"):
+        baseline_table(study, find_baseline(study, "coop"))
+    with pytest.raises(UsageError, match="--baseline x: unknown"):
+        write_report(folder, folder / "out", "x")
+    assert not (folder / "out").exists()
+
+
+def test_the_answer_has_the_numbers_of_the_tables(reported: tuple[Study, list[ResultTable]]) -> None:
+    study, made = reported
+    aggregate = {row["method"]: row for row in made[1].frame.to_dict("records")}
+    subject, compared, means, pairs, breaking, doubts = answer(study, made)
+    assert subject == (
+        "18 of 19 runs finished, 1 diverged: dqn, coop on CartPole-v0, seeds 0-2; "
+        "they differ by replay.capacity (500, 600, 5000)."
+    )
+    assert compared == (
+        "Differences from dqn, return of the last 100 episodes over the same seeds: coop 8.67 [6.67, 10.7]."
+    )
+    assert means.startswith("Over the 3 settings that all methods share, the interquartile mean")
+    best, other = re.findall(r"(dqn|coop) ([\d.]+) \[([\d.]+), ([\d.]+)\]", means)
+    assert {best[0], other[0]} == {"dqn", "coop"}
+    assert float(best[1]) >= float(other[1])
+    for name, *values in (best, other):
+        assert [float(value) for value in values] == pytest.approx(
+            [aggregate[name][column] for column in ("IQM", "low", "high")], rel=1e-2
+        )
+    # Coop is better at one of three capacities, with every seed.
+    assert pairs == "Of two runs, dqn returns more than coop with probability 0.667 [0.667, 0.667]."
+    assert breaking == "Smallest buffer with 95 % of the return at 5000: dqn 500 [500, 500], coop 5000 [5000, 5000]."
+    assert doubts.startswith("Some settings have 3 runs")
+
+
+def test_methods_that_the_runs_do_not_tell_apart(reported: tuple[Study, list[ResultTable]]) -> None:
+    study, made = reported
+    (settings,) = (table for table in made if table.name == "settings")
+    means = ResultTable("aggregate", "", ["method", "IQM", "low", "high", "settings"], [["dqn", 1.0, 0.0, 2.0, 1]])
+    columns = ["x", "y", "P(x > y)", "low", "high"]
+    rows: list[list[Value]] = [["coop", "dqn", 0.6, 0.4, 0.8]]
+    told = answer(study, [means, ResultTable("improvement", "", columns, rows), settings])
+    assert told[1:3] == [
+        "The interquartile mean of the return of the last 100 episodes is: dqn 1 [0, 2].",
+        "These runs tell no two methods apart: every interval of the probability of improvement holds 0.5.",
+    ]
+    rows += [["edql", "dqn", 0.3, 0.2, 0.4], ["edql", "coop", 0.7, 0.6, 0.8]]
+    told = answer(study, [means, ResultTable("improvement", "", columns, rows), settings])
+    assert told[2] == (
+        "Of two runs, dqn returns more than edql with probability 0.7 [0.6, 0.8]; edql returns more than coop with "
+        "probability 0.7 [0.6, 0.8]. One other pair they do not tell apart: its interval holds 0.5."
+    )
+    assert told[3:5] == [
+        "dqn: the interquartile mean of the return of the last 100 episodes is highest at capacity 500, "
+        "101 [100, 102]; the intervals of all others overlap with it.",
+        "coop: the interquartile mean of the return of the last 100 episodes is highest at capacity 5000, "
+        "203 [200, 206]; the intervals of capacity 500, capacity 600 end below it.",
+    ]
+
+
+@pytest.mark.parametrize("columns", [1, 3])
+@pytest.mark.parametrize(
+    "sizes",
+    [(500, 1000, 1500, 2000, 3000, 3500, 4000, 5000), (0, 50, 100, 200, 500, 1000, 2000, 5000), (10, 1_000_000)],
+)
+def test_labels_of_ticks_do_not_touch(sizes: tuple[int, ...], columns: int) -> None:
+    values = np.array(sizes, np.float64)
+    line = Line("dqn", values, Interval(values, values, values))
+    with mpl.rc_context(STYLE):
+        canvas = Canvas(figsize=(WIDTH if columns > 1 else WIDTH * 2 / 3, 2.3), layout="constrained")
+        grid = canvas.subplots(1, columns, squeeze=False)[0]
+        for axes in grid:
+            axes.plot(values, values)
+            _finish_panel(axes, Panel("", "capacity", "return", [line], marks=True, wide_x=True), columns)
+        canvas.draw_without_rendering()
+        for axes in grid:
+            labels = [label for label in axes.get_xticklabels() if label.get_text()]
+            boxes = [label.get_window_extent() for label in labels]
+            assert len(labels) >= 2
+            assert labels[-1].get_text() in ("5k", "1000k")
+            assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
+
+
+def test_a_table_for_readers() -> None:
+    rows = [["a <b>", 1.5, 0.25, None, None, 7], ["c", 200.0, None, 1.0, float("nan"), 8], ["d,e", 3, 1.0, 1.0, 2.0, 9]]
+    beside = {"mean": ["sd"], "IQM": ["low"]}
+    table = ResultTable("t", "T", ["name", "mean", "sd", "IQM", "low", "more"], rows, "note", beside, aside=["more"])
+    assert table.csv() == 'name,mean,sd,IQM,low,more\na <b>,1.5,0.25,,,7\nc,200,,1,,8\n"d,e",3,1,1,2,9\n'
+    assert table.markdown().splitlines() == [
+        *("## T", "", "| name | mean (sd) | IQM (low) |", "| --- | --- | --- |"),
+        *("| a <b> | 1.5 (0.25) | - |", "| c | 200 | 1 |", "| d,e | 3 (1) | 1 (2) |", "", "note"),
+    ]
+    assert "<td>a &lt;b&gt;</td>" in table.html()
+    interval = ResultTable("t", "T", ["x", "low", "high"], [[1.0, 0.5, 2.0]], beside={"x": ["low", "high"]})
+    assert interval.markdown().splitlines()[2:] == ["| x [95 %] |", "| --- |", "| 1 [0.5, 2] |"]
+
+
+def test_nothing_is_wider_than_the_window(reported: tuple[Study, list[ResultTable]], tmp_path: Path) -> None:
+    study, made = reported
+    drawn = [(figure, tmp_path / f"{figure.name}.png") for figure in (buffers(study), final_returns(study))]
+    for figure, png in drawn:
+        draw(figure, png)
+    index = tmp_path / "index.html"
+    index.write_text(page(study, tmp_path, answer(study, made), made, drawn, []) + MEASURE, encoding="utf-8")
+    headings = re.findall("<h2>(.*?)</h2>", index.read_text(encoding="utf-8"))
+    assert headings == [*("Mean return against buffer size", made[0].title, "Over all settings", "Every setting"),
+                        *("Figures", "Tables")]  # fmt: skip
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium: apt-get install chromium")
+    flags = ["--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}/c", "--dump-dom"]
+    for width in (1300, 700):
+        command = [CHROMIUM, *flags, f"--window-size={width},900", index.as_uri()]
+        shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        (found,) = re.findall(r"<title>(\d+) (\d+) (\d+)</title>", shown)
+        whole, window, scrolled = map(int, found)
+        assert whole <= window, "the page does not scroll sideways"
+        assert width < 1300 or scrolled == 0, "nor does a table"
