@@ -55,7 +55,9 @@ def figures(study: Study) -> tuple[list[Figure], list[str]]:
     if len(study.settings) <= MOST_TICKS:
         ends.append(final_returns(study))
     else:
-        lacking.append(f"Return at every setting: {len(study.settings)} settings are too many; the table has them all.")
+        lacking.append(
+            f"Return of the last 100 episodes: {len(study.settings)} settings are too many; the table has them all."
+        )
     if study.index(CAPACITY) is None:
         lacking.append(f"Return against buffer size, breaking points: {CAPACITY} is the same in all finished runs.")
     else:

@@ -136,6 +136,7 @@ def draw(figure: Figure, path: Path) -> None:
         if len(handles) > 1 and not any(set(panel.ticks) >= handles.keys() for panel in figure.panels):
             canvas.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=6)
         canvas.savefig(path, dpi=170, metadata={"Software": None})
+        canvas.set_layout_engine("none")  # which has placed everything, and takes half of the time
         canvas.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
         plt.close(canvas)
 
@@ -143,7 +144,7 @@ def draw(figure: Figure, path: Path) -> None:
 def _draw_line(axes: Axes, panel: Panel, line: Line, colour: str) -> None:
     value, low, high = line.y
     if line.faint:
-        axes.plot(value, line.x, "o", color=colour, alpha=0.35, markersize=2.2, markeredgewidth=0)
+        axes.plot(value, line.x, "o", color=colour, alpha=0.4, markersize=3, markeredgewidth=0, zorder=3)
     elif panel.marks:
         bounds = np.nan_to_num(np.stack([(value - low).clip(0), (high - value).clip(0)]))
         style = "o" if panel.ticks else "o--" if line.dashed else "o-"

@@ -50,10 +50,10 @@ def final_returns(study: Study) -> Figure:
             Panel(env, "", "return of the last 100 episodes", [*dots, *tick_lines(ends, shifts)], True, ticks=ticks)
         )
     text = (
-        "Return of the last 100 episodes. Small dots: single runs; large ones: their interquartile mean, with its 95 % "
-        "bootstrap interval over runs (none for a single run)."
+        "Small dots: single runs; large ones: their interquartile mean, with its 95 % bootstrap interval over runs "
+        "(none for a single run)."
     )
-    return Figure("final_returns", "Return at every setting", text, counts(study.runs), panels)
+    return Figure("final_returns", "Return of the last 100 episodes", text, counts(study.runs), panels)
 
 
 def aggregates(study: Study) -> list[Figure]:
