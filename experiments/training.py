@@ -141,6 +141,7 @@ def train(
         run_dir: folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given.
         distributed: run a learner, a replay service and `actors` actors as processes of this machine; otherwise the
             run is one of `coop-lockstep`, in a thread of this process.
+        actors: actor processes of a distributed run.
         resume: continue the run in `run_dir`; start it if there is none yet.
         settings: fields of a run; a table as a mapping: `seed=1, total_steps=20_000, replay={"capacity": 500}`.
 
