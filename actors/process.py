@@ -8,16 +8,14 @@ import numpy as np
 import zenoh
 
 from actors.cli import ActorOptions
-from actors.policy import Policy
+from actors.joined import make_policy
 from actors.service import ActorService
 from common.envs.make import make_vector_env
 from common.errors import JoinError
-from common.imports import check_allowed
 from common.messaging.joining import Membership, join, leave_run
 from common.messaging.messages.join import Join, Joined
 from common.messaging.route import ReplayRoute, RoutedReplay, open_client
 from common.messaging.transport import Node, new_incarnation, open_session
-from common.networks.acting import ActingNetwork, acting_network
 from common.process.console import Console, counted
 from common.process.health import answering
 from common.process.lifecycle import Stop
@@ -67,13 +65,11 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
             differs from the learner's.
     """
     config = joined.config
-    for field, path in config.imports.items():
-        check_allowed(path, options.allow_import, field)
     # The learner gives each number once per run, also across restarts, so no two processes play the same seeds.
     seed = np.random.SeedSequence([config.seed, 3, joined.index])
     env_seed, policy_seed = seed.spawn(2)
+    policy = make_policy(joined, options.allow_import, np.random.default_rng(policy_seed))
     env = make_vector_env(config.env, options.envs or config.actor.envs, int(env_seed.generate_state(1)[0]))
-    policy = Policy(_networks(joined), joined.spec, np.random.default_rng(policy_seed))
     if env.spec != joined.spec:
         raise JoinError(f"environment here {env.spec}, the learner's {joined.spec}")
 
@@ -98,15 +94,3 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
             service.run()
     console.event(f"{stop.reason}; {service.progress()}")
     env.close()
-
-
-def _networks(joined: Joined) -> tuple[ActingNetwork, ActingNetwork]:
-    """Networks of the run's layout, whose parameters the learner will send.
-
-    Raises:
-        JoinError: this process builds another layout than the learner does.
-    """
-    first, second = (acting_network(joined.config.network, joined.spec) for _ in range(2))
-    if first.layout_digest() != joined.layout:
-        raise JoinError(f"network layout here {first.layout_digest()}, the learner's {joined.layout}")
-    return first, second

@@ -20,7 +20,8 @@ ANSWER_TIMEOUT = 2.0  # seconds to wait for each answer
 class WeightsFollower:
     """Loads broadcast weights into a policy.
 
-    version: of the parameters that act now.
+    version: of the parameters that act now. progress: updates and environment steps of the run when the networks that
+    the newest role names were broadcast.
     """
 
     def __init__(self, node: Node, policy: Policy) -> None:
@@ -29,6 +30,7 @@ class WeightsFollower:
         self._size = policy.networks[0].size
         self._held = [UNKNOWN, UNKNOWN]
         self._told = [UNKNOWN, UNKNOWN]
+        self.progress = (0, 0)
         self._ask_at = math.inf  # monotonic time; inf while nothing is missing
         self._keys = [weights_key(node, 1), weights_key(node, 2)]
         self._weights = [node.latest(key) for key in self._keys]
@@ -43,6 +45,11 @@ class WeightsFollower:
     def ready(self) -> bool:
         """True once both networks have been received."""
         return UNKNOWN not in self._held
+
+    @property
+    def settled(self) -> bool:
+        """True if the acting network is just the one that the newest role names."""
+        return self.ready and self.version == self._told[self._policy.acting]
 
     def refresh(self) -> None:
         """Load new broadcasts; ask the learner for weights whose broadcast did not arrive."""
@@ -88,4 +95,5 @@ class WeightsFollower:
             self._node.count_bad()
             return
         self._told = list(role.versions)
+        self.progress = role.updates, role.env_step
         self._policy.acting = role.acting - 1

@@ -22,9 +22,10 @@ from common.bounds import (
     MAX_UPDATES,
 )
 from common.errors import BadMessage
-from common.messaging.keys import join_key, replay_key, role_key, stop_key, weights_key
+from common.messaging.keys import evaluations_key, join_key, replay_key, role_key, stop_key, weights_key
 from common.messaging.members import Origin
 from common.messaging.messages.epoch import Snapshot, Written
+from common.messaging.messages.evaluate import GIF, Evaluated, Evaluation, Video
 from common.messaging.messages.insert import SegmentReader, encode_segment
 from common.messaging.messages.join import Join, Joined
 from common.messaging.messages.limits import Limit, LimitsQuestion
@@ -76,6 +77,10 @@ def targets(node: Node, joined: Joined) -> list[Target]:
         if Join.decode(message).role != role:
             raise BadMessage("fields.role", "not this key's")
 
+    def reporting(message: Message) -> None:
+        (Video if message.kind == Video.kind else Evaluated).decode(message)
+
+    result, video = Evaluation(0, 0, 1, 10, 1.0, 1.0, 0.0, 1.0), Video(1, 0, 0, np.frombuffer(GIF, np.uint8))
     draw = DrawRequest(1, 0, 0, batch_size, 0)
     made: list[tuple[str, bytearray, str, Callable[[Message], Any]]] = [
         (replay_key(node, "insert"), encode_segment(RUN, segment), "replay", SegmentReader(spec)),
@@ -89,6 +94,8 @@ def targets(node: Node, joined: Joined) -> list[Target]:
             (join_key(node, role), Join(role, 5, []).encode(RUN), "learner", partial(joining, role))
             for role in ("actor", "replay")
         ),
+        (evaluations_key(node), Evaluated(1, 0, result).encode(RUN), "learner", reporting),
+        (evaluations_key(node), video.encode(RUN), "learner", reporting),
         (weights_key(node, 1), Current().encode(RUN), "learner", Current.decode),
         (weights_key(node, 2), Current().encode(RUN), "learner", Current.decode),
         (role_key(node), Current().encode(RUN), "learner", Current.decode),

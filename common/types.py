@@ -12,7 +12,16 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from common.bounded import Count, Float32, Incarnation, Name, Share
-from common.bounds import MAX_ACTIONS, MAX_COUNT, MAX_SEGMENT_STEPS, MAX_SIDE, MAX_STACK, MAX_STREAMS, MAX_UPDATES
+from common.bounds import (
+    MAX_ACTIONS,
+    MAX_COUNT,
+    MAX_RETURN,
+    MAX_SEGMENT_STEPS,
+    MAX_SIDE,
+    MAX_STACK,
+    MAX_STREAMS,
+    MAX_UPDATES,
+)
 
 Array = NDArray[Any]
 
@@ -58,7 +67,7 @@ class EpisodeEnd(Struct, frozen=True, array_like=True, forbid_unknown_fields=Tru
     """
 
     step_in_segment: Annotated[int, Meta(ge=0, lt=MAX_SEGMENT_STEPS)]
-    episode_return: Annotated[float, Meta(ge=-1e15, le=1e15)]
+    episode_return: Annotated[float, Meta(ge=-MAX_RETURN, le=MAX_RETURN)]
     length: Annotated[int, Meta(ge=1, le=MAX_COUNT)]
     epsilon: Share
     q1_mean: Float32

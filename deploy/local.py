@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.envs.make import env_spec
+from common.envs.make import check_filmed, env_spec
 from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
 from common.process.console import stamped
@@ -72,6 +72,9 @@ class Topology:
             ChildProcess(f"actor {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")
             for number in range(1, options.actors + 1)
         ]
+        if config.eval_every or config.video_every:
+            evaluating = command("coop-eval", *playing)
+            self._others.append(ChildProcess("evaluator", evaluating, logs / "evaluator.log"))
         self._policies = {process.name: RestartPolicy() for process in self._all()}
         self._interrupted = False
 
@@ -107,7 +110,7 @@ class Topology:
             status = process.exit_status() or 0
             if not policy.ended(now):
                 raise RunError(f"{process.why()}; it has been started again {RESTARTS} times")
-            if status > 0 and not process.was_interrupted() and not process.name.startswith("actor"):
+            if status > 0 and not process.was_interrupted() and not process.name.startswith(("actor", "evaluator")):
                 raise (UsageError if status == UsageError.exit_status else RunError)(process.why())
             if status:
                 display.say(stamped(f"{process.why()}; starting it again"))
@@ -145,6 +148,8 @@ def _run() -> None:
     spec = env_spec(config.env)  # refuses invalid environments before anything starts
     check_memory(config, spec)
     check_messages(config, spec)
+    if config.video_every:
+        check_filmed(config.env)
     directory = options.directory()
     stop = Stop()
     stop.on_signals()

@@ -1,9 +1,9 @@
-"""Evaluation: plays full episodes by a policy, without exploration."""
+"""Evaluation of what has been saved: full episodes by the networks of checkpoints, and by any policy."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from common.envs.make import make_vector_env
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.settings.environment import EnvSettings
 from common.settings.tables import resolve
-from common.types import Array
-from experiments.saved import SavedPolicy, SavedRun
+from experiments.episodes import AT_ONCE, Acting, exploring, play
+from experiments.film import Film, check_video, write_video
+from experiments.saved import NetworkChoice, SavedPolicy, SavedRun
 
-Acting = Callable[[Array], Any]
+RESAMPLES = 2000  # of the returns, for an interval
 
 
 @dataclass(frozen=True)
@@ -36,47 +37,47 @@ class Evaluation:
         """Standard deviation of the returns."""
         return statistics.pstdev(self.returns)
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the mean, by the bootstrap."""
+        drawn = np.random.default_rng(0).choice(self.returns, (RESAMPLES, len(self.returns)))
+        low, high = np.percentile(drawn.mean(1), (2.5, 97.5)).tolist()
+        return low, high
+
 
 @dataclass(frozen=True)
 class CheckpointEvaluation(Evaluation):
-    """Returns of the acting `network` (1 or 2) of the checkpoint `epoch`."""
+    """Returns of a run's checkpoint `epoch`.
 
-    epoch: int
-    network: int
-
-
-def play(policy: Acting, env: EnvSettings, episodes: int, seed: int) -> list[float]:
-    """Play full episodes and return their unclipped returns.
-
-    policy: gives an action for a batch of one stacked observation, <frame_dtype>[1, *obs_shape]. seed: of the emulator.
+    network: 1, 2, or "mean", which plays by the mean of both networks' Q-values. epsilon: probability of a random
+    action. acts: the network acted and was trained last.
     """
-    emulator = make_vector_env(env, 1, seed)
-    returns: list[float] = []
-    total = 0.0
-    try:
-        obs = emulator.reset()
-        while len(returns) < episodes:
-            steps = emulator.step(np.asarray(policy(obs), np.int32).reshape(1))
-            obs = steps.obs
-            total += float(steps.raw_rewards[0])
-            if steps.episode_over[0]:
-                returns.append(total)
-                total = 0.0
-    finally:
-        emulator.close()
-    return returns
+
+    run: str
+    epoch: int
+    network: NetworkChoice
+    epsilon: float
+    acts: bool
 
 
 def evaluate(
-    policy: Acting, episodes: int = 20, env: str | Mapping[str, Any] | None = None, seed: int = 0
+    policy: Acting,
+    episodes: int = 20,
+    env: str | Mapping[str, Any] | None = None,
+    seed: int = 0,
+    *,
+    epsilon: float = 0.0,
+    at_once: int = 1,
 ) -> Evaluation:
     """Play full episodes by a policy in its own environment, or in another one.
 
     Args:
-        policy: of `SavedRun.policy`, or any function of a batch of one stacked observation that gives an action.
+        policy: of `SavedRun.policy`, or any function of a batch of stacked observations that gives an action for each.
         env: an environment's id; or settings that replace those of the policy's environment, as a table
             ({"kwargs": {"side": 12}}).
-        seed: of the emulator.
+        seed: of the emulators and the random actions.
+        epsilon: probability of a random action.
+        at_once: emulators that play at once, each its share of the episodes.
 
     Raises:
         UsageError: there are no episodes to play; a function without an environment of its own got none.
@@ -88,21 +89,73 @@ def evaluate(
         raise UsageError("env: a policy that no run has trained needs one")
     changes = {"id": env} if isinstance(env, str) else dict(env or {})
     settings = resolve({"env": {**(asdict(own) if own else {}), **changes}}).env
-    return Evaluation(play(policy, settings, episodes, seed))
+    return Evaluation(_returns(policy, settings, episodes, seed, epsilon, at_once))
 
 
-def evaluate_checkpoint(run_dir: Path, episodes: int, seed: int) -> CheckpointEvaluation:
-    """Play the acting network of a run's newest checkpoint greedily.
+def evaluate_checkpoint(
+    run_dir: Path,
+    episodes: int,
+    seed: int,
+    networks: Sequence[NetworkChoice] = (1, 2, "mean"),
+    epsilons: Sequence[float] = (0.0,),
+    at_once: int = AT_ONCE,
+) -> Iterator[CheckpointEvaluation]:
+    """Play the networks of a run's newest checkpoint, each with each epsilon, all from the same starts.
 
-    seed: of the emulator; the derived seed differs from those of the run's emulators.
+    Of a method with one network, of which the second is an older copy, only the first plays.
+
+    seed: of the emulators; the derived seed differs from those of the run's emulators.
 
     Raises:
-        UsageError: the folder holds no run, or no checkpoint.
+        UsageError: the folder holds no run, or no checkpoint; raised at once, before anything is played.
     """
     run = SavedRun(run_dir)
     checkpoint = run.checkpoint()
-    number = checkpoint.acting + 1
-    emulator = np.random.SeedSequence([run.config.seed, 4, seed]).generate_state(1)
-    policy = SavedPolicy(run.config.env, checkpoint.spec, (checkpoint.networks[checkpoint.acting],))
-    returns = play(policy, run.config.env, episodes, int(emulator[0]))
-    return CheckpointEvaluation(returns, checkpoint.epoch, number)
+    derived = _derived(run, seed)
+    chosen: Sequence[NetworkChoice] = networks if run.config.two_networks else (1,)
+
+    def one(network: NetworkChoice, epsilon: float) -> CheckpointEvaluation:
+        played = checkpoint.networks if network == "mean" else (checkpoint.networks[network - 1],)
+        policy = SavedPolicy(run.config.env, checkpoint.spec, played)
+        returns = _returns(policy, run.config.env, episodes, derived, epsilon, at_once)
+        acts = network == checkpoint.acting + 1
+        return CheckpointEvaluation(returns, str(run_dir), checkpoint.epoch, network, epsilon, acts)
+
+    return (one(network, epsilon) for network in chosen for epsilon in epsilons)
+
+
+def film_checkpoint(run_dir: Path, video: Path, seed: int, networks: Sequence[NetworkChoice]) -> str:
+    """Film an episode of greedy play by a run's newest checkpoint; return a line that describes it.
+
+    seed: as of `evaluate_checkpoint`. networks: the one to play; if there are several, the acting network plays.
+
+    Raises:
+        UsageError: the folder holds no run, or no checkpoint; or its environment can't be filmed, or not so.
+        RunError: the video can't be written.
+    """
+    check_video(video)
+    run = SavedRun(run_dir)
+    checkpoint = run.checkpoint()
+    network: NetworkChoice = networks[0] if len(networks) == 1 else checkpoint.acting + 1  # type: ignore[assignment]
+    film = Film(run.policy(network), run.config.env, _derived(run, seed))
+    try:
+        write_video(film, video)
+    except OSError as error:
+        raise RunError(f"{video}: {error.strerror or error}") from error
+    return f"{video}: network {network}, return {film.episode_return:g} in {film.steps:,} steps"
+
+
+def _derived(run: SavedRun, seed: int) -> int:
+    (derived,) = np.random.SeedSequence([run.config.seed, 4, seed]).generate_state(1).tolist()
+    return int(derived)
+
+
+def _returns(
+    policy: Acting, settings: EnvSettings, episodes: int, seed: int, epsilon: float, at_once: int
+) -> list[float]:
+    env = make_vector_env(settings, min(episodes, at_once), seed)
+    try:
+        act = exploring(policy, epsilon, env.spec.num_actions, np.random.default_rng(seed))
+        return play(env, act, episodes)
+    finally:
+        env.close()

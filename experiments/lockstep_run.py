@@ -6,12 +6,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from common.envs.make import check_filmed
 from common.errors import RunError
 from common.process.console import say
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
+from experiments.episodes import Evaluator
 from experiments.lockstep import Lockstep
 from learner.records.epochs import newest_epoch
 from learner.records.run_directory import RunDirectory
@@ -36,6 +38,8 @@ class LockstepRun:
         use_threads(config.learner.threads)
         self.path = path
         self._wandb = wandb
+        if config.video_every:
+            check_filmed(config.env)
         self._run = Lockstep(config)
         try:
             self._lock = RunLock(path, program, ("learner", "replay"))
@@ -56,7 +60,8 @@ class LockstepRun:
             RunError: there is no space for the closing epoch or the summary.
             UsageError: Weights & Biases refuses.
         """
-        with RunDirectory(self.path, self._run.config, self._sizes, wandb=self._wandb) as directory:
+        run = self._run
+        with RunDirectory(self.path, run.config, self._sizes, run.step, wandb=self._wandb) as directory:
             return play_lockstep(self._run, directory, stop, progress)
 
     @property
@@ -79,9 +84,12 @@ def play_lockstep(
         RunError: there is no space for the closing epoch or the summary.
     """
     trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
+    evaluator = Evaluator(run.config, stop.is_set)
+    _evaluate(run, directory, evaluator)  # what a stop has abandoned
     while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
         for effects in run.play():
             directory.record(effects.episodes, effects.metrics)
+        _evaluate(run, directory, evaluator)
         if trainer.epoch_due() and not trainer.outcome():
             trainer.epoch_begun()
             try:
@@ -102,6 +110,20 @@ def play_lockstep(
         summary = summarise(trainer, outcome, time.monotonic(), run.step)
         directory.conclude(summary, f"{summary.title}, lockstep")
     return summary
+
+
+def _evaluate(run: Lockstep, directory: RunDirectory, evaluator: Evaluator) -> None:
+    """Evaluate and film the acting network if it is time."""
+    config, agent, step = run.config, run.agent, run.step
+    network = agent.networks[agent.acting]
+    if run.trainer.diverged or not step:
+        return
+    if config.eval_every and step % config.eval_every == 0 and step > directory.evaluated:
+        result = evaluator.evaluate(network, agent.acting + 1, agent.updates, step)
+        if result is not None:
+            directory.evaluation(result)
+    if config.video_every and step % config.video_every == 0:
+        directory.video(evaluator.film(network, step), step)
 
 
 def _progress(run: Lockstep) -> str:

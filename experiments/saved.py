@@ -22,6 +22,7 @@ from common.settings.tables import load_tables, resolve
 from common.types import EnvSpec
 from learner.qnetwork import make_network
 from learner.records.epochs import load_learner, newest_epoch
+from learner.records.evaluations import EVALUATIONS
 
 CPU = torch.device("cpu")
 NetworkChoice = Literal["mean", 1, 2]
@@ -103,6 +104,11 @@ class SavedRun:
     def metrics(self) -> pd.DataFrame:
         """A row for each line of metrics.jsonl."""
         return pd.read_json(self.path / "metrics.jsonl", lines=True, convert_dates=False)
+
+    @property
+    def evaluations(self) -> pd.DataFrame:
+        """A row for each evaluation during the run, with the columns of evaluations.csv."""
+        return pd.read_csv(self.path / EVALUATIONS)
 
     @property
     def summary(self) -> dict[str, Any] | None:

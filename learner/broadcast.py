@@ -10,20 +10,24 @@ from learner.protocol import Agent
 
 
 class Broadcaster:
-    """Publishes an agent's networks and role, and answers queries with the values published last."""
+    """Publishes an agent's networks and role, and answers queries with the values published last.
 
-    def __init__(self, node: Node, agent: Agent) -> None:
+    env_step: environment steps of the run so far, here and below.
+    """
+
+    def __init__(self, node: Node, agent: Agent, env_step: int = 0) -> None:
         self._node = node
         self._agent = agent
+        self._progress = (0, 0)
         self._published = [-1, -1]
         self._weights = [bytearray(), bytearray()]
         self._role = bytearray()
-        self.publish()
+        self.publish(env_step)
         node.serve(self._weights_key(0), lambda message: self._answer(message, self._weights[0]))
         node.serve(self._weights_key(1), lambda message: self._answer(message, self._weights[1]))
         node.serve(role_key(node), lambda message: self._answer(message, self._role))
 
-    def publish(self) -> None:
+    def publish(self, env_step: int = 0) -> None:
         """Broadcast the networks that changed since their last broadcast, then the role."""
         agent, node = self._agent, self._node
         for number, version in enumerate(agent.versions):
@@ -32,12 +36,13 @@ class Broadcaster:
                 self._weights[number] = Weights(number + 1, version, flat).encode(node.run)
                 self._published[number] = version
                 node.publish(self._weights_key(number), self._weights[number])
+        self._progress = (agent.updates, env_step)
         self.publish_role()
 
     def publish_role(self) -> None:
         """Broadcast the acting role with the versions of the networks as published last."""
         agent, node = self._agent, self._node
-        role = Role(agent.acting + 1, (self._published[0], self._published[1]), agent.updates)
+        role = Role(agent.acting + 1, (self._published[0], self._published[1]), *self._progress)
         self._role = role.encode(node.run)
         node.publish(role_key(node), self._role)
 

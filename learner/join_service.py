@@ -110,9 +110,9 @@ class JoinService:
                 epoch, anew = self._epochs.offered(request)
         except AlreadyServed as other:
             return Retry(str(other)).encode(self._node.run)
-        if request.role == "actor" or request.endpoints:
-            name = f"actor {index}" if request.role == "actor" else "replay service"
-            self.members.joined(request, name)
+        names = {"actor": f"actor {index}", "evaluator": "evaluator"}
+        if request.role in names or request.endpoints:
+            self.members.joined(request, names.get(request.role, "replay service"))
         joined = Joined(
             self._config,
             self._spec,

@@ -78,7 +78,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         )
         checkpoints = Checkpoints(node, path, samples, epochs, console.event)
         sizes = None if state is None else state["sizes"]
-        with RunDirectory(path, config, sizes, wandb=options.wandb) as directory:
+        with RunDirectory(path, config, sizes, trainer.drawn.inserted, wandb=options.wandb) as directory:
             service = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console)
             with _exported(options.prometheus, service):
                 summary = service.run()

@@ -10,6 +10,7 @@ import msgspec
 from common.errors import RunError
 from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key, stop_key
+from common.messaging.messages.evaluate import Evaluation
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.messages.stop import EndOfRun
@@ -18,6 +19,7 @@ from common.process.console import Console, progress_line
 from common.process.lifecycle import Stop
 from learner.broadcast import Broadcaster
 from learner.checkpoints import Checkpoints
+from learner.evaluations import EvaluationInbox
 from learner.join_service import JoinService
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
@@ -27,6 +29,7 @@ from learner.trainer import Effects, Trainer
 STATUS_EVERY = 0.5  # seconds
 REPLAY_BACK = 30.0  # seconds to wait for an absent replay service when the run is complete
 FAREWELL = 5.0  # seconds for the other roles to leave
+LAST_EVALUATION = 60.0  # seconds for evaluators to evaluate a completed run's final networks, and leave
 
 
 class LearnerService:
@@ -54,7 +57,8 @@ class LearnerService:
         self._directory = directory
         self._samples = samples
         self._checkpoints = checkpoints
-        self._broadcaster = Broadcaster(node, trainer.agent)
+        self._broadcaster = Broadcaster(node, trainer.agent, trainer.drawn.inserted)
+        self._evaluations = EvaluationInbox(node, lambda: trainer.drawn.inserted)
         self._status_due = 0.0
         self._reporter = StatusReporter(node, trainer, samples, join_service, console)
         self._join_service = join_service
@@ -102,13 +106,21 @@ class LearnerService:
             self._apply(trainer.receive(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
         if got is None and self._join_service.departure.is_due:
             self._save_for_departure()
+        self._record_evaluations()
         if time.monotonic() >= self._status_due:
             self._publish_status()
 
     def _apply(self, effects: Effects) -> None:
         if effects.broadcast:
-            self._broadcaster.publish()
+            self._broadcaster.publish(self._trainer.drawn.inserted)
         self._directory.record(effects.episodes, effects.metrics)
+
+    def _record_evaluations(self) -> None:
+        for result in self._evaluations.take():
+            if isinstance(result, Evaluation):
+                self._directory.evaluation(result)
+            else:
+                self._directory.video(result.gif.tobytes(), result.env_step)
 
     def _publish_status(self) -> None:
         """Publish the status for displays, and repeat the role for actors that missed it."""
@@ -176,11 +188,15 @@ class LearnerService:
         }
 
     def _farewell(self, outcome: str) -> None:
-        """Announce the stop until the other roles have gone or `FAREWELL` seconds have passed."""
-        deadline = time.monotonic() + FAREWELL
-        while time.monotonic() < deadline:
+        """Announce the stop until the other roles have gone, or have had the time to go."""
+        began, patience = time.monotonic(), {"replay": FAREWELL, "actor": FAREWELL, "evaluator": FAREWELL}
+        if outcome.startswith("complete"):
+            patience["evaluator"] = LAST_EVALUATION
+            self._broadcaster.publish(self._trainer.drawn.inserted)
+        while True:
             self._node.announce(stop_key(self._node), EndOfRun.because(outcome).encode(self._node.run))
             time.sleep(0.1)
-            alive = self._node.presence.counts()
-            if not alive.get("actor") and not alive.get("replay"):
+            self._record_evaluations()
+            alive, seconds = self._node.presence.counts(), time.monotonic() - began
+            if not any(alive.get(role) and seconds < longest for role, longest in patience.items()):
                 return

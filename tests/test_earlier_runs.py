@@ -25,7 +25,7 @@ def earlier(tmp_path: Path) -> Path:
 
 
 def test_it_is_evaluated_and_reported(earlier: Path) -> None:
-    assert evaluate_checkpoint(earlier, 1, 0).epoch == 160
+    assert next(evaluate_checkpoint(earlier, 1, 0)).epoch == 160
     (run,) = load_study(earlier.parent).runs
     assert run.config.replay.learning_starts == 40
     assert run.config.learner.beta2 == 0.999

@@ -14,12 +14,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import make_segment
 
-from common.bounds import MAX_AHEAD, MAX_COUNT, MAX_FLOAT32, MAX_INTEGER, MAX_MAGNITUDE, MAX_STREAMS, MAX_UPDATES
+from common.bounds import (
+    MAX_AHEAD,
+    MAX_COUNT,
+    MAX_EVALUATED,
+    MAX_FLOAT32,
+    MAX_INTEGER,
+    MAX_MAGNITUDE,
+    MAX_RETURN,
+    MAX_STREAMS,
+    MAX_UPDATES,
+    MAX_VIDEO,
+)
 from common.errors import BadMessage, RunError
 from common.messaging import wire
 from common.messaging.members import Origin
 from common.messaging.messages.answers import Ack, Error, Retry
 from common.messaging.messages.epoch import Snapshot, Written
+from common.messaging.messages.evaluate import GIF, Evaluated, Evaluation, Video
 from common.messaging.messages.insert import OPTIONAL, SegmentReader, encode_segment
 from common.messaging.messages.join import Join, Joined, Leave
 from common.messaging.messages.limits import Limit, Limits
@@ -40,6 +52,9 @@ STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
 JOIN = Join("replay", 5, ["tcp/127.0.0.1:1"], epochs=[500, 1000])
 JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300, replay=Origin("h", 7))
 LIMITS = Limits(0.5, 8.0, 10, 5, 50, "a", "")
+EVALUATED = Evaluated(5, 3, Evaluation(600, 400, 2, 10, 21.5, 3.25, 0.0, 1.5))
+RESULT = msgspec.structs.asdict(EVALUATED.result)
+VIDEO = Video(5, 4, 600, np.frombuffer(GIF + b"9a", np.uint8))
 TABLES = to_tables(RunConfig())
 FLAT = np.arange(3, dtype=np.float32)
 
@@ -73,6 +88,8 @@ READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "written": (Written(12).encode("r"), Written.decode),
     "limit": (Limit(0.5, 8).encode("r"), Limit.decode),
     "limits": (LIMITS.encode("r"), Limits.decode),
+    "evaluated": (EVALUATED.encode("r"), Evaluated.decode),
+    "video": (VIDEO.encode("r"), Video.decode),
     "stop": (EndOfRun.because("complete").encode("r"), EndOfRun.decode),
     "current": (Current().encode("r"), Current.decode),
 }
@@ -93,6 +110,7 @@ def _valid(kind: str) -> Message:
         ("error", Error("f", "f: wrong")),
         ("sample", DrawRequest(1, 3, 2, 4, 5, ((7, 0.5),))),
         ("role", Role(2, (4, 5), 6)),
+        ("evaluated", EVALUATED),
         ("stats", STATS),
         ("snapshot", Snapshot(12, [4, 8])),
         ("written", Written(12)),
@@ -196,6 +214,11 @@ FIELDS = [
     ("role", "versions", [1]),
     ("role", "versions", [1, -1]),
     ("role", "updates", "many"),
+    ("role", "env_step", -1),
+    ("evaluated", "incarnation", 2**63),
+    ("evaluated", "number", -1),
+    ("video", "number", MAX_COUNT + 1),
+    ("video", "env_step", -1),
     ("stats", "lost", -1),
     ("stats", "samples_wait_for", None),
     ("stop", "reason", None),
@@ -244,7 +267,34 @@ def test_a_bad_specification_is_refused_by_name(field: str, value: object) -> No
     assert caught.value.field == f"fields.spec.{field}"
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("env_step", -1),
+        ("update", MAX_UPDATES + 1),
+        ("network", 3),
+        ("episodes", 0),
+        ("episodes", MAX_EVALUATED + 1),
+        ("return_mean", math.nan),
+        ("return_mean", 2 * MAX_RETURN),
+        ("return_sd", -1.0),
+        ("return_sd", math.inf),
+        ("epsilon", 1.5),
+        ("seconds", -1.0),
+    ],
+)
+def test_a_bad_result_is_refused_by_name(field: str, value: object) -> None:
+    message = _valid("evaluated")
+    with pytest.raises(BadMessage) as caught:
+        Evaluated.decode(replace(message, fields={**message.fields, "result": {**RESULT, field: value}}))
+    assert caught.value.field == f"fields.result.{field}"
+
+
 ARRAYS = [
+    ("video", "gif", np.zeros(6, np.uint8), "gif"),
+    ("video", "gif", np.zeros((2, 3), np.uint8), "gif"),
+    ("video", "gif", np.zeros(0, np.uint8), "gif"),
+    ("video", "gif", np.tile(np.frombuffer(GIF, np.uint8), MAX_VIDEO // 4 + 1), "gif"),
     ("insert", "frames", np.zeros((5, 4), np.float64), "frames"),
     ("insert", "frames", np.zeros((5, 3), np.float32), "frames"),
     ("insert", "frames", np.zeros((0, 4), np.float32), "obs_index"),

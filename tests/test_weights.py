@@ -9,8 +9,8 @@ import zenoh
 from msgspec.structs import replace as changed
 from samples import await_service
 
+from actors.joined import make_policy
 from actors.policy import Policy
-from actors.process import _networks
 from actors.weights import GRACE, WeightsFollower
 from common.errors import JoinError
 from common.messaging.keys import role_key, weights_key
@@ -26,7 +26,7 @@ from learner.broadcast import Broadcaster
 CONFIG = RunConfig(method="coop", network=NetworkSettings(hidden=(8,)))
 
 
-def make_policy(spec: EnvSpec) -> Policy:
+def own_policy(spec: EnvSpec) -> Policy:
     """Networks of the run's layout with parameters of their own."""
     first, second = (FlatNetwork(build_network("mlp", spec, (8,), seed=seed)) for seed in (7, 8))
     return Policy((first, second), spec, np.random.default_rng(0))
@@ -55,7 +55,7 @@ def test_an_actor_follows_weights_and_role_through_swaps(nodes: tuple[Node, Node
     learner, actor = nodes
     agent = Agent(CONFIG, spec)
     broadcaster = Broadcaster(learner, agent)
-    policy = make_policy(spec)
+    policy = own_policy(spec)
     follower = WeightsFollower(actor, policy)
     assert not follower.ready
     refresh_until(follower, 0)  # asked for: the broadcast was before its time
@@ -76,7 +76,7 @@ def test_a_broadcast_that_was_lost_is_asked_for(nodes: tuple[Node, Node], spec: 
     learner, actor = nodes
     agent = Agent(CONFIG, spec)
     broadcaster = Broadcaster(learner, agent)
-    policy = make_policy(spec)
+    policy = own_policy(spec)
     follower = WeightsFollower(actor, policy)
     refresh_until(follower, 0)
     change(agent, 0, 5)
@@ -95,7 +95,7 @@ def test_an_actor_that_has_everything_asks_for_nothing(
 ) -> None:
     learner, actor = nodes
     Broadcaster(learner, Agent(CONFIG, spec))
-    follower = WeightsFollower(actor, make_policy(spec))
+    follower = WeightsFollower(actor, own_policy(spec))
     refresh_until(follower, 0)
     monkeypatch.setattr("actors.weights.GRACE", 0.02)
     monkeypatch.setattr(follower, "fetch", lambda: pytest.fail("asked"))
@@ -108,7 +108,7 @@ def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(nodes: tuple[No
     learner, actor = nodes
     agent = Agent(CONFIG, spec)
     Broadcaster(learner, agent)
-    policy = make_policy(spec)
+    policy = own_policy(spec)
     follower = WeightsFollower(actor, policy)
     refresh_until(follower, 0)
     learner.publish(role_key(learner), Role(2, (9, 9), 9).encode("test")[:20])
@@ -128,7 +128,7 @@ def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
 ) -> None:
     monkeypatch.setattr("actors.weights.ANSWER_TIMEOUT", 0.1)
     learner, actor = nodes
-    policy = make_policy(spec)
+    policy = own_policy(spec)
     follower = WeightsFollower(actor, policy)
     flat = policy.networks[0].snapshot()
     answers = {weights_key(learner, number): Weights(number, 4, flat).encode("test") for number in (1, 2)}
@@ -152,10 +152,10 @@ def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
 def test_a_layout_that_differs_is_refused(spec: EnvSpec) -> None:
     layout = Agent(CONFIG, spec).networks[0].layout_digest()
     joined = Joined(CONFIG, spec, layout, 0, [], 5, 0)
-    first, second = _networks(joined)
+    first, second = make_policy(joined, (), np.random.default_rng(0)).networks
     assert first.layout_digest() == second.layout_digest() == layout
     with pytest.raises(JoinError, match=f"network layout here {layout}, the learner's 0123"):
-        _networks(changed(joined, layout="0123"))
+        make_policy(changed(joined, layout="0123"), (), np.random.default_rng(0))
     wider = replace(CONFIG, network=NetworkSettings(hidden=(9,)))
     with pytest.raises(JoinError, match="network layout here"):
-        _networks(changed(joined, config=wider))
+        make_policy(changed(joined, config=wider), (), np.random.default_rng(0))

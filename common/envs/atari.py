@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import ale_py
 import numpy as np
 from ale_py import roms
@@ -14,6 +16,8 @@ from common.errors import UsageError
 from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
 
+FRAMES_PER_S = 60
+SCREEN = (210, 160)  # height, width
 FRAME_LIMIT = 108_000  # emulator frames of an episode, half an hour of play
 
 
@@ -33,22 +37,7 @@ class AtariEnv:
         self._seeds = np.array(seeds)
         self._clip = settings.clip_rewards
         self._limit_terminal = settings.time_limit_terminal
-        limit = settings.max_episode_steps * settings.frame_skip
-        self._ale = AtariVectorEnv(
-            game,
-            self.num_envs,
-            autoreset_mode=AutoresetMode.SAME_STEP,
-            max_num_frames_per_episode=limit or FRAME_LIMIT,
-            repeat_action_probability=settings.repeat_action_probability,
-            full_action_space=settings.full_action_space,
-            stack_num=settings.stack,
-            frameskip=settings.frame_skip,
-            noop_max=settings.noop_max + 1,  # ALE draws from 0..noop_max-1
-            use_fire_reset=False,
-            # This ends the episode for learning and keeps the game; ALE's `episodic_life` would reset the emulator.
-            life_loss_info=settings.episodic_life,
-            reward_clipping=False,
-        )
+        self._ale = _emulators(settings, game, self.num_envs, stack_num=settings.stack)
         self._game_start = np.empty(0)
 
     def reset(self) -> Array:
@@ -96,6 +85,65 @@ class AtariEnv:
 
     def _shape(self, obs: Array) -> Array:
         return obs.reshape(self.num_envs, *self.spec.obs_shape)
+
+
+class FilmedAtari(AtariEnv):
+    """One emulator of a game, as `FilmedEnv`: a second one plays the same actions from the same seed in full colour."""
+
+    def __init__(self, settings: EnvSettings, game: str, seed: int) -> None:
+        super().__init__(settings, game, [seed])
+        self.pictures_per_s = FRAMES_PER_S / settings.frame_skip
+        self._twin = _emulators(
+            settings, game, 1, stack_num=1, grayscale=False, img_height=SCREEN[0], img_width=SCREEN[1]
+        )
+        self._picture: Array
+
+    def reset(self) -> Array:
+        """See `AtariEnv`."""
+        self._show(self._twin.reset(seed=self._seeds)[0])
+        return super().reset()
+
+    def send(self, actions: NDArray[np.int32]) -> None:
+        """See `AtariEnv`."""
+        super().send(actions)
+        self._twin.send(actions)
+
+    def recv(self) -> Steps:
+        """See `AtariEnv`."""
+        self._show(self._twin.recv()[0])
+        return super().recv()
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The screen: uint8 [210, 160, 3]."""
+        return self._picture
+
+    def close(self) -> None:
+        """Join both emulators' threads."""
+        super().close()
+        del self._twin
+
+    def _show(self, screens: Array) -> None:
+        self._picture = screens.reshape(*SCREEN, 3)
+
+
+def _emulators(settings: EnvSettings, game: str, count: int, **screen: Any) -> AtariVectorEnv:  # noqa: ANN401
+    """ALE's emulators of a game; screen: how they show it."""
+    limit = settings.max_episode_steps * settings.frame_skip
+    return AtariVectorEnv(
+        game,
+        count,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+        max_num_frames_per_episode=limit or FRAME_LIMIT,
+        repeat_action_probability=settings.repeat_action_probability,
+        full_action_space=settings.full_action_space,
+        frameskip=settings.frame_skip,
+        noop_max=settings.noop_max + 1,  # ALE draws from 0..noop_max-1
+        use_fire_reset=False,
+        # This ends the episode for learning and keeps the game; ALE's `episodic_life` would reset the emulator.
+        life_loss_info=settings.episodic_life,
+        reward_clipping=False,
+        **screen,
+    )
 
 
 def atari_spec(settings: EnvSettings, game: str) -> EnvSpec:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from typing import Any
 
 import gymnasium
@@ -12,12 +13,15 @@ from numpy.typing import NDArray
 
 from common.bounds import MAX_ACTIONS, MAX_SIDE
 from common.envs.observations import FrameMaker
+from common.envs.pictures import coloured
 from common.envs.protocol import Steps
 from common.envs.registry import find_registered
 from common.errors import UsageError
 from common.imports import describe
 from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
+
+PICTURES_PER_S = 10.0  # where the environment does not say
 
 
 class GymnasiumEnv:
@@ -26,8 +30,8 @@ class GymnasiumEnv:
     `stack` frames make one observation; zeros stand for frames before an episode's first.
     """
 
-    def __init__(self, settings: EnvSettings, seeds: list[int]) -> None:
-        self._envs, self._limit = _make(settings, len(seeds))
+    def __init__(self, settings: EnvSettings, seeds: list[int], render_mode: str | None = None) -> None:
+        self._envs, self._limit = _make(settings, len(seeds), render_mode)
         self._frame = FrameMaker(settings, self._envs[0].observation_space)
         self.spec = _spec_of(settings, self._envs[0], self._frame)
         self.num_envs = len(seeds)
@@ -120,6 +124,32 @@ class GymnasiumEnv:
         return mask
 
 
+class FilmedGymnasium(GymnasiumEnv):
+    """One environment as `FilmedEnv`: pictures that are its observations, or those that it renders."""
+
+    def __init__(self, settings: EnvSettings, seed: int) -> None:
+        """Raise UsageError for an environment that has no pictures, or lacks a package for them."""
+        (env,), _ = _make(settings, 1)
+        metadata, vectors = env.metadata, len(FrameMaker(settings, env.observation_space).shape) == 1
+        env.close()
+        if vectors and "rgb_array" not in metadata.get("render_modes", ()):
+            raise UsageError(f"env.id: {settings.id!r} has no pictures to film")
+        super().__init__(settings, [seed], "rgb_array" if vectors else None)
+        self.pictures_per_s = float(metadata.get("render_fps", PICTURES_PER_S))
+        self._renders = vectors
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The newest frame of the observation in colour, or what the environment renders; raises UsageError."""
+        if not self._renders:
+            return coloured(self._obs[0, -1] if self.spec.stack > 1 else self._obs[0])
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs neither a screen
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # nor to greet
+        try:
+            return np.asarray(self._envs[0].render(), np.uint8)
+        except gymnasium.error.DependencyNotInstalled as error:
+            raise UsageError(f"env.id: {self.spec.env_id!r} can't be filmed: {describe(error)}") from None
+
+
 def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
     """The specification of a gymnasium id.
 
@@ -133,7 +163,9 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
         envs[0].close()
 
 
-def _make(settings: EnvSettings, count: int) -> tuple[list[gymnasium.Env[Any, Any]], int]:
+def _make(
+    settings: EnvSettings, count: int, render_mode: str | None = None
+) -> tuple[list[gymnasium.Env[Any, Any]], int]:
     """Make environments without gymnasium's checks and step limit; return them and that limit (0: none)."""
     registered = find_registered(settings)
     # By the specification and not by the id, because `make` warns about ids that have a newer version.
@@ -142,7 +174,7 @@ def _make(settings: EnvSettings, count: int) -> tuple[list[gymnasium.Env[Any, An
         order_enforce=False,
         disable_env_checker=True,
         max_episode_steps=None,
-        kwargs={**registered.kwargs, **settings.kwargs},
+        kwargs={**registered.kwargs, **settings.kwargs, **({"render_mode": render_mode} if render_mode else {})},
     )
     try:
         envs = [gymnasium.make(plain) for _ in range(count)]

@@ -5,11 +5,12 @@ Emulators are imported only when they are made, so that a process that only read
 
 from __future__ import annotations
 
+from contextlib import closing
 from difflib import get_close_matches
 
 import numpy as np
 
-from common.envs.protocol import VectorEnv
+from common.envs.protocol import FilmedEnv, VectorEnv
 from common.errors import UsageError
 from common.settings.environment import EnvSettings
 from common.types import EnvSpec
@@ -31,6 +32,33 @@ def make_vector_env(settings: EnvSettings, num_envs: int, seed: int) -> VectorEn
     from common.envs.gymnasium_env import GymnasiumEnv  # noqa: PLC0415
 
     return GymnasiumEnv(settings, seeds.tolist())
+
+
+def make_filmed_env(settings: EnvSettings, seed: int) -> FilmedEnv:
+    """Make one emulator that shows pictures too.
+
+    Raises:
+        UsageError: as `make_vector_env`; or the environment has no pictures, or lacks a package for them.
+    """
+    (first,) = np.random.SeedSequence(seed).generate_state(1) & 0x7FFFFFFF
+    if (game := _atari_game(settings)) is not None:
+        from common.envs.atari import FilmedAtari  # noqa: PLC0415
+
+        return FilmedAtari(settings, game, int(first))
+    from common.envs.gymnasium_env import FilmedGymnasium  # noqa: PLC0415
+
+    return FilmedGymnasium(settings, int(first))
+
+
+def check_filmed(settings: EnvSettings) -> None:
+    """Raise UsageError for an environment that can't be filmed here."""
+    try:
+        env = make_filmed_env(settings, 0)
+        with closing(env):
+            env.reset()
+            env.picture()
+    except UsageError as error:
+        raise UsageError(f"video_every: {error}") from error
 
 
 def env_spec(settings: EnvSettings) -> EnvSpec:

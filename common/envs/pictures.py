@@ -1,8 +1,9 @@
-"""Changes pictures on request: to grayscale, and to another size."""
+"""Changes pictures on request: to grayscale, to another size, and to colours for people."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from colorsys import hsv_to_rgb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,28 @@ def grayscale(picture: Array) -> NDArray[np.float32]:
     """The brightness of a picture: <dtype>[height, width, 3] -> float32 [height, width]."""
     brightness: NDArray[np.float32] = picture @ _LUMA
     return brightness
+
+
+def coloured(frame: Array) -> NDArray[np.uint8]:
+    """A stored frame, <dtype>[height, width] or [height, width, channels], in colour: uint8 [height, width, 3].
+
+    Three channels are red, green and blue; of other numbers of channels, each has a colour of its own, and the last
+    one that is not 0 shows. float32 runs from the least to the largest value.
+    """
+    if frame.dtype == np.float32:
+        low, high = float(frame.min()), float(frame.max())
+        frame = ((frame - low) * (255 / max(high - low, 1e-12))).astype(np.uint8)
+    elif frame.dtype == np.bool_:
+        frame = frame.view(np.uint8) * np.uint8(255)
+    if frame.ndim == 2:
+        return np.repeat(frame[..., None], 3, axis=2)
+    if frame.shape[2] == 3:
+        return frame
+    colours = np.array([hsv_to_rgb(number / frame.shape[2], 0.65, 1.0) for number in range(frame.shape[2])])
+    picture = np.zeros((*frame.shape[:2], 3))
+    for channel, colour in zip(np.moveaxis(frame, 2, 0), colours, strict=True):
+        picture = np.where(channel[..., None] > 0, channel[..., None] * colour, picture)
+    return picture.astype(np.uint8)
 
 
 def make_resizer(size: tuple[int, ...], to: tuple[int, int]) -> Callable[[Array], Array]:

@@ -52,3 +52,15 @@ class VectorEnv(Protocol):
 
     def close(self) -> None:
         """Free the emulators."""
+
+
+class FilmedEnv(VectorEnv, Protocol):
+    """One emulator that also shows pictures for people.
+
+    pictures_per_s: at which the game goes at its usual speed.
+    """
+
+    pictures_per_s: float
+
+    def picture(self) -> NDArray[np.uint8]:
+        """What there is to see of the present state: uint8 [height, width, 3]."""

@@ -136,7 +136,7 @@ class Membership:
         learned: called with each answer and with the time of the request.
         event: called with a line when a member stops answering, and when it is back.
         replay_there: returns whether a replay service is connected; while none is, this thread asks often for the
-            next one's endpoints, otherwise seldom. None: this process is the replay service, which always asks often.
+            next one's endpoints, otherwise seldom. None: this process needs none; it always asks often.
     """
 
     def __init__(

@@ -39,6 +39,11 @@ def role_key(node: KeySpace) -> str:
     return node.key("role")
 
 
+def evaluations_key(node: KeySpace) -> str:
+    """Key at which the learner takes the results of evaluators."""
+    return node.key("evaluations")
+
+
 def stop_key(node: KeySpace) -> str:
     """Key at which the learner ends the run."""
     return node.key("stop")

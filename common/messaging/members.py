@@ -10,8 +10,9 @@ from msgspec import Meta
 
 from common.bounded import Name
 
-ROLES = ("learner", "replay", "actor")
-JOINING = ("replay", "actor", "watch")  # roles that ask the learner for the run's data; "watch" takes no part
+ROLES = ("learner", "replay", "actor", "evaluator")
+# Roles that ask the learner for the run's data; "watch" takes no part.
+JOINING = ("replay", "actor", "evaluator", "watch")
 
 
 class Origin(NamedTuple):

@@ -13,6 +13,7 @@ from common.bounds import (
     MAX_AHEAD,
     MAX_BATCH,
     MAX_ENV_ID,
+    MAX_EVALUATED,
     MAX_GAPS,
     MAX_LAYERS,
     MAX_N_STEP,
@@ -28,6 +29,7 @@ from common.settings.methods import METHODS
 from common.settings.names import EvictionName, MethodName, SamplingName
 from common.settings.policies import EVICTIONS, SAMPLERS
 
+OUTSIDE = ("checkpoint_every", "eval_every", "eval_episodes", "video_every")  # training does not depend on these
 NETWORK_KINDS = ("mlp", "nature", "nips2013", "minatar")
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 
@@ -210,6 +212,12 @@ class RunConfig:
     """Stop once the mean return of the last 100 episodes reaches this."""
     checkpoint_every: Count = 10_000
     """Updates between epochs, the checkpoints of the whole system; 0: only at the end."""
+    eval_every: Count = 0
+    """Environment steps between evaluations: the acting network plays full episodes greedily; 0: none."""
+    eval_episodes: Annotated[int, Field(gt=0, le=MAX_EVALUATED)] = 10
+    """Episodes of each evaluation."""
+    video_every: Count = 0
+    """Environment steps between videos of an episode that the acting network plays greedily; 0: none."""
     env: EnvSettings = field(default_factory=EnvSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
     learner: LearnerSettings = field(default_factory=LearnerSettings)

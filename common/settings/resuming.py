@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import RunError, UsageError
-from common.settings.config import RunConfig
+from common.settings.config import OUTSIDE, RunConfig
 from common.settings.overrides import leaves
 from common.settings.tables import to_tables
 
-_FREE = ("checkpoint_every", "target_return")
+_FREE = (*OUTSIDE, "target_return")
 _TELLS_APART = (("run",), ("method",), ("seed",), ("env", "id"))
 _LIMITS = ("total_updates", "total_episodes")  # 0: none
 
@@ -19,8 +19,8 @@ def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
     """Refuse changes that would make it a different run.
 
     A run may be made longer: `total_steps`, `total_updates` and `total_episodes` may grow, and `target_return` and
-    `checkpoint_every` may take any value. Schedules that span the run (`learner.learning_rate_final`) then follow the
-    longer run.
+    what training does not depend on may take any value. Schedules that span the run (`learner.learning_rate_final`)
+    then follow the longer run.
 
     Args:
         config: the config that the command line asks for. saved: the run's config so far. source: the file of `saved`.

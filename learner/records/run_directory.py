@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from common.errors import RunError
+from common.messaging.messages.evaluate import Evaluation
 from common.process.console import say
 from common.process.files import LineFile, truncate, write_atomic
 from common.process.run_ids import draw_run_id, read_run_id
@@ -20,6 +21,7 @@ from common.settings.config import RunConfig
 from common.settings.overrides import leaves
 from common.settings.tables import to_tables, to_toml
 from learner.records.curve import draw_learning_curve
+from learner.records.evaluations import EvaluationsFile
 from learner.records.mirror import WandbMirror
 from learner.records.summary import Summary
 from learner.records.tensorboard import TensorBoardWriter
@@ -35,9 +37,15 @@ class RunDirectory:
     """Writes a run's files during the run; when a call returns, its lines are complete if the disk has space."""
 
     def __init__(
-        self, path: Path, config: RunConfig, sizes: dict[str, int] | None = None, *, wandb: bool = False
+        self,
+        path: Path,
+        config: RunConfig,
+        sizes: dict[str, int] | None = None,
+        env_step: int = 0,
+        *,
+        wandb: bool = False,
     ) -> None:
-        """Create a run's files, or continue them, cut back to `sizes` in bytes.
+        """Create a run's files; or continue them, cut back to `sizes` in bytes, after `env_step` environment steps.
 
         wandb: mirror TensorBoard's scalars to Weights & Biases.
 
@@ -54,6 +62,7 @@ class RunDirectory:
             (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
             self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
             self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
+            self._evaluations = EvaluationsFile(path, None if sizes is None else env_step)
             self._tensorboard = TensorBoardWriter(path / "tb", mirror)
             self._tensorboard.hyperparameters({".".join(place): value for place, value in leaves(to_tables(config))})
         except OSError as error:
@@ -87,6 +96,29 @@ class RunDirectory:
         self._metrics.write(json.dumps({"time": time.time(), **row}) + "\n")
         self._tensorboard.metrics(row)
 
+    @property
+    def evaluated(self) -> int:
+        """Environment steps at the last evaluation; 0 before it."""
+        return self._evaluations.newest
+
+    def evaluation(self, row: Evaluation) -> None:
+        """Add a line to evaluations.csv, and its returns to TensorBoard."""
+        self._evaluations.add(row)
+        self._tensorboard.evaluation(row.return_mean, row.return_sd, row.env_step)
+        self._look()
+
+    def video(self, gif: bytes, env_step: int) -> None:
+        """Write a film of the acting network after `env_step` steps to videos/, and to TensorBoard."""
+        path = self.path / "videos" / f"{env_step}.gif"
+        try:
+            path.parent.mkdir(exist_ok=True)
+            write_atomic(path, gif)
+        except OSError as error:
+            say(f"{path}: {error.strerror or error}")
+            return
+        self._tensorboard.video(gif, env_step)
+        self._look()
+
     def conclude(self, summary: Summary, title: str) -> None:
         """Write the kept lines, then summary.json, and try to draw the learning curve.
 
@@ -94,7 +126,7 @@ class RunDirectory:
             RunError: there is no space for lines or summary; says how the run has ended all the same.
         """
         try:
-            for file in (self._episodes, self._metrics):
+            for file in (self._episodes, self._metrics, self._evaluations):
                 file.finish()
             write_atomic(self.path / SUMMARY, f"{json.dumps(asdict(summary), indent=2)}\n".encode())
         except OSError as error:
@@ -113,11 +145,13 @@ class RunDirectory:
         """Close all files."""
         self._episodes.close()
         self._metrics.close()
+        self._evaluations.close()
         self._tensorboard.close()
 
     def _look(self) -> None:
         """Report once that the disk is full, and once that it has space again; no line is lost in between."""
-        problem = self._episodes.problem or self._metrics.problem or self._tensorboard.problem
+        files = (self._episodes, self._metrics, self._evaluations, self._tensorboard)
+        problem = next((file.problem for file in files if file.problem), "")
         if problem != self._problem:
             say(f"{self.path}: {problem or 'can be written again'}")
         self._problem = problem

@@ -80,6 +80,17 @@ class TensorBoardWriter:
         """Add a finished episode; step: the run's environment steps at its end, and below."""
         self._scalars({"charts/episodic_return": episode_return, "charts/episodic_length": length}, step)
 
+    def evaluation(self, return_mean: float, return_sd: float, step: int) -> None:
+        """Add an evaluation of the acting network."""
+        self._scalars({"eval/return_mean": return_mean, "eval/return_sd": return_sd}, step)
+
+    def video(self, gif: bytes, step: int) -> None:
+        """Add an animated GIF."""
+        width, height = (int.from_bytes(gif[place : place + 2], "little") for place in (6, 8))
+        image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=gif)
+        summary = Summary(value=[Summary.Value(tag="eval/video", image=image)])
+        self._add(Event(wall_time=time.time(), step=step, summary=summary))
+
     def metrics(self, row: Mapping[str, Any]) -> None:
         """Add the numbers of a row of metrics.jsonl, and the histograms of its samples."""
         step, q_values = row["env_step"], row[f"q{row['acting']}_mean"]

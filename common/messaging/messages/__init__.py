@@ -5,6 +5,7 @@ insert    insert: a segment for the table
 sample    sample / batch: the learner draws a batch; the answer also carries the episodes that ended
 answers   ack, retry, error: a receipt; a request to try again later, with the reason; a rejection or failure
 weights   weights, role: the learner's broadcasts; current: asks for the latest of them
+evaluate  evaluated, video: an evaluator's results and pictures, for the run directory
 stats     stats: the replay service's counters
 limits    limit / limits: reads and changes the limiter's settings
 epoch     snapshot, written: begins the replay service's part of an epoch, and asks whether it is on disk

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from msgspec import Meta, Struct
 
-from common.bounded import Updates
+from common.bounded import Counter, Updates
 from common.messaging import wire
 from common.messaging.messages.body import Body, Layout, check_arrays, check_kind, to_struct
 from common.messaging.wire import Message
@@ -42,10 +42,14 @@ class Weights(Struct, frozen=True):
 
 
 class Role(Body, frozen=True):
-    """The acting network (1 or 2), the newest version of each network, and the run's progress."""
+    """The acting network (1 or 2) and the newest version of each network.
+
+    updates, env_step: updates and environment steps that the run had done when these networks were broadcast.
+    """
 
     kind: ClassVar[str] = "role"
 
     acting: Network
     versions: tuple[Updates, Updates]
     updates: Updates
+    env_step: Counter = 0

@@ -1,0 +1,28 @@
+"""What a process makes of the learner's answer to its request to join: the networks that it follows."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from actors.policy import Policy
+from common.errors import JoinError
+from common.imports import check_allowed
+from common.messaging.messages.join import Joined
+from common.networks.acting import acting_network
+
+
+def make_policy(joined: Joined, allow_import: Collection[str], rng: np.random.Generator) -> Policy:
+    """A policy with networks of the run's layout, whose parameters the learner will send.
+
+    Raises:
+        JoinError: the run needs a module that this process may not import, or this process builds another layout than
+            the learner does.
+    """
+    for field, path in joined.config.imports.items():
+        check_allowed(path, allow_import, field)
+    first, second = (acting_network(joined.config.network, joined.spec) for _ in range(2))
+    if first.layout_digest() != joined.layout:
+        raise JoinError(f"network layout here {first.layout_digest()}, the learner's {joined.layout}")
+    return Policy((first, second), joined.spec, rng)

@@ -1,0 +1,106 @@
+"""Plays full episodes by a policy, on several emulators at once."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from common.envs.make import env_spec, make_vector_env
+from common.envs.protocol import VectorEnv
+from common.messaging.messages.evaluate import Evaluation
+from common.networks.acting import ActingNetwork
+from common.settings.config import RunConfig
+from common.types import Array, EnvSpec
+
+Acting = Callable[[Array], Any]
+"""Actions, int [envs], for observations <frame_dtype>[envs, *obs_shape]."""
+
+AT_ONCE = 8  # emulators, if nothing else is asked for
+
+
+def play(env: VectorEnv, act: Acting, episodes: int, stopped: Callable[[], bool] = lambda: False) -> list[float]:
+    """Play full episodes, and return their unclipped returns; fewer if `stopped` returns True after a step.
+
+    Each emulator plays the same number of episodes, or one more: the first ones to end would be the short ones.
+    """
+    left = np.array([len(share) for share in np.array_split(np.arange(episodes), env.num_envs)])
+    totals = np.zeros(env.num_envs)
+    returns: list[float] = []
+    obs = env.reset()
+    while len(returns) < episodes and not stopped():
+        steps = env.step(np.asarray(act(obs), np.int32).reshape(env.num_envs))
+        obs = steps.obs
+        totals += steps.raw_rewards
+        for number in np.flatnonzero(steps.episode_over & (left > 0)).tolist():
+            returns.append(float(totals[number]))
+            left[number] -= 1
+        totals[steps.episode_over] = 0.0
+    return returns
+
+
+def greedy(network: ActingNetwork, spec: EnvSpec) -> Acting:
+    """A policy that always takes the best action of a network."""
+    return lambda obs: network.q_values(obs, spec).argmax(1)
+
+
+def exploring(act: Acting, epsilon: float, num_actions: int, rng: np.random.Generator) -> Acting:
+    """A policy that takes a random action with probability `epsilon`, and otherwise the one of `act`."""
+
+    def explore(obs: Array) -> Array:
+        random = rng.integers(num_actions, size=len(obs), dtype=np.int32)
+        return np.where(rng.random(len(obs)) < epsilon, random, act(obs))
+
+    return explore if epsilon else act
+
+
+class Evaluator:
+    """Lets the acting network of a run play episodes of their own, apart from those of the training.
+
+    Args:
+        config: of the run. episodes: of each evaluation. at_once: emulators at most.
+        stopped: returns whether an evaluation should be abandoned.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        stopped: Callable[[], bool],
+        episodes: int | None = None,
+        epsilon: float = 0.0,
+        at_once: int = AT_ONCE,
+    ) -> None:
+        self._config = config
+        self._stopped = stopped
+        self._episodes = episodes or config.eval_episodes
+        self._epsilon = epsilon
+        self._at_once = at_once
+
+    def evaluate(self, network: ActingNetwork, number: int, update: int, env_step: int) -> Evaluation | None:
+        """Evaluate a network, 1 or 2, after `env_step` steps of the run; None if that was abandoned.
+
+        The emulators' seed follows from the run's seed and the step, so that a repetition gives the same result.
+        """
+        began, config, episodes = time.monotonic(), self._config, self._episodes
+        env_seed, policy_seed = np.random.SeedSequence([config.seed, 5, env_step]).spawn(2)
+        env = make_vector_env(config.env, min(episodes, self._at_once), int(env_seed.generate_state(1)[0]))
+        rng = np.random.default_rng(policy_seed)
+        act = exploring(greedy(network, env.spec), self._epsilon, env.spec.num_actions, rng)
+        try:
+            returns = play(env, act, episodes, self._stopped)
+        finally:
+            env.close()
+        if len(returns) < episodes:
+            return None
+        mean, sd, seconds = statistics.fmean(returns), statistics.pstdev(returns), time.monotonic() - began
+        return Evaluation(env_step, update, number, episodes, mean, sd, self._epsilon, seconds)
+
+    def film(self, network: ActingNetwork, env_step: int) -> bytes:
+        """Film the beginning of an episode that a network plays greedily after `env_step` steps: an animated GIF."""
+        from experiments.film import Film, short_gif  # noqa: PLC0415 (most runs film nothing)
+
+        settings, seed = self._config.env, np.random.SeedSequence([self._config.seed, 6, env_step]).generate_state(1)
+        return short_gif(Film(greedy(network, env_spec(settings)), settings, int(seed[0])))

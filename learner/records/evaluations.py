@@ -1,0 +1,54 @@
+"""evaluations.csv: how the networks of a run play without exploration, a line for each evaluation."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from common.messaging.messages.evaluate import Evaluation
+from common.process.files import LineFile
+
+EVALUATIONS = "evaluations.csv"
+FIELDS = Evaluation.__struct_fields__
+
+
+class EvaluationsFile(LineFile):
+    """Writes evaluations.csv.
+
+    newest: environment steps at the last evaluation; 0 before it.
+    """
+
+    def __init__(self, folder: Path, env_step: int | None) -> None:
+        """Create the file, or continue it with the lines of a run that is resumed after `env_step` steps.
+
+        Lines stay by their step, and not up to a size as in other files: results arrive later than the epoch of the
+        networks that they are of.
+
+        Raises:
+            OSError: it can't be written.
+        """
+        path = folder / EVALUATIONS
+        kept = [] if env_step is None else [row for row in _rows(path) if int(row[0]) <= env_step]
+        super().__init__(path, go_on=False)
+        self.newest = 0
+        self._csv = csv.writer(self, lineterminator="\n")
+        self._csv.writerow(FIELDS)
+        for row in kept:
+            self._write(row)
+
+    def add(self, row: Evaluation) -> None:
+        """Add a line."""
+        values = [getattr(row, name) for name in FIELDS]
+        self._write([f"{value:.8g}" if isinstance(value, float) else str(value) for value in values])
+
+    def _write(self, row: list[str]) -> None:
+        self._csv.writerow(row)
+        self.newest = max(self.newest, int(row[0]))
+
+
+def _rows(path: Path) -> list[list[str]]:
+    """The whole lines of a file that a kill may have torn."""
+    if not path.exists():
+        return []
+    whole = path.read_text(encoding="utf-8").rpartition("\n")[0]
+    return [row for row in list(csv.reader(whole.splitlines()))[1:] if len(row) == len(FIELDS)]

@@ -1,0 +1,219 @@
+"""Evaluation during a run: what an evaluator plays, what becomes of its results; the training stays the same."""
+
+import csv
+import re
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from commands import run_command
+from samples import await_service
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_topology import running, wait_for
+
+from common.envs.make import make_vector_env
+from common.messaging.keys import evaluations_key
+from common.messaging.messages.answers import Ack
+from common.messaging.messages.evaluate import Evaluated, Evaluation
+from common.messaging.transport import Node, Refused
+from common.process.lifecycle import Stop
+from common.process.processes import free_endpoint
+from common.settings.config import NetworkSettings, RunConfig
+from common.settings.environment import EnvSettings
+from common.settings.sources import base_config
+from experiments.episodes import Evaluator, exploring, play
+from experiments.evaluator import Schedule
+from experiments.lockstep_run import LockstepRun
+from learner.agent import Agent
+from learner.evaluations import EvaluationInbox
+from learner.records.run_directory import RunDirectory
+
+COLUMNS = "env_step,update,network,episodes,return_mean,return_sd,epsilon,seconds"
+RESULT = Evaluation(500, 300, 1, 10, 21.5, 3.25, 0.0, 1.5)
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    text = (folder / "evaluations.csv").read_text()
+    assert text.splitlines()[0] == COLUMNS
+    return list(csv.DictReader(text.splitlines()))
+
+
+def without_seconds(folder: Path) -> list[dict[str, str]]:
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in rows(folder)]
+
+
+@pytest.mark.parametrize(("episodes", "left", "right"), [(4, 2, 2), (3, 2, 1)])
+def test_short_episodes_do_not_crowd_out_long_ones(episodes: int, left: int, right: int) -> None:
+    """The first emulator walks to the left, for 50 steps and nothing; the other one reaches the end within 5."""
+    env = make_vector_env(EnvSettings(id="coop/Corridor-v0"), 2, 0)
+    returns = play(env, lambda obs: np.array([0, 1]), episodes)
+    env.close()
+    assert sorted(returns) == [0.0] * left + [1.0] * right
+
+
+def test_epsilon_is_the_share_of_random_actions() -> None:
+    act = exploring(lambda obs: np.zeros(len(obs), np.int64), 0.3, 5, np.random.default_rng(0))
+    actions = act(np.zeros((10_000, 4)))
+    assert np.mean(actions != 0) == pytest.approx(0.3 * 4 / 5, abs=0.02)
+
+
+def test_an_evaluation_can_be_repeated_and_abandoned() -> None:
+    config = replace(base_config([]), eval_episodes=6)
+    env = make_vector_env(config.env, 1, 0)
+    network = Agent(config, env.spec).networks[1]
+    env.close()
+    evaluator = Evaluator(config, lambda: False)
+    first, again, other = (evaluator.evaluate(network, 2, 7, step) for step in (100, 100, 200))
+    assert first is not None
+    assert again is not None
+    assert other is not None
+    assert (first.env_step, first.update, first.network, first.episodes, first.epsilon) == (100, 7, 2, 6, 0)
+    assert msgspec.structs.replace(again, seconds=first.seconds) == first
+    assert other.return_mean != first.return_mean, "another step has other starts"
+    assert Evaluator(config, lambda: True).evaluate(network, 2, 7, 100) is None
+
+
+def test_a_schedule_by_steps_and_one_by_seconds() -> None:
+    steps = Schedule(None, 100)
+    asked = [(0, 0), (50, 99), (52, 101), (60, 130), (120, 305), (121, 310), (180, 400)]
+    begun = []
+    for progress in asked:
+        if steps.due(progress, 0.0):
+            steps.begun(progress, 0.0)
+            begun.append(progress[1])
+    assert begun == [101, 305, 400]
+    seconds = Schedule(60.0, 0)
+    assert seconds.due((0, 0), 5.0)
+    seconds.begun((0, 0), 5.0)
+    assert not seconds.due((9, 9), 64.0)
+    assert seconds.due((9, 9), 65.0)
+    assert not seconds.due((0, 0), 65.0), "these networks have been evaluated"
+    never = Schedule(None, 0)
+    never.rush()
+    assert not never.due((10**9, 10**9), 1e9)
+    steps.rush()
+    assert [steps.due(progress, 0.0) for progress in ((180, 400), (181, 401))] == [False, True]
+
+
+class StopsAfter(Stop):
+    """A stop at the given number of looks at it."""
+
+    def __init__(self, looks: int) -> None:
+        super().__init__()
+        self._left = looks
+
+    def is_set(self) -> bool:
+        self._left -= 1
+        if self._left < 0:
+            self.set("interrupted")
+        return super().is_set()
+
+
+def lockstep(config: RunConfig, folder: Path, stop: Stop, *, resume: bool = False) -> str:
+    with closing(LockstepRun(config, folder, "test", resume=resume)) as run:
+        return run.play(stop).exit
+
+
+def test_lockstep_runs_are_the_same_with_evaluations_and_through_stops(tmp_path: Path) -> None:
+    config = base_config(["--total-steps", "300"])
+    env = replace(config.env, max_episode_steps=40)
+    config = replace(config, env=env, checkpoint_every=70, network=NetworkSettings(hidden=(8,)))
+    evaluating = replace(config, eval_every=50, eval_episodes=3)
+    assert lockstep(config, tmp_path / "without", Stop()) == "complete"
+    assert lockstep(evaluating, tmp_path / "whole", Stop()) == "complete"
+    stops = 0
+    while lockstep(evaluating, tmp_path / "torn", StopsAfter(170), resume=stops > 0) == "interrupted":
+        stops += 1
+    assert stops > 1
+    episodes = [(tmp_path / name / "episodes.csv").read_bytes() for name in ("without", "whole", "torn")]
+    assert episodes[0] == episodes[1] == episodes[2]
+    assert [int(row["env_step"]) for row in rows(tmp_path / "whole")] == list(range(50, 301, 50))
+    assert {row["network"] for row in rows(tmp_path / "whole")} == {"1", "2"}
+    assert without_seconds(tmp_path / "torn") == without_seconds(tmp_path / "whole")
+    assert rows(tmp_path / "without") == []
+
+
+def test_a_resumed_run_keeps_the_lines_up_to_its_epoch(tmp_path: Path) -> None:
+    config = base_config([])
+    with RunDirectory(tmp_path, config) as directory:
+        sizes = directory.sizes()
+        for step in (100, 200, 300):
+            directory.evaluation(msgspec.structs.replace(RESULT, env_step=step))
+        assert directory.evaluated == 300
+    with (tmp_path / "evaluations.csv").open("a") as file:
+        file.write("150,2,1,10,1")  # torn by a kill
+    with RunDirectory(tmp_path, config, sizes, 200) as directory:
+        assert directory.evaluated == 200
+        directory.evaluation(msgspec.structs.replace(RESULT, env_step=250, return_mean=1234567.25))
+    assert [row["env_step"] for row in rows(tmp_path)] == ["100", "200", "250"]
+    assert rows(tmp_path)[-1]["return_mean"] == "1234567.2"
+    board = EventAccumulator(str(tmp_path / "tb")).Reload()
+    assert [event.step for event in board.Scalars("eval/return_mean")][-1] == 250
+    with RunDirectory(tmp_path, config):
+        pass
+    assert rows(tmp_path) == []
+
+
+@pytest.fixture
+def inbox(nodes: tuple[Node, Node]) -> Iterator[tuple[EvaluationInbox, Node]]:
+    """The inbox of a learner that has done 1,000 steps, and an evaluator's node."""
+    learner, evaluator = nodes
+    taken = EvaluationInbox(learner, lambda: 1000)
+    await_service(evaluator, evaluations_key(evaluator))
+    yield taken, evaluator
+    assert learner.faults.count == 0
+
+
+def test_a_result_is_taken_once(inbox: tuple[EvaluationInbox, Node]) -> None:
+    taken, node = inbox
+    later = msgspec.structs.replace(RESULT, env_step=1000)
+    for sent in (Evaluated(5, 0, RESULT), Evaluated(5, 0, RESULT), Evaluated(6, 0, later), Evaluated(5, 1, later)):
+        answer = node.ask(evaluations_key(node), sent.encode(node.run))
+        assert Ack.decode(answer).inserted == 1000
+    assert list(taken.take()) == [RESULT, later, later]
+    assert list(taken.take()) == []
+
+
+def test_a_result_of_a_future_that_is_gone_is_refused(inbox: tuple[EvaluationInbox, Node]) -> None:
+    taken, node = inbox
+    ahead = Evaluated(5, 0, msgspec.structs.replace(RESULT, env_step=1001))
+    with pytest.raises(Refused, match="an evaluation after 1,001 steps; this run has done 1,000"):
+        node.ask(evaluations_key(node), ahead.encode(node.run))
+    assert list(taken.take()) == []
+
+
+def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -> None:
+    endpoint, folder = free_endpoint(), tmp_path / "run"
+    flags = ("--total-steps", "1500", "--eval-every", "500", "--eval-episodes", "2", "--run-dir", str(folder))
+    mine = ("--connect", endpoint, "--every", "0.5", "--episodes", "3", "--epsilon", "0.5", "--envs", "2")
+    with (
+        running("coop-eval", "--run", "coop", *mine, "--join-timeout", "100") as second,
+        running("coop-local", "--listen", endpoint, *flags) as local,
+    ):
+        out, err = local.communicate(timeout=110)
+        told, wrong = second.communicate(timeout=20)
+    assert (local.returncode, err, second.returncode, wrong) == (0, "", 0, "")
+    last = re.search(r"complete: ([\d,]+) steps, ([\d,]+) updates", out)
+    assert last is not None
+    end = [int(number.replace(",", "")) for number in last.groups()]
+    for epsilon, episodes in (("0", "2"), ("0.5", "3")):
+        found = [row for row in rows(folder) if row["epsilon"] == epsilon]
+        assert {row["episodes"] for row in found} == {episodes}
+        steps = [int(row["env_step"]) for row in found]
+        assert steps == sorted(set(steps))
+        assert [steps[-1], int(found[-1]["update"])] == end
+    assert f"3 episodes after {end[0]:,} steps" in told
+
+
+def test_an_evaluator_needs_to_know_how_often(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with running("coop-learner", "--listen", endpoint, "--run-dir", str(tmp_path / "run")) as learner:
+        assert learner.stdout is not None
+        wait_for("the learner", lambda: "listens" in learner.stdout.readline())
+        done = run_command("coop-eval", "--connect", endpoint, "--join-timeout", "60")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "coop-eval: error: --every: needed, as the run has no eval_every\n"
