@@ -10,6 +10,7 @@ import numpy as np
 
 from actors.joined import make_policy
 from actors.weights import WeightsFollower
+from common.envs.make import check_filmed
 from common.errors import UsageError
 from common.messaging.joining import Membership, join, leave_run
 from common.messaging.keys import evaluations_key
@@ -115,10 +116,12 @@ class EvaluatorService:
         incarnation: int,
         console: Console,
     ) -> None:
-        """Raise UsageError if neither the plan nor the run says how often; JoinError as `make_policy`."""
+        """Raise UsageError if nothing says how often, or the run can't be filmed; JoinError as `make_policy`."""
         steps, config = plan.steps or joined.config.eval_every, joined.config
         if plan.seconds is None and not (steps or config.video_every):
             raise UsageError("--every: needed, as the run has no eval_every")
+        if config.video_every:
+            check_filmed(config.env)
         self._policy = make_policy(joined, allow_import, np.random.default_rng(0))
         self._node, self._stop, self._console, self._incarnation = node, stop, console, incarnation
         self._weights = WeightsFollower(node, self._policy)

@@ -116,6 +116,7 @@ class LearnerService:
         self._directory.record(effects.episodes, effects.metrics)
 
     def _record_evaluations(self) -> None:
+        """Write the results that evaluators have sent."""
         for result in self._evaluations.take():
             if isinstance(result, Evaluation):
                 self._directory.evaluation(result)
@@ -171,6 +172,8 @@ class LearnerService:
             self._directory.conclude(summary, summary.title)
         finally:
             self._farewell(outcome)
+        if self._directory.evaluated:
+            self._directory.draw(summary.title)  # again, with what evaluators have sent since
         return summary
 
     def _replay_stats(self) -> ReplayStats | None:

@@ -18,7 +18,7 @@ from test_topology import running, wait_for
 from common.envs.make import make_vector_env
 from common.messaging.keys import evaluations_key
 from common.messaging.messages.answers import Ack
-from common.messaging.messages.evaluate import Evaluated, Evaluation
+from common.messaging.messages.evaluate import GIF, Evaluated, Evaluation
 from common.messaging.transport import Node, Refused
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
@@ -30,6 +30,7 @@ from experiments.evaluator import Schedule
 from experiments.lockstep_run import LockstepRun
 from learner.agent import Agent
 from learner.evaluations import EvaluationInbox
+from learner.records.evaluations import returns_by_step
 from learner.records.run_directory import RunDirectory
 
 COLUMNS = "env_step,update,network,episodes,return_mean,return_sd,epsilon,seconds"
@@ -137,6 +138,25 @@ def test_lockstep_runs_are_the_same_with_evaluations_and_through_stops(tmp_path:
     assert rows(tmp_path / "without") == []
 
 
+def test_films_of_a_lockstep_run(tmp_path: Path) -> None:
+    config = base_config(["--preset", "catch", "--total-steps", "300"])
+    small = NetworkSettings(hidden=(8,))
+    config = replace(config, actor=replace(config.actor, envs=1), network=small, video_every=150)
+    assert lockstep(config, tmp_path / "run", Stop()) == "complete"
+    images = EventAccumulator(str(tmp_path / "run" / "tb")).Reload().Images("eval/video")
+    assert [(image.step, image.width, image.height) for image in images] == [(150, 252, 252), (300, 252, 252)]
+    for image in images:
+        assert (tmp_path / "run" / "videos" / f"{image.step}.gif").read_bytes() == image.encoded_image_string
+
+
+@pytest.mark.parametrize("name", ["coop-local", "coop-lockstep"])
+def test_what_can_t_be_filmed_is_refused_before_the_run_starts(name: str, tmp_path: Path) -> None:
+    done = run_command(name, "--env.id", "coop/Corridor-v0", "--video-every", "9", "--run-dir", tmp_path / "run")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"{name}: error: video_every: env.id: 'coop/Corridor-v0' has no pictures to film\n"
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_resumed_run_keeps_the_lines_up_to_its_epoch(tmp_path: Path) -> None:
     config = base_config([])
     with RunDirectory(tmp_path, config) as directory:
@@ -156,6 +176,15 @@ def test_a_resumed_run_keeps_the_lines_up_to_its_epoch(tmp_path: Path) -> None:
     with RunDirectory(tmp_path, config):
         pass
     assert rows(tmp_path) == []
+
+
+def test_the_curve_is_of_the_play_with_the_least_randomness(tmp_path: Path) -> None:
+    with RunDirectory(tmp_path, base_config([])) as directory:
+        for step, epsilon, mean in ((300, 0.0, 3.0), (100, 0.0, 1.0), (200, 0.5, 9.0), (200, 0.0, 2.0)):
+            result = msgspec.structs.replace(RESULT, env_step=step, epsilon=epsilon, return_mean=mean)
+            directory.evaluation(result)
+    assert returns_by_step((tmp_path / "evaluations.csv").read_text()).tolist() == [[100, 200, 300], [1, 2, 3]]
+    assert returns_by_step(COLUMNS).shape == (2, 0)
 
 
 @pytest.fixture
@@ -189,6 +218,7 @@ def test_a_result_of_a_future_that_is_gone_is_refused(inbox: tuple[EvaluationInb
 def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -> None:
     endpoint, folder = free_endpoint(), tmp_path / "run"
     flags = ("--total-steps", "1500", "--eval-every", "500", "--eval-episodes", "2", "--run-dir", str(folder))
+    flags += ("--env.id", "coop/Catch-v0", "--network.hidden", "8", "--video-every", "500")
     mine = ("--connect", endpoint, "--every", "0.5", "--episodes", "3", "--epsilon", "0.5", "--envs", "2")
     with (
         running("coop-eval", "--run", "coop", *mine, "--join-timeout", "100") as second,
@@ -207,6 +237,11 @@ def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -
         assert steps == sorted(set(steps))
         assert [steps[-1], int(found[-1]["update"])] == end
     assert f"3 episodes after {end[0]:,} steps" in told
+    videos = list((folder / "videos").iterdir())
+    assert videos
+    assert all(video.read_bytes().startswith(GIF) for video in videos)
+    images = EventAccumulator(str(folder / "tb")).Reload().Images("eval/video")
+    assert {f"{image.step}.gif" for image in images} == {video.name for video in videos}
 
 
 def test_an_evaluator_needs_to_know_how_often(tmp_path: Path) -> None:

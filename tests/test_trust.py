@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from common.messaging.keys import join_key, replay_key
+from common.messaging.keys import evaluations_key, join_key, replay_key
 from common.messaging.messages.epoch import Snapshot
+from common.messaging.messages.evaluate import Evaluated, Evaluation
 from common.messaging.messages.join import Join
 from common.messaging.messages.limits import Limit
 from common.messaging.messages.sample import DrawRequest
@@ -147,6 +148,22 @@ def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, s
         assert overheard.try_recv() is None
         token.undeclare()
         assert stats(inside).bad_messages == before.bad_messages, "nothing of it came through"
+
+
+def test_an_evaluator_s_certificate_reads_weights_and_reports(run: tuple[str, str], keys: Path) -> None:
+    report = Evaluated(1, 0, Evaluation(0, 0, 1, 1, 1.0, 0.0, 0.0, 1.0)).encode(RUN)
+    with joined(run, keys / "evaluator.json5", "evaluator") as evaluator, joined(run, keys / "actor.json5") as actor:
+        joining = Join("evaluator", 5, []).encode(RUN)
+        assert evaluator.ask(join_key(evaluator, "evaluator"), joining).kind == "joined"
+        assert evaluator.ask(evaluator.key("weights", "1"), Current().encode(RUN)).kind == "weights"
+        assert evaluator.ask(evaluations_key(evaluator), report).kind == "ack"
+        for node, key, payload in (
+            (actor, evaluations_key(actor), report),
+            (evaluator, replay_key(evaluator, "insert"), DrawRequest(1, 0, 0, 32, 0).encode(RUN)),
+            (evaluator, replay_key(evaluator, "stats"), StatsQuestion().encode(RUN)),
+        ):
+            with pytest.raises(NoAnswer):
+                node.ask(key, payload)
 
 
 def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys: Path) -> None:

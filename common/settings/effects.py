@@ -50,7 +50,6 @@ _CONDITIONS = (
         lambda c: SAMPLERS.get(c.replay.sampling).priorities,
         "replay.sampling = {c.replay.sampling!r}",
     ),
-    Condition(("eval_episodes",), lambda c: c.eval_every > 0, "eval_every = 0"),
     Condition(
         ("actor.epsilon_steps", "actor.epsilon_decay"),
         lambda c: c.actor.epsilon_start != c.actor.epsilon_final,

@@ -1,9 +1,9 @@
 #!/bin/sh
 # Makes a small certificate authority and a Zenoh configuration with a certificate of its own for learner, replay
-# service and actors:
+# service, actors and evaluators:
 #   deploy/zenoh/make_keys.sh FOLDER [NAME-OR-ADDRESS ...]
 # The names are those that learner and replay service are reached by (default: localhost 127.0.0.1). Each of
-# FOLDER/learner.json5, replay.json5 and actor.json5 is all that a machine needs for --zenoh-config, and holds a private
+# FOLDER/learner.json5, replay.json5, actor.json5 and evaluator.json5 is all that a machine needs for --zenoh-config, and holds a private
 # key. FOLDER/ca.key signs new ones: keep it off the machines of the run. DAYS sets how long certificates hold.
 set -eu
 umask 077
@@ -46,4 +46,5 @@ openssl req -x509 -new -key ca.key -subj "/CN=coop run authority" -days "$days" 
 certificate learner service "extendedKeyUsage=serverAuth,clientAuth\nsubjectAltName=${names#,}"
 certificate replay service "extendedKeyUsage=serverAuth,clientAuth\nsubjectAltName=${names#,}"
 certificate actor actor "extendedKeyUsage=clientAuth" # can't pass for a learner or a replay service
-echo "$folder: learner.json5, replay.json5 and actor.json5 for --zenoh-config, good for $days days; ca.key signs more"
+certificate evaluator actor "extendedKeyUsage=clientAuth"
+echo "$folder: learner.json5, replay.json5, actor.json5 and evaluator.json5 for --zenoh-config, good for $days days; ca.key signs more"

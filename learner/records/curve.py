@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike
 
 from common.process.files import write_atomic
 from common.returns import RETURN_WINDOW, running_mean
+from learner.records.evaluations import EVALUATIONS, Floats, returns_by_step
+
+NONE: Floats = np.empty((2, 0))
 
 
 def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
@@ -20,11 +23,14 @@ def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
     if not rows:
         return None
     steps, returns = np.array(rows).T
-    return draw_curve(steps, returns, title, run_dir / "learning_curve.png")
+    evaluated = returns_by_step((run_dir / EVALUATIONS).read_text(encoding="utf-8"))
+    return draw_curve(steps, returns, title, run_dir / "learning_curve.png", evaluated)
 
 
-def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path) -> Path:
+def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path, evaluated: Floats = NONE) -> Path:
     """Draw returns [episodes] against the environment steps [episodes] at which the episodes ended, as a PNG.
+
+    evaluated: of `returns_by_step`.
 
     Raises:
         OSError: it can't be written; an older one is untouched then.
@@ -36,6 +42,8 @@ def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path) -> 
     axes = figure.subplots()
     axes.plot(steps, returns, ".", markersize=2, alpha=0.35, label="episode")
     axes.plot(steps, running_mean(returns), linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
+    if evaluated.size:
+        axes.plot(*evaluated, "o-", markersize=4, label="evaluation")
     axes.set(xlabel="environment steps", ylabel="return", title=title)
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from common.messaging.messages.evaluate import Evaluation
 from common.process.files import LineFile
 
 EVALUATIONS = "evaluations.csv"
+Floats = NDArray[np.float64]
 FIELDS = Evaluation.__struct_fields__
 
 
@@ -44,6 +48,14 @@ class EvaluationsFile(LineFile):
     def _write(self, row: list[str]) -> None:
         self._csv.writerow(row)
         self.newest = max(self.newest, int(row[0]))
+
+
+def returns_by_step(text: str) -> Floats:
+    """Environment steps, in order, and mean returns, of the lines with the least epsilon: float64 [2, lines]."""
+    rows = list(csv.DictReader(text.splitlines()))
+    least = min((float(row["epsilon"]) for row in rows), default=0.0)
+    found = [(float(row["env_step"]), float(row["return_mean"])) for row in rows if float(row["epsilon"]) == least]
+    return np.array(sorted(found), np.float64).reshape(-1, 2).T
 
 
 def _rows(path: Path) -> list[list[str]]:

@@ -132,6 +132,10 @@ class RunDirectory:
         except OSError as error:
             # The message must also say how the run ended.
             raise RunError(f"{self.path}: {error.strerror or error}; how the run ended: {summary.exit}") from error
+        self.draw(title)
+
+    def draw(self, title: str) -> None:
+        """Draw the learning curve if there is space for it."""
         try:
             draw_learning_curve(self.path, title)
         except OSError as error:
