@@ -2,7 +2,9 @@
 
 import csv
 import re
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -16,24 +18,34 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_topology import running, wait_for
 
 from common.envs.make import make_vector_env
-from common.messaging.keys import evaluations_key
+from common.errors import UsageError
+from common.messaging.keys import evaluations_key, stop_key
 from common.messaging.messages.answers import Ack
 from common.messaging.messages.evaluate import GIF, Evaluated, Evaluation
+from common.messaging.messages.join import Joined
+from common.messaging.messages.stop import EndOfRun
 from common.messaging.transport import Node, Refused
+from common.process.console import Console
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
 from common.settings.config import NetworkSettings, RunConfig
 from common.settings.environment import EnvSettings
 from common.settings.sources import base_config
+from common.types import EnvSpec
 from experiments.episodes import Evaluator, exploring, play
-from experiments.evaluator import Schedule
+from experiments.evaluator import EvaluatorService, Plan, Schedule
 from experiments.lockstep_run import LockstepRun
+from experiments.report.figures import evaluations
+from experiments.report.packed import pack
+from experiments.report.study import load_study
 from learner.agent import Agent
+from learner.broadcast import Broadcaster
 from learner.evaluations import EvaluationInbox
 from learner.records.evaluations import returns_by_step
 from learner.records.run_directory import RunDirectory
 
 COLUMNS = "env_step,update,network,episodes,return_mean,return_sd,epsilon,seconds"
+SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 RESULT = Evaluation(500, 300, 1, 10, 21.5, 3.25, 0.0, 1.5)
 
 
@@ -137,6 +149,14 @@ def test_lockstep_runs_are_the_same_with_evaluations_and_through_stops(tmp_path:
     assert without_seconds(tmp_path / "torn") == without_seconds(tmp_path / "whole")
     assert rows(tmp_path / "without") == []
 
+    pack(tmp_path, tmp_path / "packed.parquet")
+    for source in (tmp_path, tmp_path / "packed.parquet"):
+        (panel,) = evaluations(load_study(source)).panels
+        (line,) = panel.lines
+        assert line.x.tolist() == list(range(50, 301, 50))
+        means = [float(row["return_mean"]) for row in rows(tmp_path / "whole")]
+        assert line.y.value.tolist() == pytest.approx(means), "of two runs that are the same"
+
 
 def test_films_of_a_lockstep_run(tmp_path: Path) -> None:
     config = base_config(["--preset", "catch", "--total-steps", "300"])
@@ -215,17 +235,18 @@ def test_a_result_of_a_future_that_is_gone_is_refused(inbox: tuple[EvaluationInb
     assert list(taken.take()) == []
 
 
+@pytest.mark.timeout(600)  # on a busy machine
 def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -> None:
     endpoint, folder = free_endpoint(), tmp_path / "run"
     flags = ("--total-steps", "1500", "--eval-every", "500", "--eval-episodes", "2", "--run-dir", str(folder))
-    flags += ("--env.id", "coop/Catch-v0", "--network.hidden", "8", "--video-every", "500")
+    flags += ("--method", "dqn", "--env.id", "coop/Catch-v0", "--network.hidden", "8", "--video-every", "500")
     mine = ("--connect", endpoint, "--every", "0.5", "--episodes", "3", "--epsilon", "0.5", "--envs", "2")
     with (
-        running("coop-eval", "--run", "coop", *mine, "--join-timeout", "100") as second,
+        running("coop-eval", "--run", "coop", *mine, "--join-timeout", "500") as second,
         running("coop-local", "--listen", endpoint, *flags) as local,
     ):
-        out, err = local.communicate(timeout=110)
-        told, wrong = second.communicate(timeout=20)
+        out, err = local.communicate(timeout=500)
+        told, wrong = second.communicate(timeout=80)
     assert (local.returncode, err, second.returncode, wrong) == (0, "", 0, "")
     last = re.search(r"complete: ([\d,]+) steps, ([\d,]+) updates", out)
     assert last is not None
@@ -244,11 +265,63 @@ def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -
     assert {f"{image.step}.gif" for image in images} == {video.name for video in videos}
 
 
-def test_an_evaluator_needs_to_know_how_often(tmp_path: Path) -> None:
-    endpoint = free_endpoint()
-    with running("coop-learner", "--listen", endpoint, "--run-dir", str(tmp_path / "run")) as learner:
-        assert learner.stdout is not None
-        wait_for("the learner", lambda: "listens" in learner.stdout.readline())
-        done = run_command("coop-eval", "--connect", endpoint, "--join-timeout", "60")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "coop-eval: error: --every: needed, as the run has no eval_every\n"
+def service(nodes: tuple[Node, Node], stop: Stop, plan: Plan) -> tuple[Agent, EvaluatorService]:
+    """A learner's agent, and an evaluator that has joined its run."""
+    config = RunConfig(method="coop", network=NetworkSettings(hidden=(8,)))
+    agent = Agent(config, SPEC)
+    joined = Joined(config, SPEC, agent.networks[0].layout_digest(), 0, [], 5, 0)
+    return agent, EvaluatorService(nodes[1], stop, joined, (), plan, 7, Console())
+
+
+def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> None:
+    learner, evaluator = nodes
+    stop = Stop()
+    evaluator.follow_stop(stop)
+    agent, evaluations = service(nodes, stop, Plan(steps=100, episodes=2))
+    broadcaster, inbox = Broadcaster(learner, agent), EvaluationInbox(learner, lambda: 1000)
+    taken: list[Evaluation] = []
+
+    def learn(update: int, env_step: int) -> None:
+        agent.acting, agent.updates = update % 2, update
+        agent.versions[agent.acting] = update
+        broadcaster.publish(env_step)
+
+    def taken_all(count: int) -> bool:
+        taken.extend(result for result in inbox.take() if isinstance(result, Evaluation))
+        return len(taken) >= count
+
+    with ThreadPoolExecutor() as threads:
+        playing = threads.submit(evaluations.run)
+        learn(1, 99)
+        time.sleep(0.3)
+        learn(5, 150)
+        wait_for("an evaluation", lambda: taken_all(1))
+        learn(6, 199)
+        time.sleep(0.3)
+        learn(8, 333)
+        wait_for("the next one", lambda: taken_all(2))
+        learn(9, 390)  # the final networks
+        learner.announce(stop_key(learner), EndOfRun.because("complete: total_updates reached").encode(learner.run))
+        wait_for("the last one", lambda: taken_all(3))
+        playing.result(20)
+    assert [(one.env_step, one.update, one.network) for one in taken] == [(150, 5, 2), (333, 8, 1), (390, 9, 2)]
+    assert {one.episodes for one in taken} == {2}
+    assert list(inbox.take()) == []
+
+
+def test_an_evaluator_of_an_interrupted_run_stops_at_once(nodes: tuple[Node, Node]) -> None:
+    stop = Stop()
+    agent, evaluations = service(nodes, stop, Plan(seconds=0.0, episodes=100_000))
+    Broadcaster(nodes[0], agent)
+    inbox = EvaluationInbox(nodes[0], lambda: 1000)
+    with ThreadPoolExecutor() as threads:
+        playing = threads.submit(evaluations.run)
+        time.sleep(1)
+        stop.set("interrupted")
+        playing.result(20)
+    assert list(inbox.take()) == []
+
+
+def test_an_evaluator_needs_to_know_how_often(nodes: tuple[Node, Node]) -> None:
+    with pytest.raises(UsageError, match="--every: needed, as the run has no eval_every"):
+        service(nodes, Stop(), Plan())

@@ -15,6 +15,7 @@ from experiments.report.measures import (
     by_steps,
     diagnostic,
     diagnostics_of,
+    evaluated_by_steps,
     iqm_by_task,
     metrics_by_steps,
     q_gaps,
@@ -67,6 +68,8 @@ def figures(study: Study) -> tuple[list[Figure], list[str]]:
         lacking.append(f"Aggregates over settings: returns of {', '.join(study.environments)} have different scales.")
     else:
         made += aggregates(study)
+    if any(run.evaluated.size for run in study.runs):
+        made.append(evaluations(study))
     made += [exploration(study), q_gap(study), *networks(study)]
     lacking += [f"{figure.title}: no run has the data for it." for figure in made if not _has_lines(figure)]
     return [figure for figure in made if _has_lines(figure)], lacking
@@ -85,6 +88,14 @@ def returns_by_steps(study: Study) -> Figure:
     return _curves(
         study, "returns_steps", "Returns against environment steps", "environment steps", RETURN,
         lambda runs: by_steps(runs, [running_mean(run.returns) for run in runs]),
+    )  # fmt: skip
+
+
+def evaluations(study: Study) -> Figure:
+    """Returns of greedy play against environment steps."""
+    return _curves(
+        study, "evaluations", "Returns of greedy play during training", "environment steps", "mean return",
+        evaluated_by_steps, lambda run: run.evaluated.size > 0,
     )  # fmt: skip
 
 

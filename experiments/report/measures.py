@@ -84,6 +84,13 @@ def metrics_by_steps(runs: Sequence[Run], name: str) -> tuple[Floats, Floats]:
     return at, np.stack([_latest(steps, values, at) for steps, values in rows])
 
 
+def evaluated_by_steps(runs: Sequence[Run]) -> tuple[Floats, Floats]:
+    """Curves of evaluations, of which every run must have some, as `metrics_by_steps`."""
+    low, high = max(run.evaluated[0, 0] for run in runs), min(run.evaluated[0, -1] for run in runs)
+    at = np.unique(np.concatenate([run.evaluated[0] for run in runs]).clip(low, max(low, high)))
+    return at, np.stack([_latest(run.evaluated[0], run.evaluated[1], at) for run in runs])
+
+
 def by_steps(runs: Sequence[Run], values: Sequence[Floats]) -> tuple[Floats, Floats]:
     """Curves of values per episode on common environment steps: steps float64 [points], curves [runs, points]."""
     low, high = max(run.end_steps[0] for run in runs), min(run.end_steps[-1] for run in runs)

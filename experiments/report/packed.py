@@ -1,7 +1,7 @@
 """Packs a study into one Parquet file with a row per run, and restores every file of the runs byte for byte.
 
-Columns: `run`, the folder's name; `config.toml` and `summary.json`, their text; and a list for each column of
-`episodes.csv` and `metrics.jsonl`, named like `episodes.csv/return`. The schema's metadata hold `sweep.toml`.
+Columns: `run`, the folder's name; `config.toml`, `summary.json` and `evaluations.csv`, their text; and a list for each
+column of `episodes.csv` and `metrics.jsonl`, named like `episodes.csv/return`. The schema's metadata hold `sweep.toml`.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from experiments.report.columns import (
     json_text,
     json_type,
 )
+from learner.records.evaluations import EVALUATIONS
 
 SWEEP, CONFIG, SUMMARY, EPISODES, METRICS = "sweep.toml", "config.toml", "summary.json", "episodes.csv", "metrics.jsonl"
-TEXTS = (CONFIG, SUMMARY)
+TEXTS = (CONFIG, SUMMARY, EVALUATIONS)
 FILES = (*TEXTS, EPISODES, METRICS)
 READ: Mapping[str, Callable[[str], Columns]] = {EPISODES: csv_columns, METRICS: json_columns}
 TYPE: Mapping[str, Callable[[Sequence[Sequence[Any]]], tuple[pa.DataType, Callable[[Any], Any]]]] = {
@@ -56,6 +57,8 @@ class PackedStudy:
         """The content of a run's file; None if there is none."""
         if run not in self._rows:
             return None
+        if file in TEXTS and file not in self._table.column_names:
+            return None  # packed by an earlier version
         if file in TEXTS:
             text: str | None = self._value(run, file).as_py()
             return text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from common.settings.tables import identity, load_tables, resolve
 from experiments.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
 from experiments.report.sources import Source, open_source
 from experiments.sweep.grid import parse_grid
+from learner.records.evaluations import EVALUATIONS, returns_by_step
 
 Floats = NDArray[np.float64]
 Setting = tuple[Any, ...]  # a value for each axis
@@ -42,7 +43,8 @@ class Run:
     end_steps: float64 [episodes], environment steps when each episode ended. returns, s, q1_means, q2_means: float64
     [episodes], of the columns `return`, `s`, `q1_mean` and `q2_mean`. metrics: float64 [rows] of each name of SERIES,
     of LATER, and of "q_share", mean |Q| as a share of its bound; nan where a row lacks it.
-    above_bound: number of rows of metrics.jsonl whose mean |Q| exceeds its bound, `q_bound`.
+    above_bound: number of rows of metrics.jsonl whose mean |Q| exceeds its bound, `q_bound`. evaluated: float64
+    [2, evaluations], environment steps and mean returns of greedy play.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Run:
     q2_means: Floats
     metrics: Mapping[str, Floats]
     above_bound: int = 0
+    evaluated: Floats = field(default_factory=lambda: np.empty((2, 0)))
 
 
 @dataclass(frozen=True)
@@ -215,12 +218,13 @@ def _read(source: Source, run: str, path: Path) -> Run:
         rows = source.columns(run, METRICS, SERIES, (*LATER, Q_SIZE, Q_BOUND))
         ends, returns, s, q1, q2 = (np.array(values, np.float64) for values in episodes.values())
         metrics = {name: np.array(values, np.float64) for name, values in rows.items()}  # None becomes nan
+        evaluated = returns_by_step(source.text(run, EVALUATIONS) or "")
     except (OSError, ValueError, KeyError, UsageError) as error:
         raise RunError(f"{path / run}: a finished run with a file that can't be read: {error!r}") from error
     size, bound = metrics.pop(Q_SIZE), metrics.pop(Q_BOUND)
     with np.errstate(divide="ignore", invalid="ignore"):  # without rewards the bound is 0
         metrics[Q_SHARE] = size / bound
-    return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()))
+    return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()), evaluated)
 
 
 def read_config(source: Source, run: str, path: Path) -> RunConfig:
