@@ -159,7 +159,7 @@ def test_lockstep_runs_are_the_same_with_evaluations_and_through_stops(tmp_path:
 
 
 def test_films_of_a_lockstep_run(tmp_path: Path) -> None:
-    config = base_config(["--preset", "catch", "--total-steps", "300"])
+    config = base_config(["--preset", "catch", "--method", "dqn", "--total-steps", "300"])
     small = NetworkSettings(hidden=(8,))
     config = replace(config, actor=replace(config.actor, envs=1), network=small, video_every=150)
     assert lockstep(config, tmp_path / "run", Stop()) == "complete"

@@ -3,8 +3,9 @@
 # service, actors and evaluators:
 #   deploy/zenoh/make_keys.sh FOLDER [NAME-OR-ADDRESS ...]
 # The names are those that learner and replay service are reached by (default: localhost 127.0.0.1). Each of
-# FOLDER/learner.json5, replay.json5, actor.json5 and evaluator.json5 is all that a machine needs for --zenoh-config, and holds a private
-# key. FOLDER/ca.key signs new ones: keep it off the machines of the run. DAYS sets how long certificates hold.
+# FOLDER/learner.json5, replay.json5, actor.json5 and evaluator.json5 is all that a machine needs for --zenoh-config,
+# and holds a private key.
+# FOLDER/ca.key signs new ones: keep it off the machines of the run. DAYS sets how long certificates hold.
 set -eu
 umask 077
 here=$(cd "$(dirname "$0")" && pwd)
