@@ -12,7 +12,7 @@ quietly "${BUILDER:-python3}" -m build --outdir dist .
 wheel=$(readlink -f dist/*.whl)
 cd "$folder"
 "${PYTHON:-python3}" -m venv venv
-quietly venv/bin/python -m pip install --disable-pip-version-check --constraint "$constraints" "$wheel"
+quietly venv/bin/python -m pip install --disable-pip-version-check --constraint "$constraints" "$wheel[report]"
 version=$(basename "$wheel" | cut -d- -f2)
 for command in venv/bin/coop-*; do
   test "$("$command" --version)" = "$(basename "$command") $version" || { echo "$command: not version $version" >&2; exit 1; }

@@ -9,51 +9,72 @@ import yaml
 
 from actors.cli import ActorOptions
 from common.process import cli
-from common.settings.options import RoleOptions, RunOptions, parse_run
+from common.process.health import host_and_port
+from common.settings.options import parse_run
+from deploy.router import RouterOptions
 from learner.cli import LearnerOptions
 from replay.cli import ReplayOptions
 
 DEPLOY = Path(__file__).parents[1] / "deploy"
+ROLES = ("learner", "replay", "actor")
+FILES = ("compose.yaml", "compose.tls.yaml", "compose.router.yaml")
 
 
-def _services() -> dict[str, Any]:
-    text = (DEPLOY / "compose.yaml").read_text()
-    with_defaults = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text)
-    services: dict[str, Any] = yaml.safe_load(with_defaults)["services"]
-    return services
+def services(*files: str) -> dict[str, Any]:
+    """The services of Compose files, later files over earlier ones."""
+    merged: dict[str, dict[str, Any]] = {}
+    for file in files:
+        with_defaults = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", (DEPLOY / file).read_text(encoding="utf-8"))
+        for name, service in yaml.safe_load(with_defaults)["services"].items():
+            merged.setdefault(name, {}).update(service)
+    return merged
 
 
-def _parse(service: str, monkeypatch: pytest.MonkeyPatch) -> RunOptions | RoleOptions:
-    program, *flags = _services()[service]["command"]
-    monkeypatch.setattr("sys.argv", [program, *flags])
-    assert program == f"coop-{service}"
-    match service:
-        case "learner":
-            return parse_run(LearnerOptions, program, "")
-        case "replay":
-            return cli.parse(ReplayOptions, program, "")
-        case _:
-            return cli.parse(ActorOptions, program, "")
+def parse(line: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    program, *flags = line
+    monkeypatch.setattr("sys.argv", line)
+    if program == "coop-learner":
+        return parse_run(LearnerOptions, program, "")
+    kinds = {"coop-replay": ReplayOptions, "coop-actor": ActorOptions, "coop-router": RouterOptions}
+    return cli.parse(kinds[program], program, "", args=flags)
 
 
-@pytest.mark.parametrize("service", ["learner", "replay", "actor"])
-def test_each_command_line_is_accepted(service: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    options = _parse(service, monkeypatch)
-    assert options.run == "compose"
-    if isinstance(options, RoleOptions):
-        assert options.connect == ("tcp/learner:7447",)
+@pytest.mark.parametrize("overlay", FILES)
+def test_each_command_line_is_accepted(overlay: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    merged = services("compose.yaml", overlay)
+    options = {name: parse(merged[name]["command"], monkeypatch) for name in ROLES}
+    protocol = "tls" if "tls" in overlay else "tcp"
+    assert {each.run for each in options.values()} == {"compose"}
+    assert options["learner"].run_dir == options["replay"].run_dir
+    assert options["learner"].resume
+    assert options["replay"].resume
+    config = options["learner"].run_config()
+    assert (config.total_steps, config.replay.journal) == (50_000, True)
+    assert options["replay"].connect[0] == f"{protocol}/learner:7447"
+    assert options["learner"].listen == (f"{protocol}/0.0.0.0:7447",)
+    for name, each in options.items():
+        assert host_and_port(each.health)[1] == int(merged[name]["healthcheck"]["test"][-1].partition(":")[2])
+        assert each.zenoh_config == (Path(f"/keys/{name}.json5") if protocol == "tls" else None)
 
 
-def test_learner_and_replay_write_to_the_same_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner, replay = _parse("learner", monkeypatch), _parse("replay", monkeypatch)
-    assert isinstance(learner, LearnerOptions)
-    assert isinstance(replay, ReplayOptions)
-    assert learner.run_dir == replay.run_dir
-    assert learner.run_config().total_steps == 50_000
+def test_actors_reach_the_router(monkeypatch: pytest.MonkeyPatch) -> None:
+    merged = services("compose.yaml", "compose.router.yaml")
+    actor, replay, router = (parse(merged[name]["command"], monkeypatch) for name in ("actor", "replay", "router"))
+    assert (actor.mode, actor.connect) == ("client", ("tcp/router:7449",))
+    assert (router.listen, replay.connect[1]) == (("tcp/0.0.0.0:7449",), "tcp/router:7449")
 
 
-def test_the_image_ends_without_root() -> None:
+@pytest.mark.parametrize("overlay", FILES)
+def test_every_service_is_restarted_limited_and_asked(overlay: str) -> None:
+    for service in services("compose.yaml", overlay).values():
+        assert service["restart"] in {"on-failure", "unless-stopped"}
+        assert {"healthcheck", "mem_limit"} <= service.keys()
+
+
+def test_the_image_ends_without_root_and_without_build_tools() -> None:
     steps = (DEPLOY / "Dockerfile").read_text().splitlines()
+    last = max(number for number, line in enumerate(steps) if line.startswith("FROM "))
     users = [number for number, line in enumerate(steps) if line.startswith("USER ")]
     assert steps[users[-1]] != "USER root"
     assert not [line for line in steps[users[-1] :] if line.startswith("RUN ")]
+    assert not [line for line in steps[last:] if "pip install" in line or "apt-get" in line]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 from common.process.cli import parse
 from common.process.lifecycle import run_main
 
@@ -42,6 +43,8 @@ def _run() -> None:
     runs = options.runs
     if not runs.exists():
         raise UsageError(f"{runs}: no such folder or file")
+    if missing := [package for package in ("rliable", "pyarrow") if find_spec(package) is None]:
+        raise RunError(f"{missing[0]} is not installed; it comes with the extra report: pip install 'coop-rl[report]'")
     # Imported only after the flags have been checked: the statistics' libraries take seconds.
     if options.pack is not None:
         from experiments.report.packed import pack  # noqa: PLC0415
