@@ -98,7 +98,7 @@ complete() { # of one run with an overlay
 }
 
 echo "a run: learner, replay service, four actors, TensorBoard"
-export STEPS=${STEPS:-12000}
+export STEPS=30000 LEARNER_CPUS=0.25 # slow enough to be still running when it is stopped
 quietly compose up --detach --scale actor=4
 wait_for 300 "four actors" joined 4
 wait_for 300 "500 steps" reached 500
@@ -120,7 +120,8 @@ echo "healthy: learner, replay service, actors, TensorBoard"
 quietly compose stop
 ended interrupted || fail "the run was not stopped cleanly"
 echo "stopped: $(summary | grep -o '"env_steps": [0-9]*')"
-quietly compose up --detach --no-recreate --scale actor=5
+export LEARNER_CPUS=0
+quietly compose up --detach --scale actor=5
 complete
 quietly compose down --volumes
 

@@ -1,0 +1,148 @@
+"""What a run needs, and what limits it: arithmetic from the measured costs of steps, updates, inserts and draws."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from common.errors import UsageError
+from common.settings.capacity import ROW_BYTES, estimated_bytes, frame_bytes
+from common.settings.config import RunConfig
+from common.types import EnvSpec
+
+MIB = 2**20
+ACTOR_BYTES = 280 * MIB  # resident (docs/robustness.md)
+LEARNER_BYTES = 300 * MIB
+REPLAY_BYTES = 90 * MIB  # without its table (docs/benchmarks.md)
+LINK_BYTES = 0.8 * MIB  # of either service, for each actor
+HEADER_BYTES = 300  # of a message
+COPIES = 6  # of the parameters: two networks, and two running means of each optimizer
+ERROR_DRIVEN = ("edql", "coop")
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Processor time in milliseconds, measured by `benchmarks/rates.py` on a core of an AMD EPYC (Zen 4).
+
+    step: of an actor, for one environment step. gradient, error_driven: an update of the learner, with receiving its
+    batch. insert, draw: of the replay service, for one transition and for one batch.
+    """
+
+    step: float
+    gradient: float
+    error_driven: float
+    insert: float
+    draw: float
+
+
+COSTS = {
+    "nature": Costs(0.82, 33.5, 50.5, 0.0085, 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a run.
+
+    cores, memory: what it needs, in all; bytes. most: environment steps per second that it can carry.
+    remedy: what to do where it is what limits the run.
+    """
+
+    name: str
+    cores: int
+    memory: float
+    most: float
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Bytes per environment step between actors, replay service and learner."""
+
+    inserts: float
+    draws: float
+    weights: float
+
+
+@dataclass(frozen=True)
+class Sizing:
+    """What a run needs; parts: actors, replay service, learner, and the links of the two services' hosts."""
+
+    parts: tuple[Part, ...]
+    traffic: Traffic
+
+    @property
+    def bottleneck(self) -> Part:
+        """The part that carries the fewest steps."""
+        return min(self.parts, key=lambda part: part.most)
+
+    @property
+    def speed(self) -> float:
+        """Environment steps per second of the whole run."""
+        return self.bottleneck.most
+
+
+def size(
+    config: RunConfig, spec: EnvSpec, parameters: int, actors: int, learner_speedup: float = 1.0, gbits: float = 10.0
+) -> Sizing:
+    """Size a run whose learner and replay service have a host each, and its actors a core each.
+
+    Args:
+        parameters: of one network.
+        learner_speedup: how many times as fast as one measured core the learner computes.
+        gbits: bandwidth of each of the two hosts, in each direction, in Gbit/s.
+
+    Raises:
+        UsageError: nothing has been measured for the config's network.
+    """
+    costs = COSTS.get(config.network.kind)
+    if costs is None:
+        raise UsageError(f"network.kind = {config.network.kind!r}: not measured; allowed: {', '.join(COSTS)}")
+    ratio, bandwidth = config.replay.ratio, gbits * 1e9 / 8
+    traffic = _traffic(config, spec, parameters, actors)
+    update = (costs.error_driven if config.method in ERROR_DRIVEN else costs.gradient) / learner_speedup
+    links = LINK_BYTES * actors
+    table = estimated_bytes(spec, min(config.replay.capacity, config.total_steps))
+    return Sizing(
+        (
+            Part(
+                *("actors", actors, actors * ACTOR_BYTES, actors * 1000 / costs.step),
+                "more actors, or --network.dtype bfloat16",
+            ),
+            Part(
+                *("replay service", 1, REPLAY_BYTES + table + links, 1000 / (costs.insert + ratio * costs.draw)),
+                "a lower --replay.ratio with a larger --learner.batch-size",
+            ),
+            Part(
+                *("learner", 1, LEARNER_BYTES + 4 * parameters * COPIES + links, 1000 / (ratio * update)),
+                "a faster learner (--learner.device cuda), or a lower --replay.ratio; more actors gain nothing",
+            ),
+            Part(
+                *("learner's link", 0, 0.0, bandwidth / max(traffic.weights, traffic.draws)),
+                "a router beside the actors, or a larger --learner.publish-every",
+            ),
+            Part(
+                *("replay's link", 0, 0.0, bandwidth / max(traffic.inserts, traffic.draws)),
+                "learner and replay service on one host (--shared-memory)",
+            ),
+        ),
+        traffic,
+    )
+
+
+def enough_actors(sizing: Sizing) -> int:
+    """The number of actors that keep the rest of the run busy; never more than it has."""
+    actors = sizing.parts[0]
+    return math.ceil(sizing.speed / actors.most * actors.cores)
+
+
+def _traffic(config: RunConfig, spec: EnvSpec, parameters: int, actors: int) -> Traffic:
+    """Bytes per environment step; a transition in a batch brings stack + 1 frames, one in a segment brings one."""
+    row, frame = ROW_BYTES + 8 * spec.stack, frame_bytes(spec)
+    width = 2 if config.network.dtype == "bfloat16" else 4
+    learner, ratio = config.learner, config.replay.ratio
+    return Traffic(
+        inserts=frame + row + HEADER_BYTES / config.actor.segment_steps,
+        draws=ratio * (learner.batch_size * ((spec.stack + 1) * frame + row) + HEADER_BYTES),
+        weights=ratio / learner.publish_every * width * parameters * actors,
+    )
