@@ -92,13 +92,13 @@ healthy() { [ "$(docker inspect --format '{{.State.Health.Status}}' "$(one "$1")
 summary() { docker run --rm --volume coop-check_runs:/runs:ro coop cat /runs/compose/summary.json; }
 ended() { summary | grep -q "\"exit\": \"$1\""; }
 complete() { # of one run with an overlay
-    wait_for 600 "end of the run" ended complete
+    wait_for 1800 "end of the run" ended complete
     summary | grep -E '"(env_steps|transitions_accepted|transitions_lost|duplicates_refused|exit)"'
     summary | grep -q '"transitions_lost": 0' || fail "transitions are lost"
 }
 
 echo "a run: learner, replay service, four actors, TensorBoard"
-export STEPS=30000 LEARNER_CPUS=0.25 # slow enough to be still running when it is stopped
+export STEPS=40000 LEARNER_CPUS=0.15 # slow enough to be still running when it is stopped
 quietly compose up --detach --scale actor=4
 wait_for 300 "four actors" joined 4
 wait_for 300 "500 steps" reached 500

@@ -91,7 +91,7 @@ def page(config: RunConfig, preset: str, sizing: Sizing) -> str:
         f"inserts     {speed / config.actor.segment_steps:,.1f} messages/s, {speed * traffic.inserts / 1e6:,.1f} MB/s",
         f"draws       {updates:,.1f} messages/s, {speed * traffic.draws / 1e6:,.1f} MB/s",
         f"weights     {updates / config.learner.publish_every * actors.cores:,.1f} messages/s, "
-        f"{speed * traffic.weights / 1e6:,.1f} MB/s",
+        f"{speed * traffic.weights / 1e6:,.1f} MB/s, {sizing.weights_delivered:.0%} of them delivered",
         f"bottleneck  {limit.name}: {limit.remedy}",
     ]
     if limit is not actors:
@@ -101,22 +101,15 @@ def page(config: RunConfig, preset: str, sizing: Sizing) -> str:
 
 def table(config: RunConfig, sizings: Sequence[Sizing]) -> str:
     """A table in Markdown with a line for each sizing."""
-    names = (
-        "actors",
-        "steps/s",
-        "updates/s",
-        "inserts, MB/s",
-        "draws, MB/s",
-        "weights, MB/s",
-        "memory of the services",
-    )
-    rows = [(*names, "saturates first", "actors that suffice"), ["---"] * (len(names) + 2)]
+    names = ("actors", "steps/s", "updates/s", "inserts, MB/s", "draws, MB/s", "weights, MB/s", "delivered")
+    rows = [(*names, "memory of the services", "saturates first", "actors that suffice"), ["---"] * 10]
     for sizing in sizings:
         actors, replay, learner, *_ = sizing.parts
         speed, traffic = sizing.speed, sizing.traffic
         figures = (actors.cores, speed, speed * config.replay.ratio)
         streams = (speed * traffic.inserts / 1e6, speed * traffic.draws / 1e6, speed * traffic.weights / 1e6)
+        delivered = f"{sizing.weights_delivered:.0%}"
         memory = f"{(replay.memory + learner.memory) / 2**30:,.1f} GiB"
         numbers = [f"{value:,.0f}" for value in figures] + [f"{value:,.1f}" for value in streams]
-        rows.append([*numbers, memory, sizing.bottleneck.name, f"{enough_actors(sizing):,}"])
+        rows.append([*numbers, delivered, memory, sizing.bottleneck.name, f"{enough_actors(sizing):,}"])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)

@@ -22,7 +22,7 @@ ERROR_DRIVEN = ("edql", "coop")
 
 @dataclass(frozen=True)
 class Costs:
-    """Processor time in milliseconds, measured by `benchmarks/rates.py` on a core of an AMD EPYC (Zen 4).
+    """Processor time in milliseconds on a core of an AMD EPYC (Zen 4), from the measurements of docs/benchmarks.md.
 
     step: of an actor, for one environment step. gradient, error_driven: an update of the learner, with receiving its
     batch. insert, draw: of the replay service, for one transition and for one batch.
@@ -36,7 +36,7 @@ class Costs:
 
 
 COSTS = {
-    "nature": Costs(0.82, 33.5, 50.5, 0.0085, 1.0),
+    "nature": Costs(0.82, 33.5, 50.5, 0.0074, 0.95),
 }
 
 
@@ -66,10 +66,15 @@ class Traffic:
 
 @dataclass(frozen=True)
 class Sizing:
-    """What a run needs; parts: actors, replay service, learner, and the links of the two services' hosts."""
+    """What a run needs.
+
+    parts: actors, replay service, learner, and the links of the two services' hosts.
+    bandwidth: of each link in one direction, in bytes per second.
+    """
 
     parts: tuple[Part, ...]
     traffic: Traffic
+    bandwidth: float
 
     @property
     def bottleneck(self) -> Part:
@@ -80,6 +85,11 @@ class Sizing:
     def speed(self) -> float:
         """Environment steps per second of the whole run."""
         return self.bottleneck.most
+
+    @property
+    def weights_delivered(self) -> float:
+        """Share of the broadcast parameters that the learner's link carries; the rest is dropped, never waited for."""
+        return min(1.0, self.bandwidth / (self.speed * self.traffic.weights))
 
 
 def size(
@@ -118,8 +128,8 @@ def size(
                 "a faster learner (--learner.device cuda), or a lower --replay.ratio; more actors gain nothing",
             ),
             Part(
-                *("learner's link", 0, 0.0, bandwidth / max(traffic.weights, traffic.draws)),
-                "a router beside the actors, or a larger --learner.publish-every",
+                *("learner's link", 0, 0.0, bandwidth / traffic.draws),
+                "learner and replay service on one host (--shared-memory)",
             ),
             Part(
                 *("replay's link", 0, 0.0, bandwidth / max(traffic.inserts, traffic.draws)),
@@ -127,6 +137,7 @@ def size(
             ),
         ),
         traffic,
+        bandwidth,
     )
 
 

@@ -36,8 +36,14 @@ def test_each_part_can_be_the_bottleneck() -> None:
     assert breakout(1, ratio=0.001).bottleneck.name == "actors"
     assert breakout(1, ratio=0.001).speed == pytest.approx(1000 / COSTS["nature"].step)
     assert breakout(10_000, ratio=1e-6, gbits=1000).bottleneck.name == "replay service"
-    assert breakout(10_000, learner_speedup=1e6).bottleneck.name == "learner's link"
+    assert breakout(10_000, learner_speedup=1e6, gbits=1).bottleneck.name == "learner's link"
     assert breakout(10_000, ratio=1e-6, gbits=1).bottleneck.name == "replay's link"
+
+
+def test_weights_that_do_not_fit_are_dropped_and_limit_nothing() -> None:
+    few, many = breakout(100), breakout(10_000)
+    assert (few.weights_delivered, few.speed) == (1.0, many.speed)
+    assert many.weights_delivered == pytest.approx(1.25e9 / (many.speed * many.traffic.weights))
 
 
 def test_what_a_step_sends() -> None:
