@@ -44,7 +44,7 @@ class Roles:
         logs.mkdir(parents=True)
         self.folder = folder
         learner_at, replay_at = at
-        joining = (f"--run={run}", "--connect", learner_at, "--join-timeout=600")
+        joining = (f"--run={run}", "--connect", learner_at, "--join-timeout=60")
         own = {
             "learner": (f"--run={run}", f"--run-dir={folder}", "--listen", learner_at, *flags),
             "replay": (*joining, "--listen", replay_at, f"--run-dir={folder}"),
