@@ -214,6 +214,7 @@ def test_lines_said_while_the_picture_fills_the_screen(
     with Pictures(0.0, 1000, screen=True) as display:
         display.update()
         display.say("an event")
+        assert list(display.said()) == ["an event"], "progress is no event"
     assert capsys.readouterr().out == "the line\nan event\n"
 
 

@@ -54,7 +54,7 @@ class LiveDisplay(ABC):
         else:
             before, self._plain = self._plain, self.line()
             if self._plain != before:
-                self.say(self._plain)
+                self._print(self._plain)
 
     def say(self, text: str) -> None:
         """Print a permanent line."""
