@@ -19,7 +19,7 @@ from experiments.report.baseline import baseline_figure, baseline_table, find_ba
 from experiments.report.figures import buffers
 from experiments.report.measures import Interval
 from experiments.report.page import page
-from experiments.report.plots import STYLE, WIDTH, Line, Panel, _finish_panel, draw
+from experiments.report.plots import STYLE, WIDTH, Figure, Line, Panel, _finish_panel, draw
 from experiments.report.results import tables
 from experiments.report.study import Study, load_study
 from experiments.report.summaries import final_returns
@@ -208,3 +208,18 @@ def test_nothing_is_wider_than_the_window(reported: tuple[Study, list[ResultTabl
         whole, window, scrolled = map(int, found)
         assert whole <= window, "the page does not scroll sideways"
         assert width < 1300 or scrolled == 0, "nor does a table"
+
+
+def test_long_labels_leave_room_for_the_points(tmp_path: Path) -> None:
+    ticks = ["reset_role_at_episode False, noise constant, feedback weight-gradient", "all"]
+    values = np.array([1.0, 2.0])
+    line = Line("coop", np.array([0.0, 1.0]), Interval(values, values, values))
+    figure = Figure("f", "F", "", "", [Panel("", "", "return", [line], marks=True, ticks=ticks)])
+    assert figure.width == WIDTH
+    canvas = Canvas(figsize=(figure.width, 2.3), layout="constrained")
+    axes = canvas.subplots()
+    _finish_panel(axes, figure.panels[0], figure.columns)
+    canvas.draw_without_rendering()
+    assert axes.get_position().width > 0.5
+    draw(figure, tmp_path / "f.png")
+    assert (tmp_path / "f.pdf").exists()

@@ -26,7 +26,8 @@ OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
 COLUMNS = 3  # of panels
 WIDTH = 7.2  # inches, of a page's text; a single panel has two thirds of it
 HEIGHT = 1.9  # inches, of a panel
-TICK = 0.24  # inches, of a label on the y axis
+TICK = 0.24  # inches, of a line of a label on the y axis
+LONG_TICK = 24  # letters in such a line
 DECADE = 10
 STYLE: dict[Any, Any] = {
     "font.size": 8, "axes.titlesize": 8, "axes.labelsize": 8, "xtick.labelsize": 7, "ytick.labelsize": 7,
@@ -93,7 +94,8 @@ class Figure:
     @property
     def width(self) -> float:
         """Inches on a page as wide as paper's."""
-        return WIDTH if self.columns > 1 else WIDTH * 2 / 3
+        wide = self.columns > 1 or any(len(tick) > LONG_TICK for panel in self.panels for tick in panel.ticks)
+        return WIDTH if wide else WIDTH * 2 / 3
 
     def points(self) -> ResultTable:
         """All points drawn, as one table."""
@@ -111,7 +113,8 @@ def draw(figure: Figure, path: Path) -> None:
     mpl.use("Agg")
     number, columns = len(figure.panels), figure.columns
     rows = math.ceil(number / columns)
-    tall = max(HEIGHT, *(0.6 + TICK * len(panel.ticks) for panel in figure.panels))
+    lines = [sum(1 + _wrapped(tick).count("\n") for tick in panel.ticks) for panel in figure.panels]
+    tall = max(HEIGHT, 0.6 + TICK * max(lines))
     size = (figure.width, tall * rows + 0.4)
     with mpl.rc_context(STYLE):
         canvas, grid = plt.subplots(
@@ -121,7 +124,8 @@ def draw(figure: Figure, path: Path) -> None:
         handles: dict[str, Line2D] = {}
         for place, (axes, panel) in enumerate(zip(grid.flat, figure.panels, strict=False)):
             for line in panel.lines:
-                colour = colours.setdefault(line.label, _colour(line.label, list(colours.values())))
+                others = [] if panel.ticks else list(colours.values())  # a tick names its line
+                colour = colours.setdefault(line.label, _colour(line.label, others))
                 _draw_line(axes, panel, line, colour)
                 if not line.faint:
                     handles.setdefault(line.label, _handle(panel, line, colour))
@@ -171,7 +175,7 @@ def _finish_panel(axes: Axes, panel: Panel, columns: int) -> None:
     if panel.wide_x:
         _spread_x(axes, panel, columns)
     if panel.ticks:
-        axes.set_yticks(range(len(panel.ticks)), panel.ticks)
+        axes.set_yticks(range(len(panel.ticks)), list(map(_wrapped, panel.ticks)))
         axes.set_ylim(len(panel.ticks) - 0.5, -0.5)
         axes.grid(visible=False, axis="y")
         if panel.reference is not None:
@@ -191,6 +195,10 @@ def _name_axes(axes: Axes, panel: Panel, *, x: bool, y: bool) -> None:
         axes.set_xlabel(across)
     if y or panel.ticks:
         axes.set_ylabel("\n".join(textwrap.wrap(up, 34)))
+
+
+def _wrapped(tick: str) -> str:
+    return "\n".join(textwrap.wrap(tick, 2 * LONG_TICK))
 
 
 def _colour(label: str, taken: Sequence[str]) -> str:
