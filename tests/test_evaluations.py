@@ -185,7 +185,7 @@ def test_a_resumed_run_keeps_the_lines_up_to_its_epoch(tmp_path: Path) -> None:
             directory.evaluation(msgspec.structs.replace(RESULT, env_step=step))
         assert directory.evaluated == 300
     with (tmp_path / "evaluations.csv").open("a") as file:
-        file.write("150,2,1,10,1")  # torn by a kill
+        file.write("150,2,1,10,1,1,0,1")  # torn by a kill, in its last number
     with RunDirectory(tmp_path, config, sizes, 200) as directory:
         assert directory.evaluated == 200
         directory.evaluation(msgspec.structs.replace(RESULT, env_step=250, return_mean=1234567.25))
@@ -238,8 +238,8 @@ def test_a_result_of_a_future_that_is_gone_is_refused(inbox: tuple[EvaluationInb
 @pytest.mark.timeout(600)  # on a busy machine
 def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -> None:
     endpoint, folder = free_endpoint(), tmp_path / "run"
-    flags = ("--total-steps", "1500", "--eval-every", "500", "--eval-episodes", "2", "--run-dir", str(folder))
-    flags += ("--method", "dqn", "--env.id", "coop/Catch-v0", "--network.hidden", "8", "--video-every", "500")
+    flags = ("--total-steps", "500", "--eval-every", "200", "--eval-episodes", "2", "--run-dir", str(folder))
+    flags += ("--method", "dqn", "--env.id", "coop/Catch-v0", "--network.hidden", "8", "--video-every", "200")
     mine = ("--connect", endpoint, "--every", "0.5", "--episodes", "3", "--epsilon", "0.5", "--envs", "2")
     with (
         running("coop-eval", "--run", "coop", *mine, "--join-timeout", "500") as second,
