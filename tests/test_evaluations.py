@@ -254,9 +254,10 @@ def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -
     for epsilon, episodes in (("0", "2"), ("0.5", "3")):
         found = [row for row in rows(folder) if row["epsilon"] == epsilon]
         assert {row["episodes"] for row in found} == {episodes}
-        steps = [int(row["env_step"]) for row in found]
-        assert steps == sorted(set(steps))
-        assert [steps[-1], int(found[-1]["update"])] == end
+        steps, updates = ([int(row[name]) for row in found] for name in ("env_step", "update"))
+        assert steps == sorted(steps)
+        assert updates == sorted(set(updates)), "no networks twice"
+        assert [steps[-1], updates[-1]] == end
     assert f"3 episodes after {end[0]:,} steps" in told
     videos = list((folder / "videos").iterdir())
     assert videos
