@@ -24,6 +24,9 @@ finish() {
     compose down --volumes --remove-orphans > /dev/null 2>&1 || true
     if [ -n "$engine" ]; then
         kill "$engine" && tail --pid="$engine" -f /dev/null # dockerd ends containerd, its child
+        iptables-restore < "$work/rules" # dockerd leaves its rules, bridges and forwarding behind
+        for link in $(ls /sys/class/net); do grep -qx "$link" "$work/links" || ip link delete "$link"; done
+        cat "$work/forwarding" > /proc/sys/net/ipv4/ip_forward
     fi
     for place in $(awk -v work="$work/" 'index($2, work) == 1 { print $2 }' /proc/mounts | sort -r); do umount -l "$place"; done
     rm -rf --one-file-system "$work"
@@ -44,6 +47,9 @@ files="-f deploy/compose.yaml"
 compose() { docker-compose -p coop-check $files "$@"; }
 if ! docker info > /dev/null 2>&1; then
     export DOCKER_HOST=unix://$work/docker.sock
+    iptables-save > "$work/rules"
+    ls /sys/class/net > "$work/links"
+    cat /proc/sys/net/ipv4/ip_forward > "$work/forwarding"
     dockerd --host "$DOCKER_HOST" --data-root "$work/data" --exec-root "$work/exec" --pidfile "$work/dockerd.pid" > "$work/dockerd.log" 2>&1 &
     engine=$!
     up() { kill -0 "$engine" || return 0; docker info; }
