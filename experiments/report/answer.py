@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from common.process.console import counted
 from experiments.report.slices import label, seeds_of
 from experiments.report.study import Study
 from experiments.report.table import ResultTable, rounded
@@ -132,7 +133,8 @@ def _doubts(study: Study) -> list[str]:
         runs = "a single run" if fewest == 1 else f"{fewest} runs"
         told.append(f"Some settings have {runs}: intervals over so few are narrow by construction and prove nothing.")
     if study.warnings:
-        told.append(f"In {len(study.warnings)} runs mean |Q| exceeded its bound at times: do not trust them.")
+        runs = counted(len(study.warnings), "run")
+        told.append(f"In {runs} mean |Q| exceeded its bound at times: do not trust such a run.")
     return told
 
 
