@@ -9,7 +9,7 @@ import yaml
 
 from actors.cli import ActorOptions
 from common.process import cli
-from common.process.health import host_and_port
+from common.process.ports import http_address
 from common.settings.options import parse_run
 from deploy.router import RouterOptions
 from learner.cli import LearnerOptions
@@ -53,7 +53,9 @@ def test_each_command_line_is_accepted(overlay: str, monkeypatch: pytest.MonkeyP
     assert options["replay"].connect[0] == f"{protocol}/learner:7447"
     assert options["learner"].listen == (f"{protocol}/0.0.0.0:7447",)
     for name, each in options.items():
-        assert host_and_port(each.health)[1] == int(merged[name]["healthcheck"]["test"][-1].partition(":")[2])
+        assert http_address("--health", each.health)[1] == int(
+            merged[name]["healthcheck"]["test"][-1].partition(":")[2]
+        )
         assert each.zenoh_config == (Path(f"/keys/{name}.json5") if protocol == "tls" else None)
 
 

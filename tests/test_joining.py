@@ -49,9 +49,9 @@ def test_another_protocol_is_refused_with_both_versions(
     learner.serve(learner.key("newer"), lambda message: newer)
     _receive(learner, spec)
     assert join(actor, Stop(), REQUEST, (), 5) is not None
-    with pytest.raises(Refused, match="version 7; this process speaks 4"):
+    with pytest.raises(Refused, match="version 7; this process speaks 5"):
         actor.ask(join_key(actor, "actor"), payload)
-    with pytest.raises(Refused, match="version 7; this process speaks 4"):
+    with pytest.raises(Refused, match="version 7; this process speaks 5"):
         actor.ask(actor.key("newer"), Current().encode("test"))
 
 
