@@ -39,6 +39,7 @@ def test_why_not_insert(limiter: RateLimiter, inserted: int, drawn: int, reason:
 
 def test_what_displays_show_of_the_ratio() -> None:
     assert QUARTER.measured(100, 0) is None
+    assert QUARTER.measured(QUARTER.start + 1, 2) == 2.0
     assert (QUARTER.measured(300, 49), QUARTER.ahead(300, 49)) == (0.245, 4.0)
     assert (QUARTER.slack, replace(QUARTER, tolerance=1).slack) == (10, 2.0)
     changed = QUARTER.changed(300, 49, ratio=2.0)

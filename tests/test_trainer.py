@@ -70,6 +70,8 @@ def test_a_row_of_metrics_every_200_updates() -> None:
     assert [number for number, effect in enumerate(effects, start=1) if effect.metrics] == [200, 400]
     row = effects[399].metrics
     assert row is not None
+    assert trainer.metrics is row
+    assert Trainer(Agent(CONFIG, SPEC), 0.0).metrics is None
     source = batches()
     errors = np.concatenate([reference.update(next(source)).td_errors for _ in range(400)][200:])
     assert row["td_error"] == pytest.approx(np.abs(errors).mean(), rel=1e-5)

@@ -58,6 +58,7 @@ def test_an_actor_follows_weights_and_role_through_swaps(nodes: tuple[Node, Node
     policy = own_policy(spec)
     follower = WeightsFollower(actor, policy)
     assert not follower.ready
+    assert follower.progress == (0, 0)
     refresh_until(follower, 0)  # asked for: the broadcast was before its time
     assert follower.ready
     assert policy.acting == 0
@@ -66,9 +67,10 @@ def test_an_actor_follows_weights_and_role_through_swaps(nodes: tuple[Node, Node
         acting = version % 2
         change(agent, acting, version)
         agent.acting = acting
-        broadcaster.publish()
+        broadcaster.publish(env_step=10 * version)
         refresh_until(follower, version)
         assert policy.acting == acting
+        assert follower.progress == (version, 10 * version)
         assert_equal(policy, agent)
 
 
