@@ -6,7 +6,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 
-skip() { echo "SKIP: $*"; exit 0; }
+. deploy/checks.sh
 [ "$(id -u)" = 0 ] || skip "a container engine of one's own needs root"
 for tool in dockerd:docker.io docker-compose:docker-compose debootstrap:debootstrap; do
     if ! command -v "${tool%:*}" > /dev/null; then
@@ -32,16 +32,7 @@ finish() {
     rm -rf --one-file-system "$work"
 }
 trap finish EXIT
-fail() { echo "FAILED: $*"; exit 1; }
 quietly() { "$@" > "$work/step.log" 2>&1 || fail "$*"; }
-wait_for() { # SECONDS WHAT COMMAND...: until the command succeeds
-    local until=$((SECONDS + $1)) what=$2
-    shift 2
-    until "$@" > /dev/null 2>&1; do
-        [ $SECONDS -lt $until ] || fail "no $what"
-        sleep 0.5
-    done
-}
 
 files="-f deploy/compose.yaml"
 compose() { docker-compose -p coop-check $files "$@"; }

@@ -6,7 +6,7 @@ here=$(cd "$(dirname "$0")" && pwd)
 bin=${BIN:?is not set: the folder with coop-local and coop-sweep}
 PATH=$(cd "$bin" && pwd):$PATH
 
-skip() { echo "SKIP: $*"; exit 0; }
+. "$here/../checks.sh"
 [ "$(id -u)" = 0 ] || skip "a Slurm controller of one's own needs root"
 if ! command -v slurmctld slurmd munged > /dev/null; then
     apt-get install --yes --quiet slurm-wlm > /dev/null 2>&1 || skip "slurm-wlm is not installed, and apt-get can't install it"
@@ -28,7 +28,6 @@ finish() {
 }
 failed=1
 trap finish EXIT
-fail() { echo "FAILED: $*"; exit 1; }
 
 mkdir -p "$work/munge" "$work/state"
 dd if=/dev/urandom of="$work/munge/key" bs=1 count=1024 status=none
@@ -63,14 +62,6 @@ CONF
 slurmctld
 for node in n1 n2 n3; do slurmd -N "$node"; done
 
-wait_for() { # SECONDS WHAT COMMAND...: until the command succeeds
-    local until=$((SECONDS + $1)) what=$2
-    shift 2
-    until "$@" > /dev/null 2>&1; do
-        [ $SECONDS -lt $until ] || fail "no $what"
-        sleep 0.5
-    done
-}
 state() { scontrol show job "$1" | grep -o 'JobState=[A-Z]*' | head -n 1; }
 steps() { tail -n 1 "$RUN_DIR/metrics.jsonl" | grep -o '"env_step": [0-9]*' | grep -o '[0-9]*'; }
 reached() { [ "$(steps)" -ge "$1" ]; }
