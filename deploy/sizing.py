@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from common.errors import UsageError
 from common.settings.capacity import ROW_BYTES, estimated_bytes, frame_bytes
 from common.settings.config import RunConfig
+from common.settings.methods import METHODS
 from common.types import EnvSpec
 
 MIB = 2**20
@@ -17,7 +18,6 @@ REPLAY_BYTES = 90 * MIB  # without its table (docs/benchmarks.md)
 LINK_BYTES = 0.8 * MIB  # of either service, for each actor
 HEADER_BYTES = 300  # of a message
 COPIES = 6  # of the parameters: two networks, and two running means of each optimizer
-ERROR_DRIVEN = ("edql", "coop")
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def size(
         raise UsageError(f"network.kind = {config.network.kind!r}: not measured; allowed: {', '.join(COSTS)}")
     ratio, bandwidth = config.replay.ratio, gbits * 1e9 / 8
     traffic = _traffic(config, spec, parameters, actors)
-    update = (costs.error_driven if config.method in ERROR_DRIVEN else costs.gradient) / learner_speedup
+    update = (costs.error_driven if METHODS.get(config.method).error_driven else costs.gradient) / learner_speedup
     links = LINK_BYTES * actors
     table = estimated_bytes(spec, min(config.replay.capacity, config.total_steps))
     return Sizing(
