@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
-
 import numpy as np
-from numpy.typing import NDArray
 
+from common.networks.layout import ArrayT
 from common.types import EnvSpec
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-ArrayT = TypeVar("ArrayT", "Tensor", NDArray[Any])
 
 
 def preprocess(obs: ArrayT, spec: EnvSpec) -> ArrayT:
