@@ -8,19 +8,17 @@ from typing import Literal
 from common.process import cli
 from common.process.importing import importing
 from common.process.lifecycle import run_main
-from common.settings.options import RoleOptions
+from common.settings.options import HealthOptions, RoleOptions
 
 
 @dataclass(frozen=True)
-class ActorOptions(RoleOptions):
+class ActorOptions(RoleOptions, HealthOptions):
     """Flags of `coop-actor`."""
 
     mode: Literal["peer", "client"] = "peer"
     """client: --connect names a router, and this process has no other link."""
     envs: int | None = None
     """Emulators in this process; the run's actor.envs if not given."""
-    health: str | None = None
-    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
     allow_import: tuple[str, ...] = ()
     """Modules, such as my_envs, that this process may import if the run's environment or network is theirs."""
 

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
 
+from common.messaging.links import described
 from common.messaging.transport import open_session
 from common.process import cli
 from common.process.console import Console, counted
 from common.process.health import answering
 from common.process.lifecycle import Stop, run_main
+from common.settings.options import HealthOptions
 
 TICK = 0.5  # seconds
 
 
 @dataclass(frozen=True)
-class RouterOptions:
+class RouterOptions(HealthOptions):
     """Flags of `coop-router`."""
 
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -27,8 +28,6 @@ class RouterOptions:
     """Endpoints to listen on."""
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
-    health: str | None = None
-    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
 def main() -> None:
@@ -53,10 +52,5 @@ def _run() -> None:
 
 def links(session: zenoh.Session) -> str:
     """How many services and actors are connected to a router, in words."""
-    kinds = [
-        link["whatami"]
-        for reply in session.get(f"@/{session.zid()}/router", timeout=2.0)
-        if reply.ok is not None
-        for link in json.loads(reply.ok.payload.to_string())["sessions"]
-    ]
+    kinds = [link["whatami"] for link in described(session, "router").get("sessions", ())]
     return f"connected: {counted(kinds.count('peer'), 'service')}, {counted(kinds.count('client'), 'actor')}"

@@ -10,17 +10,15 @@ from common.process.importing import importing
 from common.process.lifecycle import run_main
 from common.settings.capacity import check_messages
 from common.settings.config import check_distributed
-from common.settings.options import LearnerRunOptions, parse_run
+from common.settings.options import HealthOptions, LearnerRunOptions, parse_run
 
 
 @dataclass(frozen=True)
-class LearnerOptions(LearnerRunOptions):
+class LearnerOptions(LearnerRunOptions, HealthOptions):
     """Flags of `coop-learner`."""
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints to listen on; tcp/0.0.0.0:7447 opens the run to other machines."""
-    health: str | None = None
-    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ from common.process.console import Console
 from common.process.health import answering
 from common.process.lifecycle import Stop, run_main
 from common.process.memory import keep_freed_memory
-from common.settings.options import RoleOptions
+from common.settings.options import HealthOptions, RoleOptions
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
 from replay.persistence.folder import ReplayFolder
@@ -30,7 +30,7 @@ from replay.service import ReplayService
 
 
 @dataclass(frozen=True)
-class ReplayOptions(RoleOptions):
+class ReplayOptions(RoleOptions, HealthOptions):
     """Flags of `coop-replay`."""
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
@@ -41,8 +41,6 @@ class ReplayOptions(RoleOptions):
     """Folder for this service's part of the epochs; runs/RUN-replay-ID if not given, with the run's name and id."""
     resume: bool = False
     """Continue from the state in --run-dir; start afresh if it holds nothing of this run yet."""
-    health: str | None = None
-    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
 def main() -> None:

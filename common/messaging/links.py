@@ -13,18 +13,25 @@ import socket
 import stat
 import struct
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
 _LINGER_OFF = struct.pack("ii", 0, 0)
 
 
+def described(session: zenoh.Session, mode: str = "peer") -> dict[str, Any]:
+    """What Zenoh's administration says of this session, whose mode is given; empty if it does not answer."""
+    for reply in session.get(f"@/{session.zid()}/{mode}", timeout=2.0):
+        if reply.ok is not None:
+            told: dict[str, Any] = json.loads(reply.ok.payload.to_string())
+            return told
+    return {}
+
+
 def locators(session: zenoh.Session) -> list[str]:
     """The endpoints that this session listens on, with a port of 0 resolved."""
-    for reply in session.get(f"@/{session.zid()}/peer", timeout=2.0):
-        if reply.ok is not None:
-            return [str(locator) for locator in json.loads(reply.ok.payload.to_string())["locators"]]
-    return []
+    return [str(locator) for locator in described(session).get("locators", ())]
 
 
 def never_linger(session: zenoh.Session) -> None:

@@ -36,6 +36,14 @@ COMMON = (
 
 
 @dataclass(frozen=True)
+class HealthOptions:
+    """The flag of processes that container engines watch."""
+
+    health: str | None = None
+    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
+
+
+@dataclass(frozen=True)
 class RoleOptions:
     """Where and how a process finds its run."""
 
