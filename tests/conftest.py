@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -116,6 +117,14 @@ def nothing_left_behind() -> Iterator[None]:
     while (left := _left(before)) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not left, f"left behind: {left}"
+
+
+@pytest.fixture(autouse=True)
+def modules_of_ones_own() -> Iterator[None]:
+    """Tests write modules `my_...` of the same names: none of them meets another test's."""
+    yield
+    for name in [name for name in sys.modules if name.startswith("my_")]:
+        del sys.modules[name]
 
 
 @pytest.fixture

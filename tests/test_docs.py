@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -19,8 +18,6 @@ WITH_CODE = [page for page in PAGES if any(block.code and not block.why_not_run 
 def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Reader:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    for name in [name for name in sys.modules if name.startswith("my_")]:  # other tests have modules of these names
-        monkeypatch.delitem(sys.modules, name)
     return Reader(tmp_path)
 
 

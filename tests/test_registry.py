@@ -112,7 +112,6 @@ def test_what_is_no_method_is_refused(name: str, words: str, package: Path, monk
 
 def test_an_installed_method_is_imported_only_when_asked_for(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(package)
-    sys.modules.pop("my_methods", None)
     registry = methods()
     assert registry.names()[:2] == ("dqn", "medqn")
     assert "soft-max" in registry.names()
