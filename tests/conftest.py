@@ -121,10 +121,11 @@ def nothing_left_behind() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def modules_of_ones_own() -> Iterator[None]:
-    """Tests write modules `my_...` of the same names: none of them meets another test's."""
+    """Tests write modules `my_...` of the same names into folders of their own: none of them meets another test's."""
     yield
-    for name in [name for name in sys.modules if name.startswith("my_")]:
-        del sys.modules[name]
+    for name, module in list(sys.modules.items()):
+        if name.startswith("my_") and not Path(module.__file__ or "").is_relative_to(Path(__file__).parent):
+            del sys.modules[name]
 
 
 @pytest.fixture
