@@ -13,6 +13,7 @@ from common.process.console import stamped
 from common.process.files import write_atomic
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
+from common.process.ports import check_can_listen
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.capacity import check_memory, check_messages
 from common.settings.config import RunConfig, check_distributed
@@ -153,10 +154,14 @@ def _run() -> None:
     directory = options.directory()
     stop = Stop()
     stop.on_signals()
-    with live_page(config.run, options.web) as page, RunLock(directory, "coop-local", ("learner", "replay")) as lock:
-        if options.resume:
-            print(f"goes on with the run in {directory}" if holds_run(directory) else beginning(directory), flush=True)
-        _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)
+    with live_page(config.run, options.web) as page:
+        if options.prometheus:
+            check_can_listen("--prometheus", options.prometheus)
+        with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
+            if options.resume:
+                found = f"goes on with the run in {directory}" if holds_run(directory) else beginning(directory)
+                print(found, flush=True)
+            _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)
 
 
 def _supervise(

@@ -8,6 +8,7 @@ from common.envs.make import env_spec
 from common.errors import UsageError
 from common.process.importing import importing
 from common.process.lifecycle import run_main
+from common.process.ports import check_can_listen
 from common.settings.capacity import check_messages
 from common.settings.config import check_distributed
 from common.settings.options import HealthOptions, LearnerRunOptions, parse_run
@@ -32,6 +33,9 @@ def _run() -> None:
     )
     if options.restart and not options.resume:
         raise UsageError("--restart: needs --resume; it applies where that finds no epoch to continue from")
+    for flag, address in (("--prometheus", options.prometheus), ("--health", options.health)):
+        if address:
+            check_can_listen(flag, address)
     config = options.run_config()
     check_distributed(config)
     spec = env_spec(config.env)

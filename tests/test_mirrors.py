@@ -1,6 +1,7 @@
 """What leaves a run for Prometheus and for Weights & Biases, and what is refused where they are not installed."""
 
 import json
+import socket
 import struct
 import urllib.request
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from test_screen import STATUS
 from common.errors import UsageError
 from common.messaging.messages.status import LearnerStatus
 from common.process.extras import check_extra
+from common.process.processes import free_endpoint
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
@@ -115,3 +117,26 @@ def test_flags_are_refused_before_anything_starts(tmp_path: Path) -> None:
         "coop-local: error: --prometheus x: PORT or HOST:PORT with a port from 0 to 65535 is needed\n",
     )
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "flags", "refused"),
+    [
+        ("coop-local", ("--prometheus", "{busy}"), "--prometheus {busy}"),
+        ("coop-local", ("--web", "{free}", "--prometheus", "{free}"), "--prometheus {free}"),
+        ("coop-learner", ("--prometheus", "{busy}"), "--prometheus {busy}"),
+        ("coop-learner", ("--health", "{busy}"), "--health {busy}"),
+        ("coop-replay", ("--health", "{busy}"), "--health {busy}"),
+        ("coop-actor", ("--health", "{busy}"), "--health {busy}"),
+        ("coop-router", ("--health", "{busy}"), "--health {busy}"),
+    ],
+)
+def test_a_port_in_use_is_refused_before_anything_starts(
+    tmp_path: Path, command: str, flags: tuple[str, ...], refused: str
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        ports = {"busy": other.getsockname()[1], "free": free_endpoint().rpartition(":")[2]}
+        done = run_command(command, *(flag.format(**ports) for flag in flags), cwd=tmp_path)
+    expected = f"{command}: error: {refused.format(**ports)}: Address already in use\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
+    assert not list(tmp_path.iterdir())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 
 from common.errors import UsageError
 
@@ -15,3 +16,19 @@ def http_address(flag: str, text: str) -> tuple[str, int]:
     if found is None or int(found["port"]) >= 2**16:
         raise UsageError(f"{flag} {text}: PORT or HOST:PORT with a port from 0 to 65535 is needed")
     return (found["host"] or LOOPBACK).strip("[]"), int(found["port"])
+
+
+def family(host: str) -> socket.AddressFamily:
+    """How a host of `http_address` is written."""
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
+
+
+def check_can_listen(flag: str, text: str) -> None:
+    """Raise UsageError where PORT or HOST:PORT, as the flag was given, can't be listened on."""
+    host, port = http_address(flag, text)
+    with socket.socket(family(host)) as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do: closed connections don't count
+        try:
+            trial.bind((host, port))
+        except OSError as error:
+            raise UsageError(f"{flag} {text}: {error.strerror or error}") from error

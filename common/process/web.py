@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import sys
 import threading
 from collections.abc import Callable, Mapping
@@ -11,7 +10,7 @@ from socketserver import ThreadingTCPServer
 from typing import NamedTuple
 
 from common.errors import UsageError
-from common.process.ports import http_address
+from common.process.ports import family, http_address
 
 # A page carries its script and styles, and loads nothing from elsewhere.
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; connect-src 'self'"
@@ -49,7 +48,7 @@ class WebServer:
             served = documents
 
         class Server(_Server):
-            address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            address_family = family(host)
 
         try:
             self._server = Server((host, port), Handler)

@@ -16,7 +16,6 @@ from common.errors import RunError, UsageError
 from common.process import cli
 from common.process.extras import check_extra
 from common.process.notices import note_renamed, warn
-from common.process.ports import http_address
 from common.process.run_ids import has_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.effects import without_effect
@@ -161,7 +160,6 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
         check_extra("--wandb", "wandb", "wandb")
     if isinstance(options, LearnerRunOptions) and options.prometheus:
         check_extra("--prometheus", "prometheus", "prometheus_client")
-        http_address("--prometheus", options.prometheus)
     return options
 
 
