@@ -46,6 +46,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     A mutant meets the quickest tests first, as most are killed by one of these.
     """
     if STATS_OF_MUTMUT.exists():
+        import torch._dynamo  # noqa: F401, PLC0415 - PyTorch's optimizers load it at their first step; here, once for all mutants
+
         durations = json.loads(STATS_OF_MUTMUT.read_text(encoding="utf-8"))["duration_by_test"]
         items.sort(key=lambda item: durations.get(item.nodeid, 0.0))
         return

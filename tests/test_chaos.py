@@ -9,8 +9,8 @@ import pytest
 
 
 @pytest.mark.timeout(240)  # a busy machine starts eight processes slowly
-def test_four_kills(tmp_path: Path) -> None:
-    flags = ["--kills=4", "--total-steps=3000", "--checkpoint-every=200", "--longest-pause=1", "--give-up=200"]
+def test_a_kill_of_each_role(tmp_path: Path) -> None:
+    flags = ["--kills=3", "--total-steps=2000", "--checkpoint-every=200", "--longest-pause=1", "--give-up=200"]
     done = subprocess.run(
         [sys.executable, "-m", "deploy.chaos", f"--run-dir={tmp_path / 'run'}", *flags],
         capture_output=True,
@@ -20,8 +20,8 @@ def test_four_kills(tmp_path: Path) -> None:
     )
     assert (done.returncode, done.stderr) == (0, "")
     told = dict(re.split(r" {2,}", line, maxsplit=1) for line in done.stdout.splitlines())
-    assert told["kills"].startswith("4 (")
+    assert told["kills"].startswith("3 (")
     assert told["lost"] == "0"
-    assert re.fullmatch(r"0 of [23],\d{3}", told["duplicated"])
-    assert told["restarts"] == "4"
+    assert re.fullmatch(r"0 of [12],\d{3}", told["duplicated"])
+    assert told["restarts"] == "3"
     assert "bit for bit" in told["re-executed"]

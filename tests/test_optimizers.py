@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-import torch._dynamo  # which PyTorch's optimizers load at their first step
 
 from common.settings.config import LearnerSettings, OptimizerName
 from learner.edl.arrays import AnyArray
