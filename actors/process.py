@@ -74,7 +74,7 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
         raise JoinError(f"environment here {env.spec}, the learner's {joined.spec}")
 
     def open_route(endpoints: Sequence[str]) -> zenoh.Session:
-        return open_session((), (*options.connect, *endpoints), options.zenoh_config, options.shared_memory)
+        return open_session((), endpoints, options.zenoh_config, options.shared_memory)
 
     with (
         RoutedReplay(node)

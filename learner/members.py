@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from common.messaging.members import Origin
+from common.messaging.members import ROLES, Origin
 from common.messaging.messages.join import Join
 from common.messaging.messages.status import ActorStatus, Member
 
@@ -90,12 +90,16 @@ class MemberTracker:
         with self._lock:
             return [str(self._joined[who]) for who in self._missing(now)]
 
-    def listed(self, now: float) -> list[Member]:
-        """The replay service and the actors in the order in which they joined, the missing ones among them."""
+    def listed(self, now: float, most: int) -> list[Member]:
+        """The missing members, the replay service and the other roles, each in the order in which they joined.
+
+        most: members in the list.
+        """
         with self._lock:
             lost = set(self._missing(now))
             shown = [who for who in self._joined if who in lost or who not in self._away]
-            return [self._member(who, lost=who in lost) for who in shown]
+            shown.sort(key=lambda who: (who not in lost, ROLES.index(self._joined[who].role)))
+            return [self._member(who, lost=who in lost) for who in shown[:most]]
 
     def _missing(self, now: float) -> list[int]:
         return [who for who, since in self._lost.items() if now - since < FORGOTTEN]

@@ -10,7 +10,7 @@ import msgspec
 from common.errors import BadMessage
 from common.messaging.clients import SampleClient
 from common.messaging.keys import status_key
-from common.messaging.members import ROLES, Origin
+from common.messaging.members import Origin
 from common.messaging.messages.status import (
     MAX_MEMBERS,
     ActorStatus,
@@ -108,12 +108,12 @@ class StatusReporter:
         waiting = self._samples.waiting
         learner = Member("learner", "learner", *self._origin, "waiting" if waiting else "training", reason=waiting)
         replay = self._replay_status if connected["replay"] else None
-        others = members.listed(now)
+        others = members.listed(now, MAX_MEMBERS - 1)
         return {
             "connected": connected,
             "missing": members.missing(now),
             "events": self._console.recent(),
-            "members": sorted((learner, *others), key=_rank)[:MAX_MEMBERS],
+            "members": _with_learner(learner, others),
             "ratio": None if replay is None else replay.ratio,
             "waits": waits(replay, waiting, others),
         }
@@ -146,8 +146,10 @@ class StatusReporter:
         return left if math.isfinite(left) else None
 
 
-def _rank(member: Member) -> tuple[bool, int]:
-    return member.state != "lost", ROLES.index(member.role)
+def _with_learner(learner: Member, others: list[Member]) -> list[Member]:
+    """The lost members, the learner, and the others."""
+    lost = sum(member.state == "lost" for member in others)
+    return [*others[:lost], learner, *others[lost:]]
 
 
 def waits(replay: ReplayStatus | None, learner: str, members: list[Member]) -> list[Wait]:

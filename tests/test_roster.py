@@ -4,10 +4,12 @@ from pathlib import Path
 
 import pytest
 
+import learner.roster
 from common.errors import BadMessage, RunError
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join
 from common.messaging.presence import LEASE
+from common.process.files import write_atomic
 from learner.roster import AlreadyServed, Roster
 
 
@@ -31,6 +33,20 @@ def test_no_number_is_given_twice_also_after_a_restart_of_the_learner(tmp_path: 
     with pytest.raises(BadMessage, match=r"fields.index"):
         again.actor(actor(15, index=2**63 - 1))
     assert again.actor(actor(15)) == 4, "and nobody is locked out"
+
+
+def test_many_actors_do_not_each_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved: list[bytes] = []
+    monkeypatch.setattr(
+        learner.roster, "write_atomic", lambda path, data: (saved.append(data), write_atomic(path, data))
+    )
+    roster = Roster(tmp_path)
+    assert [roster.actor(actor(incarnation)) for incarnation in range(1000)] == list(range(1000))
+    assert len(saved) < 60
+    assert [roster.actor(actor(999)), roster.actor(actor(1000))] == [999, 1000]
+    with pytest.raises(BadMessage, match=r"fields.index: 1001; 1001 actors have been numbered"):
+        roster.actor(actor(1001, index=1001))
+    assert 1001 <= Roster(tmp_path).actor(actor(2000)) <= 1001 * 1.13
 
 
 def test_one_replay_service_serves(tmp_path: Path) -> None:

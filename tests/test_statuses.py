@@ -89,13 +89,15 @@ def test_members_are_listed_with_their_states() -> None:
     service = Member("replay service", "replay", "rep", 7, "serving")
     first = Member("actor 0", "actor", "act", 8, "playing", 55.0)
     second = Member("actor 1", "actor", "act", 9, "waiting", 1.0, "because")
-    assert members.listed(0.0) == [service, first, second]
+    assert members.listed(0.0, 9) == [service, first, second]
     members.token(2, False, 1.0)
     members.leaving(3)
     members.token(3, False, 1.0)
-    assert members.listed(1.0) == [service, Member("actor 0", "actor", "act", 8, "lost")]
-    assert members.listed(1.0 + FORGOTTEN) == [service]
+    lost = Member("actor 0", "actor", "act", 8, "lost")
+    assert members.listed(1.0, 9) == [lost, service]
+    assert members.listed(1.0, 1) == [lost]
+    assert members.listed(1.0 + FORGOTTEN, 9) == [service]
     members.token(2, True, 2.0)
-    assert members.listed(2.0) == [service, first]
+    assert members.listed(2.0, 9) == [service, first]
     members.joined(Join("actor", 99, [], origin=Origin("act", 10)), "actor 2")
-    assert members.listed(2.0)[2] == Member("actor 2", "actor", "act", 10, "playing"), "nothing from before its join"
+    assert members.listed(2.0, 9)[2] == Member("actor 2", "actor", "act", 10, "playing"), "nothing from before its join"

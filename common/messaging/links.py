@@ -1,22 +1,27 @@
-"""A session's links: where it listens, and that a dead one must not block the others.
+"""A session's links: where it listens, how many it may have, and that a dead one must not block the others.
 
 Zenoh sets SO_LINGER to 10 s on its sockets. If a peer freezes or its cable is cut while data is unsent, Zenoh's closing
 thread blocks for that long, and since all links share this thread, no other peer can send or receive meanwhile. Zenoh
-has no setting for it, so this module switches lingering off on each new link's socket.
+has no setting for it, so this module switches lingering off on each new link's socket. Zenoh does not tell which one
+that is, so all are looked at: once for all links that come within a moment, as a thousand actors may join at once.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import socket
 import stat
 import struct
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
+PAUSE = 0.2  # seconds between looks at this process's sockets, far less than a peer's lease
 _LINGER_OFF = struct.pack("ii", 0, 0)
 
 
@@ -34,14 +39,27 @@ def locators(session: zenoh.Session) -> list[str]:
     return [str(locator) for locator in described(session).get("locators", ())]
 
 
+def permit_many() -> None:
+    """Raise this process's limit of descriptors, of which each link takes one, as far as the system permits."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+
+
 def never_linger(session: zenoh.Session) -> None:
     """Make Zenoh close all present and future links of this session at once; the kernel still delivers what it can."""
+    changes = session.info.declare_link_events_listener(zenoh.handlers.RingChannel(1), history=True)
+    threading.Thread(target=_follow, args=(changes,), name="links", daemon=True).start()
 
-    def changed(event: zenoh.LinkEvent) -> None:
-        if event.kind == zenoh.SampleKind.PUT:
-            _linger_off()
 
-    session.info.declare_link_events_listener(changed, history=True)
+def _follow(changes: Any) -> None:  # noqa: ANN401 (zenoh's listener)
+    """Treat the sockets after each change of the links, and at most every `PAUSE` seconds, until the session closes."""
+    while True:
+        try:
+            changes.recv()
+        except zenoh.ZError:
+            return
+        _linger_off()
+        time.sleep(PAUSE)
 
 
 def _linger_off() -> None:

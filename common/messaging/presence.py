@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 
 import zenoh
@@ -27,7 +26,7 @@ class Presence:
     """
 
     def __init__(self, session: zenoh.Session, prefix: str, faults: Faults) -> None:
-        self._there: set[str] = set()
+        self._there: dict[str, set[str]] = {}  # incarnations by role
         self._gone: dict[str, float] = {}  # by role, when its last member disappeared
         self._lock = threading.Lock()
         self._on_change: Callable[[int, bool], None] = lambda incarnation, there: None
@@ -44,17 +43,17 @@ class Presence:
     def counts(self) -> dict[str, int]:
         """Number of connected processes by role."""
         with self._lock:
-            return dict(Counter(name.split("/")[0] for name in self._there))
+            return {role: len(incarnations) for role, incarnations in self._there.items() if incarnations}
 
     def members(self, role: str) -> set[str]:
         """Incarnations of a role's connected processes."""
         with self._lock:
-            return {name.split("/")[1] for name in self._there if name.startswith(f"{role}/")}
+            return set(self._there.get(role, ()))
 
     def absence(self, role: str) -> float:
         """Seconds for which no process of this role has been connected; 0 while one is."""
         with self._lock:
-            if any(name.startswith(f"{role}/") for name in self._there):
+            if self._there.get(role):
                 return 0.0
             return time.monotonic() - self._gone.get(role, self._began)
 
@@ -62,9 +61,10 @@ class Presence:
         role, incarnation = str(sample.key_expr).split("/")[-2:]
         there = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
+            incarnations = self._there.setdefault(role, set())
             if there:
-                self._there.add(f"{role}/{incarnation}")
+                incarnations.add(incarnation)
             else:
-                self._there.discard(f"{role}/{incarnation}")
+                incarnations.discard(incarnation)
                 self._gone[role] = time.monotonic()
         self._on_change(int(incarnation, 16), there)

@@ -23,7 +23,7 @@ from common.messaging import wire
 from common.messaging.endpoints import check_endpoints, explain_listen_error, first_line
 from common.messaging.faults import Faults
 from common.messaging.keys import run_key, stop_key
-from common.messaging.links import never_linger
+from common.messaging.links import never_linger, permit_many
 from common.messaging.messages.answers import Error
 from common.messaging.messages.status import Status
 from common.messaging.messages.stop import EndOfRun
@@ -32,6 +32,7 @@ from common.messaging.wire import Message
 from common.process.lifecycle import Stop
 
 ASK_TIMEOUT = 5.0  # seconds
+MAX_LINKS = 1 << 16  # of a session; Zenoh's own limit is 1,000
 
 _QUIET = {
     "scouting/multicast/enabled": False,
@@ -40,6 +41,7 @@ _QUIET = {
     "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "listen/exit_on_failure": True,
+    "transport/unicast/max_sessions": MAX_LINKS,
     "transport/link/tx/lease": round(1000 * LEASE),
     "transport/link/rx/buffer_size": 4 << 20,
     "transport/link/rx/max_message_size": MAX_PAYLOAD + (1 << 16),
@@ -79,6 +81,8 @@ def open_session(
     """
     zenoh.init_log_from_env_or("off")
     check_endpoints((*listen, *connect))
+    if listen:
+        permit_many()
     try:
         config = zenoh.Config.from_file(str(zenoh_config)) if zenoh_config else zenoh.Config()
         for key, value in _QUIET.items():
