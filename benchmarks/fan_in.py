@@ -102,12 +102,13 @@ class Clients:
     def __init__(self, stack: ExitStack, number: int, learner: str) -> None:
         spawn = multiprocessing.get_context("spawn")
         self._ends = []
+        self._processes = []
+        stack.callback(self.kill)
         for _ in range(number):
             ours, theirs = spawn.Pipe()
             process = spawn.Process(target=serve, args=(RUN, learner, theirs), daemon=True)
             process.start()
-            stack.callback(process.join, 10)
-            stack.callback(ours.send, None)
+            self._processes.append(process)
             self._ends.append(ours)
 
     def call(self, name: str, *arguments: list[Any]) -> list[Any]:
@@ -120,6 +121,12 @@ class Clients:
         """Call a method of the first one."""
         self._ends[0].send((name, arguments))
         self._ends[0].recv()
+
+    def kill(self) -> None:
+        """End them without closing their sessions, which would take Zenoh long."""
+        for process in self._processes:
+            process.kill()
+            process.join()
 
     def shares(self, number: int) -> list[int]:
         """How many of so many actors each process gets."""
@@ -165,6 +172,7 @@ def measure(number: int, options: argparse.Namespace) -> Row:
             seconds = time.monotonic() - began
             after = {name: usage(pid) for name, pid in pids.items()}
         clients.call("leave")
+        clients.kill()
         roles.check(*pids)
         with Node(open_session((), (replay,)), RUN, "watch", new_incarnation()) as node:
             time.sleep(1.0)

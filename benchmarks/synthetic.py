@@ -164,12 +164,10 @@ class SyntheticActor:
             )
 
     def leave(self) -> None:
-        """Tell the learner that this actor stops, and close."""
+        """Tell the learner that this actor stops; its links go with the process."""
         payload = Leave(self._incarnation).encode(self.space.run)
         for _ in self.session.get(join_key(self.space, "actor"), handler=FifoChannel(2), payload=payload, timeout=5.0):
             pass
-        self.route.close()  # type: ignore[no-untyped-call]
-        self.session.close()  # type: ignore[no-untyped-call]
 
     def _join(self) -> Sequence[str]:
         """Ask the learner until it answers with the replay service's endpoints."""
@@ -258,7 +256,6 @@ class Crowd:
         """Let all actors leave."""
         with ThreadPoolExecutor(AT_ONCE) as pool:
             list(pool.map(SyntheticActor.leave, self.actors))
-        self.actors.clear()
 
     def play(self, rate: float, seconds: float) -> Share:
         """Insert `rate` transitions per second in all, as evenly as the windows permit, and wait for the answers."""
@@ -331,11 +328,11 @@ class Crowd:
 
 
 def serve(run: str, learner: str, end: Connection) -> None:
-    """Carry out the parent's calls of `Crowd`'s methods, (name, arguments), until it sends None."""
+    """Carry out the parent's calls of `Crowd`'s methods, (name, arguments), until it ends."""
     keep_freed_memory()
     crowd = Crowd(Space(run), learner)
-    while (call := end.recv()) is not None:
-        name, arguments = call
+    while True:
+        name, arguments = end.recv()
         end.send(getattr(crowd, name)(*arguments))
 
 

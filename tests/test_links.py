@@ -1,0 +1,69 @@
+"""Many links of one process: they join quickly, none may block the others, and the system's limit is the only one."""
+
+import json
+import os
+import resource
+import socket
+import time
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from common.messaging import links
+from common.messaging.links import locators
+from common.messaging.transport import open_session
+
+LINKS = 20
+
+
+def lingering(port: int) -> list[bool]:
+    """Of each connection accepted at this port, whether closing it may block."""
+    found = []
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            with socket.socket(fileno=os.dup(int(entry.name))) as opened:
+                if opened.getsockname()[1] == port and opened.getpeername():
+                    found.append(any(opened.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8)[:4]))
+        except (OSError, IndexError):
+            continue  # no such connection
+    return found
+
+
+def test_of_many_new_links_none_lingers_after_a_few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A look reads every descriptor of the process: one for each link would take the square of their number."""
+    looks: list[float] = []
+    treat = links._linger_off
+
+    def look() -> None:
+        looks.append(time.monotonic())
+        treat()
+
+    monkeypatch.setattr(links, "_linger_off", look)
+    with ExitStack() as stack:
+        session = open_session(("tcp/127.0.0.1:0",))
+        stack.callback(session.close)
+        at = locators(session)
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps(at))
+        for _ in range(LINKS):
+            stack.callback(zenoh.open(config).close)
+        deadline = time.monotonic() + 30
+        while (found := lingering(int(at[0].rpartition(":")[2]))) != [False] * LINKS:
+            assert time.monotonic() < deadline, found
+            time.sleep(0.05)
+        assert looks
+        assert all(later - earlier >= links.PAUSE for earlier, later in pairwise(looks))
+
+
+def test_a_service_may_have_as_many_links_as_the_system_permits() -> None:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (before[1] // 2, before[1]))
+    try:
+        open_session(("tcp/127.0.0.1:0",)).close()  # type: ignore[no-untyped-call]
+        assert resource.getrlimit(resource.RLIMIT_NOFILE) == (before[1], before[1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
