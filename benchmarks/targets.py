@@ -25,7 +25,7 @@ from common.errors import BadMessage
 from common.messaging.keys import evaluations_key, join_key, replay_key, role_key, stop_key, weights_key
 from common.messaging.members import Origin
 from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.messages.evaluate import GIF, Evaluated, Evaluation, Video
+from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
 from common.messaging.messages.insert import SegmentReader, encode_segment
 from common.messaging.messages.join import Join, Joined
 from common.messaging.messages.limits import Limit, LimitsQuestion
@@ -80,7 +80,7 @@ def targets(node: Node, joined: Joined) -> list[Target]:
     def reporting(message: Message) -> None:
         (Video if message.kind == Video.kind else Evaluated).decode(message)
 
-    result, video = Evaluation(0, 0, 1, 10, 1.0, 1.0, 0.0, 1.0), Video(1, 0, 0, np.frombuffer(GIF, np.uint8))
+    result, video = EvaluationRow(0, 0, 1, 10, 1.0, 1.0, 0.0, 1.0), Video(1, 0, 0, np.frombuffer(GIF, np.uint8))
     draw = DrawRequest(1, 0, 0, batch_size, 0)
     made: list[tuple[str, bytearray, str, Callable[[Message], Any]]] = [
         (replay_key(node, "insert"), encode_segment(RUN, segment), "replay", SegmentReader(spec)),

@@ -11,7 +11,7 @@ import numpy as np
 
 from common.envs.make import env_spec, make_vector_env
 from common.envs.protocol import VectorEnv
-from common.messaging.messages.evaluate import Evaluation
+from common.messaging.messages.evaluate import EvaluationRow
 from common.networks.acting import ActingNetwork
 from common.settings.config import RunConfig
 from common.types import Array, EnvSpec
@@ -79,7 +79,7 @@ class Evaluator:
         self._epsilon = epsilon
         self._at_once = at_once
 
-    def evaluate(self, network: ActingNetwork, number: int, update: int, env_step: int) -> Evaluation | None:
+    def evaluate(self, network: ActingNetwork, number: int, update: int, env_step: int) -> EvaluationRow | None:
         """Evaluate a network, 1 or 2, after `env_step` steps of the run; None if that was abandoned.
 
         The emulators' seed follows from the run's seed and the step, so that a repetition gives the same result.
@@ -96,7 +96,7 @@ class Evaluator:
         if len(returns) < episodes:
             return None
         mean, sd, seconds = statistics.fmean(returns), statistics.pstdev(returns), time.monotonic() - began
-        return Evaluation(env_step, update, number, episodes, mean, sd, self._epsilon, seconds)
+        return EvaluationRow(env_step, update, number, episodes, mean, sd, self._epsilon, seconds)
 
     def film(self, network: ActingNetwork, env_step: int) -> bytes:
         """Film the beginning of an episode that a network plays greedily after `env_step` steps: an animated GIF."""

@@ -8,7 +8,7 @@ from queue import Empty, SimpleQueue
 from common.errors import RunError
 from common.messaging.keys import evaluations_key
 from common.messaging.messages.answers import Ack
-from common.messaging.messages.evaluate import Evaluated, Evaluation, Video
+from common.messaging.messages.evaluate import Evaluated, EvaluationRow, Video
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 
@@ -23,11 +23,11 @@ class EvaluationInbox:
     def __init__(self, node: Node, env_step: Callable[[], int]) -> None:
         self._run = node.run
         self._env_step = env_step
-        self._results: SimpleQueue[Evaluation | Video] = SimpleQueue()
+        self._results: SimpleQueue[EvaluationRow | Video] = SimpleQueue()
         self._next: dict[int, int] = {}  # number of the result that follows, by incarnation
         node.serve(evaluations_key(node), self._answer)
 
-    def take(self) -> Iterator[Evaluation | Video]:
+    def take(self) -> Iterator[EvaluationRow | Video]:
         """Yield the results and videos that have arrived since the last call."""
         while True:
             try:

@@ -10,7 +10,7 @@ import msgspec
 from common.errors import RunError
 from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key, stop_key
-from common.messaging.messages.evaluate import Evaluation
+from common.messaging.messages.evaluate import EvaluationRow
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.messages.stop import EndOfRun
@@ -118,7 +118,7 @@ class LearnerService:
     def _record_evaluations(self) -> None:
         """Write the results that evaluators have sent."""
         for result in self._evaluations.take():
-            if isinstance(result, Evaluation):
+            if isinstance(result, EvaluationRow):
                 self._directory.evaluation(result)
             else:
                 self._directory.video(result.gif.tobytes(), result.env_step)

@@ -21,7 +21,7 @@ from common.envs.make import make_vector_env
 from common.errors import UsageError
 from common.messaging.keys import evaluations_key, stop_key
 from common.messaging.messages.answers import Ack
-from common.messaging.messages.evaluate import GIF, Evaluated, Evaluation
+from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow
 from common.messaging.messages.join import Joined
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.transport import Node, Refused
@@ -46,7 +46,7 @@ from learner.records.run_directory import RunDirectory
 
 COLUMNS = "env_step,update,network,episodes,return_mean,return_sd,epsilon,seconds"
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
-RESULT = Evaluation(500, 300, 1, 10, 21.5, 3.25, 0.0, 1.5)
+RESULT = EvaluationRow(500, 300, 1, 10, 21.5, 3.25, 0.0, 1.5)
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -280,7 +280,7 @@ def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> 
     evaluator.follow_stop(stop)
     agent, evaluations = service(nodes, stop, Plan(steps=100, episodes=2))
     broadcaster, inbox = Broadcaster(learner, agent), EvaluationInbox(learner, lambda: 1000)
-    taken: list[Evaluation] = []
+    taken: list[EvaluationRow] = []
 
     def learn(update: int, env_step: int) -> None:
         agent.acting, agent.updates = update % 2, update
@@ -288,7 +288,7 @@ def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> 
         broadcaster.publish(env_step)
 
     def taken_all(count: int) -> bool:
-        taken.extend(result for result in inbox.take() if isinstance(result, Evaluation))
+        taken.extend(result for result in inbox.take() if isinstance(result, EvaluationRow))
         return len(taken) >= count
 
     with ThreadPoolExecutor() as threads:

@@ -31,7 +31,7 @@ from common.messaging import wire
 from common.messaging.members import Origin
 from common.messaging.messages.answers import Ack, Error, Retry
 from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.messages.evaluate import GIF, Evaluated, Evaluation, Video
+from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
 from common.messaging.messages.insert import OPTIONAL, SegmentReader, encode_segment
 from common.messaging.messages.join import Join, Joined, Leave
 from common.messaging.messages.limits import Limit, Limits
@@ -52,7 +52,7 @@ STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
 JOIN = Join("replay", 5, ["tcp/127.0.0.1:1"], epochs=[500, 1000])
 JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300, replay=Origin("h", 7))
 LIMITS = Limits(0.5, 8.0, 10, 5, 50, "a", "")
-EVALUATED = Evaluated(5, 3, Evaluation(600, 400, 2, 10, 21.5, 3.25, 0.0, 1.5))
+EVALUATED = Evaluated(5, 3, EvaluationRow(600, 400, 2, 10, 21.5, 3.25, 0.0, 1.5))
 RESULT = msgspec.structs.asdict(EVALUATED.result)
 VIDEO = Video(5, 4, 600, np.frombuffer(GIF + b"9a", np.uint8))
 TABLES = to_tables(RunConfig())

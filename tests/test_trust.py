@@ -14,7 +14,7 @@ import zenoh
 
 from common.messaging.keys import evaluations_key, join_key, replay_key
 from common.messaging.messages.epoch import Snapshot
-from common.messaging.messages.evaluate import Evaluated, Evaluation
+from common.messaging.messages.evaluate import Evaluated, EvaluationRow
 from common.messaging.messages.join import Join
 from common.messaging.messages.limits import Limit
 from common.messaging.messages.sample import DrawRequest
@@ -151,7 +151,7 @@ def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, s
 
 
 def test_an_evaluator_s_certificate_reads_weights_and_reports(run: tuple[str, str], keys: Path) -> None:
-    report = Evaluated(1, 0, Evaluation(0, 0, 1, 1, 1.0, 0.0, 0.0, 1.0)).encode(RUN)
+    report = Evaluated(1, 0, EvaluationRow(0, 0, 1, 1, 1.0, 0.0, 0.0, 1.0)).encode(RUN)
     with joined(run, keys / "evaluator.json5", "evaluator") as evaluator, joined(run, keys / "actor.json5") as actor:
         joining = Join("evaluator", 5, []).encode(RUN)
         assert evaluator.ask(join_key(evaluator, "evaluator"), joining).kind == "joined"

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messaging.messages.evaluate import Evaluation
+from common.messaging.messages.evaluate import EvaluationRow
 from common.process.files import LineFile
 
 EVALUATIONS = "evaluations.csv"
 Floats = NDArray[np.float64]
-FIELDS = Evaluation.__struct_fields__
+FIELDS = EvaluationRow.__struct_fields__
 
 
 class EvaluationsFile(LineFile):
@@ -40,7 +40,7 @@ class EvaluationsFile(LineFile):
         for row in kept:
             self._write(row)
 
-    def add(self, row: Evaluation) -> None:
+    def add(self, row: EvaluationRow) -> None:
         """Add a line."""
         values = [getattr(row, name) for name in FIELDS]
         self._write([f"{value:.8g}" if isinstance(value, float) else str(value) for value in values])

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from common.errors import RunError
-from common.messaging.messages.evaluate import Evaluation
+from common.messaging.messages.evaluate import EvaluationRow
 from common.process.console import say
 from common.process.files import LineFile, truncate, write_atomic
 from common.process.run_ids import draw_run_id, read_run_id
@@ -101,7 +101,7 @@ class RunDirectory:
         """Environment steps at the last evaluation; 0 before it."""
         return self._evaluations.newest
 
-    def evaluation(self, row: Evaluation) -> None:
+    def evaluation(self, row: EvaluationRow) -> None:
         """Add a line to evaluations.csv, and its returns to TensorBoard."""
         self._evaluations.add(row)
         self._tensorboard.evaluation(row.return_mean, row.return_sd, row.env_step)

@@ -18,7 +18,7 @@ from common.types import Array
 GIF = b"GIF8"  # the first bytes of every one
 
 
-class Evaluation(Struct, frozen=True, forbid_unknown_fields=True):
+class EvaluationRow(Struct, frozen=True, forbid_unknown_fields=True):
     """Unclipped returns of full episodes that a network played; the columns of evaluations.csv.
 
     env_step, update: of the run when the network was broadcast. epsilon: probability of a random action; 0 is greedy
@@ -42,7 +42,7 @@ class Evaluated(Body, frozen=True):
 
     incarnation: Incarnation
     number: Count
-    result: Evaluation
+    result: EvaluationRow
 
 
 class Video(Struct, frozen=True):
