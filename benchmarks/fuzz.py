@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from mutations import mutate
-from roles import ActorWatch, Roles, replay_stats, running, wait_until
+from roles import Roles, RunWatch, replay_stats, running, wait_until
 from targets import RUN, Target, extremes, targets
 
 from common.errors import BadMessage, CoopError, RunError
@@ -177,7 +177,7 @@ def fuzz(count: int, seed: int, folder: Path) -> None:
     at = free_endpoint(), free_endpoint()
     ports = [int(endpoint.rpartition(":")[2]) for endpoint in at]
     flags = ("--preset=cartpole", "--total-steps=100000000", "--replay.ratio=0.1")
-    roles = Roles(folder, RUN, at, flags, actors=2)
+    roles = Roles.of_run(folder, RUN, at, flags, actors=2)
     actor = roles.processes["actor 1"]
     with running(roles, "actor 2"), Node(open_session((), at), RUN, "watch", new_incarnation()) as node:
         joined = join(node, Stop(), Join("actor", new_incarnation(), []), at, 60.0, need_replay=True)
@@ -226,7 +226,7 @@ def fuzz(count: int, seed: int, folder: Path) -> None:
 
 def survive(roles: Roles, watch: Watch, flood: Flood, messages: list[tuple[str, bytes]], learner_at: str) -> None:
     """Raise a CoopError if valid messages stop the run, its actor, or another actor that joins."""
-    with ActorWatch(RUN, learner_at) as actors:
+    with RunWatch(RUN, learner_at) as actors:
         wait_until("the actor's status", lambda: bool(actors.acked()))
         flood.send_valid(messages)
         roles.check("learner", "replay", "actor 1")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
@@ -27,22 +27,24 @@ class Roles:
 
     Args:
         folder: run directory; logs go to its logs/.
-        at: endpoints of learner and replay service.
-        inside: command prefix of a role ("ip netns exec NAME"), by the role's first word.
+        flags: of each process.
+        inside: command prefix of a process ("ip netns exec NAME"), by its name.
     """
 
     def __init__(
         self,
         folder: Path,
-        run: str,
-        at: tuple[str, str],
-        flags: Sequence[str],
-        actors: int,
-        inside: Callable[[str], list[str]] = lambda role: [],
+        flags: Mapping[str, Sequence[str]],
+        inside: Callable[[str], list[str]] = lambda name: [],
     ) -> None:
-        logs = folder / "logs"
-        logs.mkdir(parents=True)
         self.folder = folder
+        self._inside = inside
+        (folder / "logs").mkdir(parents=True)
+        self.processes = {name: self._process(name, own) for name, own in flags.items()}
+
+    @classmethod
+    def of_run(cls, folder: Path, run: str, at: tuple[str, str], flags: Sequence[str], actors: int) -> Self:
+        """A run whose learner, with these flags, and replay service have the endpoints `at`."""
         learner_at, replay_at = at
         joining = (f"--run={run}", "--connect", learner_at, "--join-timeout=60")
         own = {
@@ -50,14 +52,16 @@ class Roles:
             "replay": (*joining, "--listen", replay_at, f"--run-dir={folder}"),
             **{f"actor {number + 1}": joining for number in range(actors)},
         }
-        self.processes = {
-            name: ChildProcess(
-                name,
-                [*inside(name.split()[0]), *command(f"coop-{name.split()[0]}", *arguments)],
-                logs / f"{name.replace(' ', '-')}.log",
-            )
-            for name, arguments in own.items()
-        }
+        return cls(folder, own)
+
+    def _process(self, name: str, flags: Sequence[str]) -> ChildProcess:
+        arguments = [*self._inside(name), *command(f"coop-{name.split(maxsplit=1)[0]}", *flags)]
+        return ChildProcess(name, arguments, self.folder / "logs" / f"{name.replace(' ', '-')}.log")
+
+    def start_again(self, name: str, flags: Sequence[str]) -> None:
+        """Start a process that has ended, with other flags."""
+        self.processes[name] = self._process(name, flags)
+        self.processes[name].start()
 
     def check(self, *names: str) -> None:
         """Raise RunError if one of these processes has ended."""
@@ -66,12 +70,16 @@ class Roles:
                 raise RunError(self.processes[name].why())
 
     def finish(self) -> dict[str, Any]:
-        """Interrupt the learner, wait for all roles, and return the run's summary.
+        """Interrupt the learner, and return as `ended`."""
+        self.processes["learner"].interrupt()
+        return self.ended()
+
+    def ended(self) -> dict[str, Any]:
+        """Wait for the end of all roles, and return the run's summary.
 
         Raises:
             RunError: a role failed.
         """
-        self.processes["learner"].interrupt()
         for process in self.processes.values():
             process.end(GRACE)
             if process.exit_status() and not process.was_interrupted():
@@ -92,10 +100,10 @@ def running(roles: Roles, *later: str) -> Iterator[Roles]:
             process.end(0.0)
 
 
-class ActorWatch:
-    """The number of acknowledged transitions of each actor, by its own account.
+class RunWatch:
+    """The progress of a run's learner and actors, by their own account.
 
-    Actors publish it to the learner, which forwards it to its Zenoh clients, like this one.
+    Actors publish theirs to the learner, which forwards it to its Zenoh clients, like this one.
     """
 
     def __init__(self, run: str, learner_at: str) -> None:
@@ -103,16 +111,23 @@ class ActorWatch:
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/endpoints", json.dumps([learner_at]))
         config.insert_json5("connect/timeout_ms", "-1")
-        self._run = run
         self._session = zenoh.open(config)
-        self._acked: dict[str, int] = {}
-        self._told = self._session.declare_subscriber(f"coop/{run}/metrics/actor/*", zenoh.handlers.FifoChannel(256))
+        self._fields: dict[str, dict[str, Any]] = {}
+        self._told = self._session.declare_subscriber(f"coop/{run}/metrics/*/*", zenoh.handlers.RingChannel(256))
 
     def acked(self) -> dict[str, int]:
-        """The latest numbers, by incarnation."""
+        """The latest number of acknowledged transitions of each actor, by incarnation."""
+        return {key: fields["acked"] for key, fields in self._read("actor").items()}
+
+    def updates(self) -> int:
+        """The learner's latest number of updates; 0 before its first word."""
+        return max((fields["updates"] for fields in self._read("learner").values()), default=0)
+
+    def _read(self, role: str) -> dict[str, dict[str, Any]]:
+        """The latest status of each process of a role, by key."""
         while (sample := self._told.try_recv()) is not None:
-            self._acked[str(sample.key_expr)] = wire.decode(sample.payload.to_bytes()).fields["acked"]
-        return dict(self._acked)
+            self._fields[str(sample.key_expr)] = wire.decode(sample.payload.to_bytes()).fields
+        return {key: fields for key, fields in self._fields.items() if key.split("/")[-2] == role}
 
     def __enter__(self) -> Self:
         return self

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import zenoh
 
-from common.messaging.links import described
+from common.messaging.links import close, described
 from common.messaging.transport import open_session
 from common.process import cli
 from common.process.console import Console, counted
@@ -46,7 +46,7 @@ def _run() -> None:
             while not stop.wait(TICK):
                 console.progress(0, "", lambda: links(session))
     finally:
-        session.close()  # type: ignore[no-untyped-call]
+        close(session)
     stop.leave()
 
 

@@ -1,17 +1,21 @@
-"""Peers that freeze with a full link: the others are served all the same."""
+"""Peers that freeze with a full link, and hosts that never answer: all others are served all the same."""
 
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
 from common.messaging.links import locators
 from common.messaging.messages.answers import Ack
 from common.messaging.messages.weights import Current
+from common.messaging.route import CLOSING, ReplayRoute
 from common.messaging.transport import Node, new_incarnation, open_session
 
 FROZEN = 3  # more than the threads that Zenoh receives with, left to itself
@@ -57,3 +61,18 @@ def test_frozen_peers_do_not_make_a_process_deaf(server: Node) -> None:
         for _ in range(20):
             client.ask(client.key("role"), question, timeout=4.0)
             time.sleep(0.1)
+
+
+def test_a_route_leaves_a_host_that_never_answers_at_once(server: Node, tmp_path: Path) -> None:
+    patient = tmp_path / "zenoh.json5"
+    patient.write_text("{transport: {unicast: {open_timeout: 30000}}}")  # longer than closing may take
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        nowhere = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        with ReplayRoute("test", 7, lambda endpoints: open_session((), endpoints, patient), [nowhere]) as route:
+            began = time.monotonic()
+            route.follow(locators(server.session))
+            assert time.monotonic() - began < 8.0
+            assert Ack.decode(route.begin(route.key("role"), Current().encode("test"), 5.0).wait()).inserted == 1
+        for thread in threading.enumerate():
+            if thread.name == CLOSING:
+                thread.join()  # where closing failed, so does this test

@@ -16,6 +16,7 @@ from commands import run_command
 
 from common.errors import JoinError
 from common.messaging.keys import replay_key
+from common.messaging.links import close
 from common.messaging.messages.answers import Ack
 from common.messaging.route import RoutedReplay, open_client
 from common.messaging.transport import Node, new_incarnation, open_session
@@ -57,7 +58,7 @@ def test_one_link_carries_everything() -> None:
                 wait_for(lambda: learner.presence.members("actor"))
                 assert links(router) == "connected: 2 services, 1 actor"
         finally:
-            router.close()  # type: ignore[no-untyped-call]
+            close(router)
 
 
 def test_no_router() -> None:

@@ -1,4 +1,4 @@
-"""A session's links: where it listens, how many it may have, and that a dead one must not block the others.
+"""A session's links: where it listens, how many it may have, how it closes; a dead one must not block the others.
 
 Zenoh sets SO_LINGER to 10 s on its sockets. If a peer freezes or its cable is cut while data is unsent, Zenoh's closing
 thread blocks for that long, and since all links share this thread, no other peer can send or receive meanwhile. Zenoh
@@ -8,6 +8,7 @@ that is, so all are looked at: once for all links that come within a moment, as 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -60,6 +61,12 @@ def _follow(changes: Any) -> None:  # noqa: ANN401 (zenoh's listener)
             return
         _linger_off()
         time.sleep(PAUSE)
+
+
+def close(session: zenoh.Session) -> None:
+    """Close a session; takes up to 10 s while it connects to a host that does not answer."""
+    with contextlib.suppress(zenoh.ZError):  # it then says that it took too long
+        session.close()  # type: ignore[no-untyped-call]
 
 
 def _linger_off() -> None:

@@ -18,6 +18,7 @@ from common.messaging.transport import NoAnswer, Node, Pending, open_session
 from common.process.lifecycle import Stop
 
 RETRY_PAUSE = 0.1  # seconds
+CLOSING = "closing a route"  # name of a thread
 
 
 def open_client(
@@ -84,7 +85,8 @@ class ReplayRoute:
         node = self._open(endpoints)
         with self._lock:
             old, self._node, self._endpoints = self._node, node, set(endpoints)
-        old.close()
+        # In a thread of its own, for which the process waits: it takes up to 10 s where nobody answers.
+        threading.Thread(target=old.close, name=CLOSING).start()
 
     def __enter__(self) -> Self:
         return self

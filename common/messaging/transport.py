@@ -23,7 +23,7 @@ from common.messaging import wire
 from common.messaging.endpoints import check_endpoints, explain_listen_error, first_line
 from common.messaging.faults import Faults
 from common.messaging.keys import run_key, stop_key
-from common.messaging.links import never_linger, permit_many
+from common.messaging.links import close, never_linger, permit_many
 from common.messaging.messages.answers import Error
 from common.messaging.messages.status import Status
 from common.messaging.messages.stop import EndOfRun
@@ -254,7 +254,7 @@ class Node:
     def close(self) -> None:
         """Close the session and wait for the serving threads."""
         self._closing = True
-        self.session.close()  # type: ignore[no-untyped-call]
+        close(self.session)
         for thread in self._threads:
             thread.join()
 
