@@ -17,7 +17,7 @@ from common.errors import UsageError
 from experiments.report.answer import answer
 from experiments.report.baseline import baseline_figure, baseline_table, find_baseline
 from experiments.report.figures import buffers
-from experiments.report.measures import Interval
+from experiments.report.intervals import Interval
 from experiments.report.page import page
 from experiments.report.plots import STYLE, WIDTH, Figure, Line, Panel, _finish_panel, draw
 from experiments.report.results import tables

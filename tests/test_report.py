@@ -7,18 +7,20 @@ import re
 import shutil
 import statistics
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rliable import metrics
+from rliable import library, metrics
 
 from common.errors import RunError, UsageError
 from common.returns import running_mean
 from experiments.lockstep import Lockstep
 from experiments.report import cli
 from experiments.report.figures import NETWORKS, figures
-from experiments.report.measures import breaking_point, improvement, iqm_by_task
+from experiments.report.intervals import REPS, Interval, improvement, iqm_by_task, iqm_overall, profiles
+from experiments.report.measures import breaking_point
 from experiments.report.paper import table_1
 from experiments.report.results import breaking_table
 from experiments.report.study import load_study
@@ -241,12 +243,37 @@ def test_a_breaking_point_has_an_interval() -> None:
     assert found == (50, 50, 500, False)
 
 
-def test_statistics_agree_with_rliable() -> None:
+def of_rliable(function: Callable[..., np.ndarray], *scores: np.ndarray) -> Interval:
+    """What rliable gives, which draws from numpy's global generator."""
+    np.random.seed(0)
+    drawn = scores if len(scores) > 1 else scores[0]
+    values, bounds = library.get_interval_estimates({"x": drawn}, function, reps=REPS)
+    return Interval(values["x"], *bounds["x"])
+
+
+def assert_equal(ours: Interval, theirs: Interval) -> None:
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_statistics_and_intervals_are_rliables() -> None:
     generator = np.random.default_rng(3)
     x, y = generator.integers(0, 9, (7, 3)).astype(np.float64), generator.integers(0, 9, (5, 3)).astype(np.float64)
-    assert improvement(x, y).value[0] == pytest.approx(metrics.probability_of_improvement(x, y))
-    assert np.array_equal(iqm_by_task(x), iqm_by_task(x))
-    assert iqm_by_task(x).value == pytest.approx([metrics.aggregate_iqm(column) for column in x.T])
+    assert_equal(iqm_overall(x), of_rliable(lambda sample: np.array([metrics.aggregate_iqm(sample)]), x))
+    assert_equal(
+        iqm_by_task(x), of_rliable(lambda sample: np.array([metrics.aggregate_iqm(task) for task in sample.T]), x)
+    )
+    assert_equal(
+        improvement(x, y), of_rliable(lambda *both: np.array([metrics.probability_of_improvement(*both)]), x, y)
+    )
+    levels = np.arange(-1.0, 10.0)
+    np.random.seed(0)
+    shares, bounds = library.create_performance_profile({"x": x, "y": y}, levels, reps=REPS)
+    for name, ours in profiles({"x": x, "y": y}, levels).items():
+        assert_equal(ours, Interval(shares[name], *bounds[name]))
+
+
+def test_the_running_mean_takes_a_hundred_episodes() -> None:
     mean = running_mean(np.arange(250.0))
     assert (mean[0], mean[99], mean[249]) == (0.0, 49.5, 199.5)
 

@@ -43,8 +43,8 @@ def _run() -> None:
     runs = options.runs
     if not runs.exists():
         raise UsageError(f"{runs}: no such folder or file")
-    if missing := [package for package in ("rliable", "pyarrow") if find_spec(package) is None]:
-        raise RunError(f"{missing[0]} is not installed; it comes with the extra report: pip install 'coop-rl[report]'")
+    if find_spec("pyarrow") is None:
+        raise RunError("pyarrow is not installed; it comes with the extra report: pip install 'coop-rl[report]'")
     # Imported only after the flags have been checked: the statistics' libraries take seconds.
     if options.pack is not None:
         from experiments.report.packed import pack  # noqa: PLC0415

@@ -9,14 +9,13 @@ import numpy as np
 
 from common.returns import running_mean
 from common.settings.methods import METHODS
+from experiments.report.intervals import Interval, iqm_by_task
 from experiments.report.measures import (
-    Interval,
     by_episodes,
     by_steps,
     diagnostic,
     diagnostics_of,
     evaluated_by_steps,
-    iqm_by_task,
     metrics_by_steps,
     q_gaps,
     rows_with,

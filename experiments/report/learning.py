@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from common.returns import RETURN_WINDOW, running_mean
-from experiments.report.measures import REPS
+from experiments.report.intervals import REPS
 from experiments.report.study import Floats, Run, Study
 
 SHORT = 20  # episodes in the running mean that decides whether a run is healthy or has collapsed

@@ -1,29 +1,20 @@
-"""The measures that a report computes from runs, and their statistics over runs (rliable's, by seeds)."""
+"""The measures that a report computes from runs, curves over runs, and breaking points."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rliable import library, metrics
 
 from common.returns import RETURN_WINDOW
+from experiments.report.intervals import REPS
 from experiments.report.study import LATER, Q_SHARE, Floats, Run, Study
 
 ENOUGH = 0.95  # share of the return at the largest capacity that counts as unbroken learning
 POINTS = 120  # of a curve
-REPS = 1000  # bootstrap samples
 DIAGNOSTICS = ("sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsampled")
-
-
-class Interval(NamedTuple):
-    """Estimates with their 95 % bootstrap intervals; float64 arrays of one shape."""
-
-    value: Floats
-    low: Floats
-    high: Floats
 
 
 class Breaking(NamedTuple):
@@ -118,34 +109,6 @@ def _latest(steps: Floats, values: Floats, at: Floats) -> Floats:
     return values[np.maximum(0, np.searchsorted(steps, at, side="right") - 1)]
 
 
-def iqm(scores: Floats) -> Floats:
-    """Interquartile mean over runs: float64 [runs, tasks] -> [tasks], like rliable's but for each task separately."""
-    cut = len(scores) // 4
-    return np.asarray(np.sort(scores, axis=0)[cut : len(scores) - cut].mean(axis=0))
-
-
-def iqm_by_task(scores: Floats) -> Interval:
-    """Interquartile mean over runs of each task; scores float64 [runs, tasks]."""
-    return _interval(scores, iqm)
-
-
-def iqm_overall(scores: Floats) -> Interval:
-    """Interquartile mean over all runs and tasks, float64 [1]; scores float64 [runs, tasks]."""
-    return _interval(scores, lambda sample: np.array([metrics.aggregate_iqm(sample)]))
-
-
-def improvement(x: Floats, y: Floats) -> Interval:
-    """Probability that a run of x is better than one of y, mean over tasks, float64 [1]; scores [runs, tasks]."""
-    return _interval((x, y), _share_better)
-
-
-def profiles(scores: Mapping[str, Floats], levels: Floats) -> dict[str, Interval]:
-    """Performance profiles: the share of runs above each level, float64 [levels]; scores [runs, tasks] by method."""
-    _seed()
-    shares, bounds = library.create_performance_profile(dict(scores), levels, reps=REPS)
-    return {name: Interval(shares[name], *bounds[name]) for name in scores}
-
-
 def breaking_point(capacities: NDArray[np.int64], scores: Sequence[Floats]) -> Breaking:
     """The breaking point by the mean score over runs.
 
@@ -183,20 +146,3 @@ def _is_enough(means: Floats) -> NDArray[np.bool_]:
     """Whether each mean [..., capacities] is at least 95 % of the last one (if negative: within 5 % of its size)."""
     largest = means[..., -1:]
     return np.asarray(means >= largest - (1 - ENOUGH) * np.abs(largest))
-
-
-def _share_better(x: Floats, y: Floats) -> Floats:
-    """Compute rliable's `metrics.probability_of_improvement` in one array operation."""
-    difference = x[:, None] - y[None, :]
-    return np.array([((difference > 0) + 0.5 * (difference == 0)).mean()])
-
-
-def _interval(scores: Floats | tuple[Floats, Floats], function: object) -> Interval:
-    _seed()
-    values, bounds = library.get_interval_estimates({"x": scores}, function, reps=REPS)
-    return Interval(np.asarray(values["x"]), *bounds["x"])
-
-
-def _seed() -> None:
-    """Seed numpy's global generator, which rliable uses: the same runs must give the same report."""
-    np.random.seed(0)

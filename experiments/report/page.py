@@ -116,5 +116,5 @@ def _warnings(study: Study) -> str:
 
 
 def _versions() -> str:
-    packages = ", ".join(f"{name} {version(name)}" for name in ("coop-rl", "rliable", "numpy", "matplotlib"))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("coop-rl", "numpy", "matplotlib"))
     return f"{packages}, Python {platform.python_version()}"

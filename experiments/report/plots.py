@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from common.settings.methods import METHODS
-from experiments.report.measures import Interval
+from experiments.report.intervals import Interval
 from experiments.report.study import Floats
 from experiments.report.table import ResultTable, Value
 

@@ -7,16 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from experiments.report.comparisons import comparison_tables
-from experiments.report.measures import (
-    breaking_point,
-    diagnostic,
-    diagnostics_of,
-    improvement,
-    iqm_by_task,
-    iqm_overall,
-    score,
-    spread,
-)
+from experiments.report.intervals import improvement, iqm_by_task, iqm_overall
+from experiments.report.measures import breaking_point, diagnostic, diagnostics_of, score, spread
 from experiments.report.paper import table_1
 from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
 from experiments.report.study import Floats, Run, Setting, Study
@@ -192,5 +184,5 @@ def _lengths(runs: Sequence[Run]) -> list[Value]:
 def _matrix_note(study: Study) -> str:
     return (
         f"Over those of the {len(study.settings)} settings that every method has been run at, and the seeds that a "
-        "method has at all of them; by rliable, with 95 % stratified bootstrap intervals (void for one seed)."
+        "method has at all of them, with 95 % stratified bootstrap intervals (void for one seed)."
     )

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.report.measures import Interval, improvement, iqm_by_task, iqm_overall, profiles, score
+from experiments.report.intervals import Interval, improvement, iqm_by_task, iqm_overall, profiles
+from experiments.report.measures import score
 from experiments.report.plots import Figure, Line, Panel
 from experiments.report.slices import counts, label, matrices, pairs
 from experiments.report.study import Floats, Setting, Study
@@ -69,7 +70,7 @@ def aggregates(study: Study) -> list[Figure]:
     every = np.concatenate([matrix.ravel() for matrix in scores.values()]) if scores else np.zeros(1)
     levels = np.linspace(every.min() - 1e-9, every.max(), 61)
     shares = [Line(name, levels, interval) for name, interval in profiles(scores, levels).items()] if scores else []
-    interval = " over the settings that all methods share; 95 % stratified bootstrap intervals by rliable."
+    interval = " over the settings that all methods share; 95 % stratified bootstrap intervals."
     names = [line.label for line in better]
     return [
         Figure(
