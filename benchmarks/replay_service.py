@@ -3,7 +3,8 @@
 A real `coop-replay` process, two inserting processes and one sampling client (this process), over TCP and shared
 memory. The reference is bare Zenoh with numpy: a process that gathers the same number of frames from a ring and copies
 segments into it, without checks, counters or limiter. Both take turns in every round, so that the ratios hold on a busy
-machine. Prints medians with their range over the rounds.
+machine. With `--router`, inserting processes behind a `coop-router` take turns with those that have links of their own
+instead. Prints medians with their range over the rounds.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from table import ATARI, segments
 
 from common.messaging.clients import InsertClient, SampleClient
 from common.messaging.messages.insert import encode_segment
+from common.messaging.route import open_client
 from common.messaging.transport import Node, new_incarnation, open_session
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
@@ -42,7 +44,6 @@ CAPACITY = 50_000
 FRAMES = BATCH * (ATARI.stack + 1)  # of a batch without repeats
 FRAME_BYTES = 84 * 84
 RUN = "bench"
-MODES = ("coop", "bare")
 WINDOW = 16  # segments of an inserting process in flight, as many as an actor with 8 emulators has
 # A run whose limiter admits everything.
 CONFIG = validated(
@@ -90,13 +91,21 @@ def bare_server(endpoint: str, shared_memory: bool, end: Connection) -> None:
         end.recv()
 
 
-def inserter(endpoints: tuple[str, ...], shared_memory: bool, end: Connection) -> None:
-    """Insert on demand; answers each `Work` with the number of transitions acknowledged."""
+def inserter(endpoints: tuple[str, ...], routed: bool, shared_memory: bool, end: Connection) -> None:
+    """Insert on demand; answers each (mode, seconds, rate) with the number of transitions acknowledged per second.
+
+    routed: the endpoints are a router's; such a process has the mode "routed" only.
+    """
     incarnation = new_incarnation()
     stream = (msgspec.structs.replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
     bare = encode_segment(RUN, next(segments(ATARI, STEPS)))
     waiting: deque[Any] = deque()
-    with Node(open_session((), endpoints, shared_memory=shared_memory), RUN, "actor", incarnation) as node:
+    if routed:
+        session = open_client(endpoints, None, shared_memory, 30.0, Stop())
+        assert session is not None
+    else:
+        session = open_session((), endpoints, shared_memory=shared_memory)
+    with Node(session, RUN, "actor", incarnation) as node:
         client = InsertClient(node, Stop(), window=WINDOW)
 
         def insert_bare() -> None:
@@ -105,10 +114,10 @@ def inserter(endpoints: tuple[str, ...], shared_memory: bool, end: Connection) -
             waiting.append(node.session.get("bare/insert", handler=zenoh.handlers.FifoChannel(2), payload=bare))
 
         def insert(mode: str) -> None:
-            client.submit(next(stream)) if mode == "coop" else insert_bare()
+            insert_bare() if mode == "bare" else client.submit(next(stream))
 
-        insert("coop")
-        insert("bare")
+        for mode in ("routed",) if routed else ("coop", "bare"):
+            insert(mode)
         end.send("ready")
         while (work := end.recv()) is not None:
             mode, seconds, rate = work
@@ -146,23 +155,32 @@ class BareSampler:
 class Bench:
     """All processes of one transport, warmed up.
 
-    folder: for the logs of the replay service.
+    folder: for the logs. router: with a router, and two more inserting processes behind it.
+
+    Attributes:
+        modes: to be compared.
     """
 
-    def __init__(self, stack: ExitStack, shared_memory: bool, folder: Path) -> None:
+    def __init__(self, stack: ExitStack, shared_memory: bool, folder: Path, router: bool) -> None:
         keep_freed_memory()
-        head, replay, bare = (free_endpoint() for _ in range(3))
+        head, replay, bare, gate = (free_endpoint() for _ in range(4))
+        gates = [gate] if router else []
         spawn = multiprocessing.get_context("spawn")
-        self._ends: list[Connection] = []
 
-        def start(target: Callable[..., None], *args: object) -> None:
+        def start(target: Callable[..., None], *args: object) -> Connection:
             ours, theirs = spawn.Pipe()
             process = spawn.Process(target=target, args=(*args, shared_memory, theirs))
             process.start()
             stack.callback(process.join)
             stack.callback(ours.send, None)
             assert ours.recv() == "ready"
-            self._ends.append(ours)
+            return ours
+
+        def serve(name: str, *flags: str) -> None:
+            service = ChildProcess(name, command(f"coop-{name}", *flags), folder / name)
+            service.start()
+            stack.callback(service.end, 10)
+            stack.callback(service.interrupt)
 
         start(bare_server, bare)
         incarnation = new_incarnation()
@@ -171,20 +189,21 @@ class Bench:
         JoinService(
             node, CONFIG, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster(), event=print
         )
-        flags = ["--run", RUN, "--connect", head, "--listen", replay, "--run-dir", str(folder)]
-        service = ChildProcess(
-            "replay", command("coop-replay", *flags, *["--shared-memory"] * shared_memory), folder / "log"
-        )
-        service.start()
-        stack.callback(service.end, 10)
-        stack.callback(service.interrupt)
-        start(inserter, (head, replay, bare))
-        start(inserter, (head, replay, bare))
-        self._samplers = {
-            "coop": SampleClient(node, Stop(), incarnation, ATARI, BATCH, PREFETCH),
-            "bare": BareSampler(session),
-        }
-        for mode in MODES:
+        flags = ["--run", RUN, "--connect", head, *gates, "--listen", replay, "--run-dir", str(folder)]
+        serve("replay", *flags, *["--shared-memory"] * shared_memory)
+        direct = [start(inserter, (head, replay, bare), False) for _ in range(2)]
+        sampler = SampleClient(node, Stop(), incarnation, ATARI, BATCH, PREFETCH)
+        self._samplers: dict[str, SampleClient | BareSampler] = {"coop": sampler}
+        self._inserters = {"coop": direct}
+        if router:
+            serve("router", "--connect", head, "--listen", gate)
+            self._samplers["routed"] = sampler
+            self._inserters["routed"] = [start(inserter, (gate,), True) for _ in range(2)]
+        else:
+            self._samplers["bare"] = BareSampler(session)
+            self._inserters["bare"] = direct
+        self.modes = tuple(self._samplers)
+        for mode in self.modes:
             self.insert(mode, 1.0)
             self.sample(mode, 1.0, 1000.0)
 
@@ -206,7 +225,7 @@ class Bench:
         return batches / seconds, inserted
 
     def _work(self, mode: str, seconds: float, rate: float, meanwhile: Callable[[], None]) -> list[float]:
-        inserters = self._ends[1:]
+        inserters = self._inserters[mode]
         for end in inserters:
             end.send((mode, seconds, rate))
         meanwhile()
@@ -218,14 +237,15 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement")
     parser.add_argument("--insert-rate", type=float, default=5200, help="transitions/s inserted during draws, by both")
+    parser.add_argument("--router", action="store_true", help="compare with processes behind a router, over TCP")
     options = parser.parse_args()
     print(f"{options.rounds} rounds of {options.seconds:g} s: median (lowest to highest)")
-    for shared_memory in (False, True):
+    for shared_memory in (False,) if options.router else (False, True):
         with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-            bench = Bench(stack, shared_memory, Path(folder))
+            bench = Bench(stack, shared_memory, Path(folder), options.router)
             figures: dict[str, list[float]] = {}
             for _ in range(options.rounds):
-                for mode in MODES:
+                for mode in bench.modes:
                     batches, meanwhile = bench.sample(mode, options.seconds, options.insert_rate)
                     figures.setdefault(f"{mode}: batches of {BATCH}/s", []).append(batches)
                     figures.setdefault(f"{mode}:   transitions/s inserted meanwhile", []).append(meanwhile)
