@@ -180,6 +180,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=8.0, help="of each cut, more than 5")
     parser.add_argument("--only", default="", help=f"only incidents with this in their name: {'; '.join(INCIDENTS)}")
     options = parser.parse_args()
+    if not options.seconds > 5:
+        parser.error(f"--seconds {options.seconds:g}: must be more than 5")
     if os.geteuid() or shutil.which("ip") is None:
         print("netns: skipped: making network namespaces needs root and iproute2")
         return
