@@ -41,7 +41,7 @@ def _point(status: LearnerStatus) -> Point:
     known: dict[str, float | None] = {}
     if (ratio := status.ratio) is not None:
         known = {
-            "ratio": ratio.measured, "ratio_target": ratio.target,
-            "ahead": ratio.ahead, "least": ratio.least, "most": ratio.most,
+            "ratio": ratio.measured, "ratio_target": ratio.target, "least": ratio.least, "most": ratio.most,
+            "ahead": None if ratio.measured is None else ratio.ahead,  # the band holds from the first update on
         }  # fmt: skip
     return [known.get(name, getattr(status, name, getattr(status.measured, name, None))) for name in COLUMNS]

@@ -11,6 +11,7 @@ from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
 from common.process.console import stamped
 from common.process.files import write_atomic
+from common.process.flags import HttpAddress
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
 from common.process.ports import check_can_listen
@@ -35,7 +36,7 @@ class LocalOptions(LearnerRunOptions):
     """Actor processes; 0 with --listen, for actors that all run elsewhere."""
     listen: str | None = None
     """Endpoint of the learner, for actors on other machines; a free port on loopback if not given."""
-    web: str = ""
+    web: HttpAddress = ""
     """Show the run's screen as a web page too: PORT, on loopback, or HOST:PORT."""
 
 
@@ -70,7 +71,7 @@ class Topology:
         modules = [path.partition(":")[0] for path in config.imports.values()]
         playing = [*joining, "--allow-import", *modules] if modules else joining
         self._others += [
-            ChildProcess(f"actor {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")
+            ChildProcess(f"actor process {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")
             for number in range(1, options.actors + 1)
         ]
         if config.eval_every or config.video_every:

@@ -14,6 +14,7 @@ from common.errors import JoinError, PeerLost, UsageError
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.transport import new_incarnation
 from common.process.cli import parse
+from common.process.flags import HttpAddress
 from common.process.lifecycle import Stop, run_main
 from deploy.screen import RunScreen
 from deploy.status import Display, RunStatus, live_page
@@ -37,7 +38,7 @@ class WatchOptions:
     """A Zenoh configuration file (TLS, access control); the endpoint given as a flag still applies."""
     once: bool = False
     """Print the present status and end."""
-    web: str = ""
+    web: HttpAddress = ""
     """Show the screen as a web page too: PORT, on loopback, or HOST:PORT."""
     json: bool = False
     """With --once: print one JSON object instead of the screen; docs/watching.md lists its fields."""

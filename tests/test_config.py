@@ -116,6 +116,8 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
             ["--learner.optimizer", "adm"],
             ["--learner.optimizer adm: unknown; did you mean adam? allowed: sgd"],
         ),
+        (["--env", "pong"], ["--env: unknown; did you mean --env.id? "]),
+        (["preset", "cartpole"], ["preset: unknown; did you mean --preset? "]),
         (["--verison"], ["--verison: unknown; did you mean --version? "]),
         (["--resume=yes"], ["--resume", "yes"]),
         (["--learner.double", "yes"], ["yes: unknown; it follows no flag that takes it"]),

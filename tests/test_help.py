@@ -64,6 +64,33 @@ def test_the_help_fits_two_screens(name: str, pages: dict[str, Any]) -> None:
     assert "--help-all" in lines[-1]
 
 
+@pytest.mark.parametrize(
+    ("name", "usage", "entry"),
+    [
+        ("coop-eval", "[RUN_DIR ...] [FLAGS]", "RUN_DIR"),
+        ("coop-report", "RUNS [FLAGS]", "RUNS"),
+        ("coop-lockstep", "[FLAGS]", "--preset"),
+    ],
+)
+def test_what_needs_no_flag_comes_first(name: str, usage: str, entry: str, pages: dict[str, Any]) -> None:
+    lines = pages[f"{name} --help"].splitlines()
+    assert lines[0] == f"usage: {name} {usage}"
+    assert next(iter(entries("\n".join(lines)))) == entry
+
+
+@pytest.mark.parametrize(
+    ("name", "flag"),
+    [
+        ("coop-local", "--web [HOST:]PORT"),
+        ("coop-learner", "--prometheus [HOST:]PORT"),
+        ("coop-actor", "--health [HOST:]PORT"),
+        ("coop-eval", "--networks {1,2,mean} ..."),
+    ],
+)
+def test_the_help_says_how_a_value_is_written(name: str, flag: str, pages: dict[str, Any]) -> None:
+    assert f"\n  {flag} " in pages[f"{name} --help-all"].replace("\n" + " " * 28, " ")
+
+
 def test_no_answer_waits_for_torch(pages: dict[str, Any]) -> None:
     assert pages["torch"] is False
 

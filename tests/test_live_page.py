@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from test_screen import EVENTS, STATUS
 
 from common.errors import UsageError
-from common.messaging.messages.status import Member
+from common.messaging.messages.status import Member, Ratio
 from common.process.ports import http_address
 from deploy.curves import COLUMNS, MOST, Curves
 from deploy.facts import facts
@@ -100,7 +100,11 @@ def test_what_the_page_is_told(page: LivePage) -> None:
         "q_bound": 100.0, "q_gap": 0.31, "sample_age_mean": 251.0, "sample_age_p95": 478.0, "weight_lag_mean": 203.0,
     }  # fmt: skip
     page.show(replace(STATUS, ratio=None, measured=None), EVENTS, 0.0, "")
-    assert told(page)["points"][1] == [31_240, 1204.0, 1198.2, *[None] * 13]
+    page.show(replace(STATUS, ratio=Ratio(1.0, None, -500.0, -64.0, 80.0), measured=None), EVENTS, 0.0, "")
+    assert told(page)["points"][1:] == [
+        [31_240, 1204.0, 1198.2, *[None] * 13],
+        [31_240, 1204.0, 1198.2, None, 1.0, None, -64.0, 80.0, *[None] * 8],
+    ], "before the first update, steps ahead are out of the band"
 
 
 def test_the_end_of_the_run_reaches_a_browser_that_follows_it() -> None:

@@ -192,7 +192,7 @@ def test_ctrl_c_a_killed_actor_and_resume(tmp_path: Path) -> None:
         assert (local.returncode, err) == (130, "")
     assert re.search(SILENT, out)
     assert re.search(SILENT.replace("does not answer", "is back"), out)
-    assert re.search(r"actor 1 ended \(killed by SIGKILL\).*starting it again", out)
+    assert re.search(r"actor process 1 \(pid \d+\) was killed by SIGKILL; starting it again", out)
     before = check_files(path, 3000, "interrupted")
     done = run("coop-local", *flags, "--resume")
     assert (done.returncode, done.stderr) == (0, "")

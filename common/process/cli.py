@@ -106,11 +106,16 @@ def _reason(message: str) -> str:
 
 
 def _unknown(token: str, kind: type[Any]) -> str:
-    """What to say of an unknown word; of a flag with the one that it resembles, with or without its section."""
-    if not token.startswith("-"):
-        return "unknown; it follows no flag that takes it"
+    """What to say of an unknown word; of a flag with the one that it resembles, with or without its section.
+
+    Of the name of a section, with the section's first flag.
+    """
+    word = token.partition("=")[0].replace("_", "-")
     known = {name: name for part in sections(kind) for each in part.flags for name in (each.name, each.negative)}
+    if not token.startswith("-"):
+        return refusal("unknown", known.get(f"--{word}"), "it follows no flag that takes it")
+    first = next((name for name in known if name.startswith(f"{word}.")), None)
     without = {f"--{name.rpartition('.')[2]}": name for name in reversed(known) if "." in name}
     known = {**without, **known, **{name: name for name in ANSWERS}}
-    near = closest(token.partition("=")[0].replace("_", "-"), known)
+    near = first or closest(word, known)
     return refusal("unknown", near and known[near], "--help-all lists every flag")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 from tyro import _arguments as tyro_arguments  # private, as the two below; pyproject.toml pins the version
@@ -14,6 +14,9 @@ from tyro import _strings as tyro_strings
 from tyro._backends import _tyro_backend as tyro_backend
 
 SHELLS = ("bash", "zsh", "fish")
+
+HttpAddress = Annotated[str, tyro.conf.arg(metavar="[HOST:]PORT")]
+"""Where to serve HTTP; see `common.process.ports.http_address`."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,10 @@ class Section:
 
 
 def sections(kind: type[Any], default: object = None) -> list[Section]:
-    """The flags of a dataclass, then of each one nested in it; default: an instance with the values to show."""
+    """The flags of a dataclass, positional arguments first, then of each one nested in it.
+
+    default: an instance with the values to show.
+    """
     with tyro_strings.delimiter_context("-"):
         return list(_sections(_specification(kind, default)))
 
@@ -78,7 +84,8 @@ def _specification(kind: type[Any], default: object) -> tyro_parsers.ParserSpeci
 
 
 def _sections(parser: tyro_parsers.ParserSpecification, name: str = "", text: str = "") -> Iterator[Section]:
-    yield Section(name, text, tuple(_flag(arg) for arg in parser.args if not arg.is_suppressed()))
+    flags = [_flag(arg) for arg in parser.args if not arg.is_suppressed()]
+    yield Section(name, text, tuple(sorted(flags, key=lambda flag: flag.name.startswith("-"))))
     for prefix, nested in parser.child_from_prefix.items():
         yield from _sections(nested, prefix, nested.description)
 
@@ -96,8 +103,8 @@ def _flag(arg: tyro_arguments.ArgumentDefinition) -> Flag:
 def placeholder(arg: tyro_arguments.ArgumentDefinition) -> str:
     """What stands for the value in the help: "INT", "INT ..." for several, "{fifo,reservoir}" for one of several."""
     metavar = (arg.lowered.metavar or "").removeprefix("{None}|")
-    short = re.sub(r"\[(\w+) \[\1 \.\.\.\]\]", r"\1 ...", metavar)
-    return short if _choices(arg) else short.strip("{}")
+    short = re.sub(r"\[(\w+|\{[^ {}]+\}) \[\1 \.\.\.\]\]", r"\1 ...", metavar)
+    return short.strip("{}") if short == metavar and not _choices(arg) else short
 
 
 def _choices(arg: tyro_arguments.ArgumentDefinition) -> tuple[str, ...]:

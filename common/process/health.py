@@ -22,15 +22,15 @@ QUESTION_TIMEOUT = 5.0  # seconds
 
 
 @contextmanager
-def answering(address: str | None, console: Console) -> Iterator[None]:
-    """Answer on PORT or HOST:PORT, in threads of its own; do nothing if that is None.
+def answering(address: str, console: Console) -> Iterator[None]:
+    """Answer on PORT or HOST:PORT, in threads of its own; do nothing if that is empty.
 
     `GET /` has the status 503 once the main loop stands still, else 200; `GET /ready` has 200 only while it runs.
 
     Raises:
         UsageError: this process can't listen there.
     """
-    if address is None:
+    if not address:
         yield
         return
     from common.process.web import Document, WebServer  # noqa: PLC0415 (most processes answer nobody)

@@ -52,9 +52,14 @@ def full_help(program: str, description: str, parts: Sequence[Section]) -> str:
 
 
 def _head(program: str, description: str, parts: Sequence[Section]) -> list[str]:
-    needed = [flag for part in parts for flag in part.flags if flag.required]
-    words = [flag.name if flag.name == flag.value else f"{flag.name} {flag.value}" for flag in needed]
+    words = [_usage(flag) for part in parts for flag in part.flags if flag.required or flag.name == flag.value]
     return [f"usage: {' '.join([program, *words, '[FLAGS]'])}", "", *_wrapped(description), ""]
+
+
+def _usage(flag: Flag) -> str:
+    if flag.name != flag.value:
+        return f"{flag.name} {flag.value}"
+    return flag.name if flag.required else f"[{flag.name} ...]"
 
 
 def _row(flag: Flag, full: bool = False) -> tuple[str, str]:

@@ -90,11 +90,12 @@ class ChildProcess:
             self._process.wait()
 
     def why(self) -> str:
-        """Describe how it ended, with the last line of its log."""
+        """Describe how it ended; if not by a signal, with the last line of its log."""
         status = self.exit_status() or 0
-        how = f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return f"{self.name} ended ({how})" + (f": {lines[-1][-LAST_WORDS:]}" if lines else "")
+        if status < 0:
+            return f"{self.name} (pid {self.pid}) was killed by {signal.Signals(-status).name}"
+        line = self.last_line()[-LAST_WORDS:]
+        return f"{self.name} ended (exit status {status})" + (f": {line}" if line else "")
 
     def last_line(self) -> str:
         """The last line that it printed."""

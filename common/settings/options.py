@@ -15,6 +15,7 @@ import tyro
 from common.errors import RunError, UsageError
 from common.process import cli
 from common.process.extras import check_extra
+from common.process.flags import HttpAddress
 from common.process.notices import note_renamed, warn
 from common.process.run_ids import has_run_id, read_run_id
 from common.settings.config import RunConfig
@@ -38,7 +39,7 @@ COMMON = (
 class HealthOptions:
     """The flag of processes that container engines watch."""
 
-    health: str | None = None
+    health: HttpAddress = ""
     """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
@@ -128,7 +129,7 @@ class LearnerRunOptions(RunOptions):
 
     restart: bool = False
     """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
-    prometheus: str = ""
+    prometheus: HttpAddress = ""
     """Serve the learner's status to Prometheus at PORT, on loopback, or at HOST:PORT."""
 
 
