@@ -63,7 +63,7 @@ dist: $(READY)
 	@BUILDER="$(CURDIR)/$(BIN)/python" PYTHON="$(PYTHON)" deploy/check_dist.sh
 
 $(READY): pyproject.toml constraints.txt
-	@echo "setting up $(VENV)"
+	@echo "setting up $(VENV): some minutes and 2 GB; $(VENV)/install.log has the details"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(PIP) --editable '.[dev]' > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log; exit 1; }
 	@touch $(READY)

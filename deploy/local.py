@@ -190,7 +190,7 @@ def _supervise(
         status.close()
     if topology.learner.was_interrupted():
         topology.abort()
-        print(f"{topology.learner.last_line()}; --resume goes on")
+        print(f"{topology.learner.last_line()}; coop-local --resume --run-dir {directory} goes on")
         stop.leave()
         raise RunError(topology.learner.why())  # the learner alone was interrupted
     topology.finish()

@@ -31,8 +31,9 @@ def _run() -> None:
         if options.resume:
             print(beginning(path) if run.epoch is None else f"goes on from epoch {run.epoch.name}", flush=True)
         summary = run.play(stop, lambda line: say(line, end="\r" if sys.stdout.isatty() else "\n"))
-    say(f"{summary}; {path}")
+    stopped = summary.exit == stop.reason  # otherwise the run was complete before the signal
+    say(f"{summary}; coop-lockstep --resume --run-dir {path} goes on" if stopped else f"{summary}; {path}")
     if run.diverged:
         raise RunError(run.diverged)
-    if summary.exit == stop.reason:  # otherwise the run was complete before the signal
+    if stopped:
         stop.leave()

@@ -153,7 +153,7 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
     assert any("lost      does not answer" in line for lines in pictures for line in lines)
     left = terminal.text().partition("\x1b[?1049l")[2]
     assert "killed by SIGKILL" in left, "the events remain when the screen has gone"
-    assert left.rstrip().endswith("--resume goes on")
+    assert left.rstrip().endswith(f"; coop-local --resume --run-dir {tmp_path / 'r'} goes on")
 
 
 def test_watch_refuses_json_for_a_live_screen() -> None:

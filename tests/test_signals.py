@@ -52,7 +52,9 @@ def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
         run.send_signal(signal.SIGTERM)
         out, err = run.communicate(timeout=60)
     assert (run.returncode, err) == (143, "")
-    assert out.splitlines()[-1].startswith("interrupted: ")
+    last = out.splitlines()[-1]
+    assert last.startswith("interrupted: ")
+    assert last.endswith(f"; coop-lockstep --resume --run-dir {path} goes on")
     assert json.loads((path / "summary.json").read_text())["exit"] == "interrupted"
     done = run_command("coop-lockstep", *flags)
     assert (done.returncode, done.stderr) == (0, "")
@@ -67,7 +69,7 @@ def test_a_whole_run_on_one_machine(number: signal.Signals, status: int, tmp_pat
         local.send_signal(number)
         out, err = local.communicate(timeout=90)
     assert (local.returncode, err) == (status, "")
-    assert out.splitlines()[-1].endswith("; --resume goes on")
+    assert out.splitlines()[-1].endswith(f"; coop-local --resume --run-dir {path} goes on")
     assert json.loads((path / "summary.json").read_text())["exit"] == "interrupted"
 
 
