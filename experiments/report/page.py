@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+from common.process.console import counted
 from experiments.report.plots import Figure
 from experiments.report.study import Study
 from experiments.report.table import ResultTable
@@ -80,7 +81,7 @@ def page(
             if (figure, png) not in shown
         ),
         "<h2>Tables</h2>",
-        *(_folded(each.title, f"{len(each.rows)} rows", each.html()) for each in tables if each not in first),
+        *(_folded(each.title, counted(len(each.rows), "row"), each.html()) for each in tables if each not in first),
         _missing(study, lacking),
         _warnings(study),
         f"<p class=note>Made by <code>coop-report {html.escape(folder.name)}</code>: {_versions()}. Every figure is "
@@ -107,7 +108,7 @@ def _missing(study: Study, lacking: Sequence[str]) -> str:
     if not lines and not lacking:
         return ""
     items = "".join(f"<li>{html.escape(line)}</li>" for line in [*lacking, *lines])
-    return _folded("Missing", f"{len(lines)} runs, {len(lacking)} figures", f"<ul>{items}</ul>")
+    return _folded("Missing", f"{counted(len(lines), 'run')}, {counted(len(lacking), 'figure')}", f"<ul>{items}</ul>")
 
 
 def _warnings(study: Study) -> str:
