@@ -193,6 +193,8 @@ def test_one_run_alone(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "1 of 1 runs finished: coop on CartPole-v0, seed 1; they differ by nothing but method and seed" in text
     assert "Return against buffer size, breaking points: replay.capacity is the same in all finished runs" in text
     assert re.findall("<h2>(.*?)</h2>", text)[0] == "Return of the last 100 episodes"
+    assert "1 row<" in text
+    assert not re.search(r"\b1 (rows|figures)\b", text)
     assert not (tmp_path / "out" / "buffers.png").exists()
     assert rows(tmp_path / "out" / "table_settings.csv")[0]["IQM low"] == ""
 
