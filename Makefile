@@ -7,7 +7,7 @@ READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: run test check results fuzz netns soak chaos slurm-test compose-test mutants docs dist
+.PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants docs dist
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -42,6 +42,10 @@ soak: $(READY)
 # A Slurm controller and three nodes on this machine; root installs what is missing.
 slurm-test: $(READY)
 	@BIN=$(BIN) deploy/slurm/check.sh
+
+# A sweep on a Dask cluster of network namespaces, of whose workers two are killed; needs root.
+dask-test: $(READY)
+	@$(BIN)/python benchmarks/dask_sweep.py
 
 # The image and the Compose files on a real engine, which is started if none runs; root installs what is missing.
 compose-test:

@@ -26,6 +26,7 @@ class ChildProcess:
     Args:
         name: shown to users, for example "actor 2".
         inherit: file descriptors of locks that the child holds too. environment: variables that it gets as well.
+        directory: in which it works; this process's if None.
     """
 
     def __init__(
@@ -35,12 +36,14 @@ class ChildProcess:
         log: Path,
         inherit: tuple[int, ...] = (),
         environment: Mapping[str, str] = MappingProxyType({}),
+        directory: Path | None = None,
     ) -> None:
         self.name = name
         self._command = command
         self._log = log
         self._inherit = inherit
         self._environment = environment
+        self._directory = directory
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -51,6 +54,7 @@ class ChildProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
+                cwd=self._directory,
                 pass_fds=self._inherit,
                 start_new_session=True,  # a Ctrl-C at the terminal reaches the supervisor alone
                 env={

@@ -1,7 +1,8 @@
-"""`coop-sweep`: runs a grid on this machine or as job arrays; the same command continues an interrupted sweep."""
+"""`coop-sweep`: runs a grid here, as job arrays or on a Dask cluster; the same command continues a sweep."""
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,12 +12,15 @@ from tyro.conf import Positional
 
 from common.errors import Interrupted, RunError, UsageError
 from common.process.cli import parse
+from common.process.extras import check_extra
 from common.process.lifecycle import Stop, run_main
 from common.suggestions import closest, refusal
 from experiments.sweep import slurm
 from experiments.sweep.display import SweepDisplay
+from experiments.sweep.executor import Executor
 from experiments.sweep.folder import CellFolder, claim_folder, default_folder
-from experiments.sweep.grid import Grid, load_grid
+from experiments.sweep.grid import Grid, GridFile, load_grid
+from experiments.sweep.local import LocalProcesses
 from experiments.sweep.runner import Runner
 
 TICK = 0.2  # seconds
@@ -31,13 +35,15 @@ class SweepOptions:
     quick: bool = False
     """Use the grid's small version, for two cores."""
     jobs: int | None = None
-    """Number of cells to run concurrently; the number of cores if not given."""
+    """Number of cells to run concurrently; the number of cores, or of the workers' threads, if not given."""
     dir: Path | None = None
     """Folder of the sweep; runs/sweeps/GRID if not given."""
     cell: str | None = None
     """Run only this cell: its name, or its number in the grid, from 0."""
     slurm: bool = False
     """Submit the cells as Slurm job arrays instead of running them on this machine."""
+    dask: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Run the cells on the workers of this Dask scheduler, such as tcp://head:8786 (extra `dask`)."""
 
 
 def main() -> None:
@@ -49,15 +55,28 @@ def _run() -> None:
     options = parse(SweepOptions, "coop-sweep", "Run every cell of a grid once.")
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: must be at least 1")
+    if options.dask is not None:
+        if options.slurm:
+            raise UsageError("--dask and --slurm: give one of them")
+        check_extra("--dask", "dask", "distributed")
     grid = load_grid(options.grid, options.quick)
     folder = options.dir or default_folder(options.grid, options.quick)
     cells = chosen(options, grid, folder)
     claim_folder(grid, cells, folder)
     if options.slurm:
-        left = [cell.cell.name for cell in cells if not (cell.finished() or cell.diverged())]
+        left = [cell.cell.name for cell in cells if cell.ending() is None]
         print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
         return
-    _work(Runner(grid.file, cells, options.jobs), folder)
+    with _executor(options, grid.file) as executor:
+        _work(Runner(cells, executor), folder)
+
+
+def _executor(options: SweepOptions, grid: GridFile) -> AbstractContextManager[Executor]:
+    if options.dask is None:
+        return nullcontext(LocalProcesses(grid, options.jobs))
+    from experiments.sweep.dask import workers_at  # noqa: PLC0415 - takes a second, and may not be installed
+
+    return workers_at(options.dask, grid, options.jobs)
 
 
 def chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
@@ -81,8 +100,8 @@ def _work(runner: Runner, folder: Path) -> None:
     stop = Stop()
     stop.on_signals()
     with SweepDisplay(runner) as display:
-        display.say(f"{len(runner.folders)} cells in {folder}, {runner.tally.skipped} of them finished before")
-        for name, how in runner.tally.diverged.items():
+        display.say(f"{len(runner.folders)} cells in {folder}, {runner.skipped} of them finished before")
+        for name, how in runner.diverged.items():
             display.say(f"{name}: {how}")
         try:
             while not runner.done and not stop.wait(TICK):
@@ -94,12 +113,12 @@ def _work(runner: Runner, folder: Path) -> None:
         finally:
             runner.abort()
         line = display.line()
-    for name, why in runner.tally.failed.items():
+    for name, why in runner.failed.items():
         print(f"failed: {name}: {why}")
     if not runner.done:
         raise Interrupted(f"{stop.reason} with {line}; the same command goes on from here", stop.exit_status or 1)
-    if runner.tally.failed:
-        count = len(runner.tally.failed)
+    if runner.failed:
+        count = len(runner.failed)
         raise RunError(f"{count} of {len(runner.folders)} cells failed; the same command tries them again")
-    diverged = f", {len(runner.tally.diverged)} of them diverged" if runner.tally.diverged else ""
+    diverged = f", {len(runner.diverged)} of them diverged" if runner.diverged else ""
     print(f"all {len(runner.folders)} cells are finished{diverged}; coop-report {folder}")

@@ -24,16 +24,16 @@ class SweepDisplay(LiveDisplay):
 
     def line(self) -> str:
         """The sweep in one line."""
-        runner, tally = self._runner, self._runner.tally
-        over = tally.skipped + tally.finished + tally.elsewhere
-        text = f"{over} of {len(runner.folders)} cells finished"
-        if tally.skipped:
-            text += f" ({tally.skipped} before)"
+        runner = self._runner
+        runner.look()
+        text = f"{runner.finished} of {len(runner.folders)} cells finished"
+        if runner.skipped:
+            text += f" ({runner.skipped} before)"
         text += f", {len(runner.running)} running, {len(runner.waiting)} waiting"
-        if tally.diverged:
-            text += f", {len(tally.diverged)} diverged"
-        if tally.failed:
-            text += f", {len(tally.failed)} FAILED"
+        if runner.diverged:
+            text += f", {len(runner.diverged)} diverged"
+        if runner.failed:
+            text += f", {len(runner.failed)} FAILED"
         return f"{text}; {self._time_left()}"
 
     def _time_left(self) -> str:

@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from common.errors import UsageError
 from common.process.locks import FileLock
@@ -27,6 +28,17 @@ class Progress:
 
     step: int
     mean_return: float
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a cell's run ended; why: the reason, unless it is finished.
+
+    A diverged run would diverge again; a lost one, whose worker is gone, can go on elsewhere.
+    """
+
+    kind: Literal["finished", "diverged", "failed", "lost"]
+    why: str = ""
 
 
 class CellFolder:
@@ -48,13 +60,12 @@ class CellFolder:
         if not same:
             raise UsageError(f"{held}: not the config of this grid's cell; give another --dir")
 
-    def finished(self) -> bool:
-        """True once its run is complete."""
-        return self.outcome().startswith("complete")
-
-    def diverged(self) -> bool:
-        """True once its run has diverged; repeating it would diverge again."""
-        return self.outcome().startswith("diverged")
+    def ending(self) -> Ending | None:
+        """How its run ended for good; None if it has to be run or continued."""
+        outcome = self.outcome()
+        if outcome.startswith("complete"):
+            return Ending("finished")
+        return Ending("diverged", outcome) if outcome.startswith("diverged") else None
 
     def outcome(self) -> str:
         """How its run ended, from summary.json; empty if that does not exist."""

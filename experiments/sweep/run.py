@@ -16,6 +16,7 @@ from common.process.summaries import read_summary
 from common.settings.config import value_of
 from experiments.sweep.folder import CellFolder, claim_folder, default_folder
 from experiments.sweep.grid import load_grid, parse_grid
+from experiments.sweep.local import LocalProcesses
 from experiments.sweep.runner import Runner
 
 TICK = 0.2  # seconds
@@ -66,7 +67,7 @@ def sweep(
         path = Path(folder or default_folder(grid, quick))
     cells = [CellFolder(path, cell) for cell in checked.cells]
     claim_folder(checked, cells, path)
-    runner = Runner(checked.file, cells, jobs)
+    runner = Runner(cells, LocalProcesses(checked.file, jobs))
     try:
         while not runner.done:
             runner.tick()
@@ -74,7 +75,7 @@ def sweep(
     finally:
         runner.abort()
     rows = {cell.cell.name: _row(cell, checked.varied) for cell in cells if cell.outcome()}
-    return SweepResult(path, pd.DataFrame.from_dict(rows, orient="index"), dict(runner.tally.failed))
+    return SweepResult(path, pd.DataFrame.from_dict(rows, orient="index"), runner.failed)
 
 
 def _row(cell: CellFolder, varied: tuple[str, ...]) -> dict[str, Any]:
