@@ -43,7 +43,7 @@ _QUIET = {
     "listen/exit_on_failure": True,
     "transport/unicast/max_sessions": MAX_LINKS,
     "transport/link/tx/lease": round(1000 * LEASE),
-    "transport/link/rx/buffer_size": 4 << 20,
+    "transport/link/rx/buffer_size": 1 << 18,  # of each link, at once
     "transport/link/rx/max_message_size": MAX_PAYLOAD + (1 << 16),
     "transport/link/tx/queue/size/data": 16,
     "transport/shared_memory/enabled": False,
