@@ -57,7 +57,7 @@ def test_a_stopped_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert summary["exit"] == "stopped"
     steps = summary["env_steps"]
     assert 0 < steps < 20_000
-    with pytest.raises(coop.UsageError, match="holds a run already"):
+    with pytest.raises(coop.UsageError, match="^run directory .*: holds a run already; .*resume=True in Python"):
         coop.train(method="dqn", total_steps=20_000, run_dir=tmp_path)
     again = coop.train(run_dir=tmp_path, resume=True)
     assert again.config == run.config
@@ -71,7 +71,7 @@ def test_bad_settings_are_refused_before_anything_starts(tmp_path: Path) -> None
         ({"replay": {"size": 5}}, "replay.size = 5: no such field"),
         ({"replay": 5}, "replay = 5: must be a table"),
         ({"sede": 5}, "sede = 5: no such field"),
-        ({"preset": "x"}, "--preset x: unknown"),
+        ({"preset": "x"}, "preset = 'x': unknown"),
         ({"method": "dqqn"}, "did you mean dqn\\?"),
         ({"actors": 2}, "in distributed runs only"),
         ({"actors": 0, "distributed": True}, "at least 1"),

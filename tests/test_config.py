@@ -104,7 +104,7 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--preset", "cartpol"], ["--preset cartpol: unknown; did you mean cartpole? allowed: breakout, "]),
+        (["--preset", "cartpol"], ["preset = 'cartpol': unknown; did you mean cartpole? allowed: breakout, "]),
         (["--replay.capacity", "-5"], ["replay.capacity", "-5", "greater than 0"]),
         (["--learner.swap-every", "0"], ["learner.swap_every", "0", "greater than 0"]),
         (["--replay.capcity", "5"], ["--replay.capcity: unknown; did you mean --replay.capacity? --help-all lists"]),

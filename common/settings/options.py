@@ -97,7 +97,8 @@ class RunOptions(RunConfig):
         named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         path = self.run_dir or Path("runs") / named
         if holds_run(path):
-            raise UsageError(f"--run-dir {path}: holds a run already; give another folder, or --resume to go on")
+            how = "give another folder, or go on with --resume (resume=True in Python)"
+            raise UsageError(f"run directory {path}: holds a run already; {how}")
         return path
 
     def _resumed(self) -> Path:

@@ -42,7 +42,7 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise UsageError(f"--config {path}: {error}") from error
     if preset not in preset_names():
-        raise UsageError(f"--preset {preset}: {not_among(preset_names(), str(preset))}")
+        raise UsageError(f"preset = {preset!r}: {not_among(preset_names(), str(preset))}")
     return _preset(f"{preset}.toml")
 
 
