@@ -57,7 +57,7 @@ def test_a_stopped_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert summary["exit"] == "stopped"
     steps = summary["env_steps"]
     assert 0 < steps < 20_000
-    with pytest.raises(coop.UsageError, match="^run directory .*: holds a run already; .*resume=True in Python"):
+    with pytest.raises(coop.UsageError, match=r"^run directory .*: holds a run already; .*resume=True in Python"):
         coop.train(method="dqn", total_steps=20_000, run_dir=tmp_path)
     again = coop.train(run_dir=tmp_path, resume=True)
     assert again.config == run.config

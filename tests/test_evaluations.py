@@ -5,7 +5,7 @@ import re
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -291,7 +291,8 @@ def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> 
         taken.extend(result for result in inbox.take() if isinstance(result, EvaluationRow))
         return len(taken) >= count
 
-    with ThreadPoolExecutor() as threads:
+    with ThreadPoolExecutor() as threads, ExitStack() as end:
+        end.callback(stop.set, "interrupted")  # also where an assertion fails
         playing = threads.submit(evaluations.run)
         learn(1, 99)
         time.sleep(0.3)
@@ -315,7 +316,8 @@ def test_an_evaluator_of_an_interrupted_run_stops_at_once(nodes: tuple[Node, Nod
     agent, evaluations = service(nodes, stop, Plan(seconds=0.0, episodes=100_000))
     Broadcaster(nodes[0], agent)
     inbox = EvaluationInbox(nodes[0], lambda: 1000)
-    with ThreadPoolExecutor() as threads:
+    with ThreadPoolExecutor() as threads, ExitStack() as end:
+        end.callback(stop.set, "interrupted")  # also where an assertion fails
         playing = threads.submit(evaluations.run)
         time.sleep(1)
         stop.set("interrupted")
