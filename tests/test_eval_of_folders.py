@@ -17,7 +17,7 @@ from common.settings.config import NetworkSettings
 from common.settings.environment import EnvSettings
 from common.settings.sources import base_config
 from experiments import evaluation_cli
-from experiments.evaluation import Evaluation, evaluate_checkpoint
+from experiments.evaluation import Evaluation, evaluate_checkpoint, film_checkpoint
 from experiments.film import Film, short_gif, write_video
 from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
@@ -188,15 +188,18 @@ def test_a_gif_of_a_run_s_network(
 ) -> None:
     config = base_config(["--preset", "catch"])
     run = Lockstep(replace(config, actor=replace(config.actor, envs=1), network=NetworkSettings()))
+    run.agent.acting = 1
     with RunDirectory(tmp_path / "run", run.config) as directory:
         run.save(directory)
     run.env.close()
     video = tmp_path / "x.gif"
+    shown = film_checkpoint(tmp_path / "run", video, 0, (1, 2, "mean"))
+    assert shown.startswith(f"{video}: network 2,"), "the one that acts"
     status, text = told_by(
-        monkeypatch, capsys, tmp_path / "run", "--episodes", 1, "--networks", 2, "--epsilon", 0, "--video", video
+        monkeypatch, capsys, tmp_path / "run", "--episodes", 1, "--networks", 1, "--epsilon", 0, "--video", video
     )
     assert status == 0
-    assert re.match(rf"{video}: network 2, return -?1 in 6 steps\nrun ", text)
+    assert re.match(rf"{video}: network 1, return -?1 in 6 steps\nrun ", text)
     with Image.open(video) as gif:
         assert (gif.n_frames, gif.size, gif.info["duration"]) == (6, (252, 252), 100)
 
