@@ -4,12 +4,16 @@ import io
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 
+from common.envs.catch import Catch
 from common.envs.make import check_filmed, make_filmed_env, make_vector_env
 from common.envs.pictures import grayscale, make_resizer
 from common.errors import UsageError
@@ -159,6 +163,21 @@ def test_pictures_of_an_episode(name: str) -> None:
     assert {picture.shape for picture in pictures} == {PICTURES[name]}
     assert all(picture.dtype == np.uint8 for picture in pictures)
     assert len({picture.tobytes() for picture in pictures}) > 3, "something moves"
+
+
+class Dear(Catch):
+    """Catch with five times the reward."""
+
+    def step(self, action: int | np.int64) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        obs, reward, *others = super().step(action)
+        return obs, 5 * reward, *others  # type: ignore[return-value]
+
+
+def test_the_return_of_a_filmed_episode_is_unclipped() -> None:
+    gymnasium.register("tests/Dear-v0", entry_point=Dear)
+    film = Film(lambda obs: np.array([1]), EnvSettings(id="tests/Dear-v0", clip_rewards=True), 0)
+    assert [len(list(film)), abs(film.episode_return)] == [6, 5.0]
+    del gymnasium.registry["tests/Dear-v0"]
 
 
 def test_a_filmed_atari_game_is_the_one_that_is_played() -> None:
