@@ -56,6 +56,7 @@ def test_a_status_for_prometheus() -> None:
     assert (told["coop_ratio_measured"], told["coop_ratio_most"]) == (0.998, 80)
     assert (told["coop_q_abs_mean"], told["coop_q_bound"]) == (42.13, 100)
     assert told["coop_wait_share the learner actors"] == 0.63
+    assert told["coop_evicted_unsampled"] == 0, "which is not unknown"
     assert fewer["coop_env_steps_total"] == 31_290
     assert not [name for name in fewer if name.startswith(("coop_ratio", "coop_q", "coop_wait"))]
 

@@ -158,6 +158,13 @@ def test_what_is_not_there_yet() -> None:
     assert "ratio       target 0.25 updates per step; no update yet" in shown(unmeasured, 80, 24)
 
 
+def test_each_that_waits_has_a_line() -> None:
+    waits = [Wait("the learner", "actors", 0.4, "no inserts"), Wait("actors", "the learner", 0.05, "no draws")]
+    lines = shown(replace(STATUS, waits=waits), 80, 24)
+    at = lines.index("waiting     the learner waits for actors 40% of the time: no inserts")
+    assert lines[at + 1] == "            actors wait for the learner 5% of the time: no draws"
+
+
 def test_names_from_other_machines_cannot_steer_the_terminal() -> None:
     evil = replace(STATUS, members=[Member("actor 0", "actor", "\x1b[2J\nnode", 1, "waiting", 0.0, "\x1b]0;x\x07")])
     text = "\n".join(shown(evil, 80, 24))
