@@ -147,17 +147,8 @@ def measure(number: int, options: argparse.Namespace) -> Row:
     head, replay = free_endpoint(), free_endpoint()
     processes = min(number, options.processes)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        roles = stack.enter_context(
-            running(
-                Roles(
-                    Path(folder),
-                    RUN,
-                    (head, replay),
-                    (*FLAGS, *NETWORKS[options.network], f"--learner.publish-every={options.publish_every}"),
-                    0,
-                )
-            )
-        )
+        flags = (*FLAGS, *NETWORKS[options.network], f"--learner.publish-every={options.publish_every}")
+        roles = stack.enter_context(running(Roles.of_run(Path(folder), RUN, (head, replay), flags, 0)))
         clients = Clients(stack, processes, head)
         clients.call_first("join", 1)
         clients.call_first("fill", CAPACITY + 1000)
