@@ -1,9 +1,9 @@
 """Processor time of a run's parts, for `deploy/sizing.py`: `python benchmarks/costs.py cartpole catch breakout-small`.
 
-A run of each preset with one actor, its roles as real processes: first at the preset's replay ratio, where the learner
-is busy all the time, then at a ratio so low that the actor is. The processor time of the three processes in both
-phases gives the cost of an update, of a step, and of the replay service's inserts and draws. Prints a line of
-milliseconds and of resident memory for each preset.
+A run of each preset with one actor, its roles as real processes: first without the actor, then at the preset's replay
+ratio, where the learner is busy all the time, then at a ratio so low that the actor is. The processor time of the three
+processes in the phases gives the cost of an update, of a step, and of the replay service's inserts and draws. Prints a
+line of milliseconds and of resident memory for each preset.
 """
 
 from __future__ import annotations
@@ -59,31 +59,38 @@ class Meter:
         return {name: measure(self._roles.processes[name].pid)["MiB"] for name in NAMES}
 
     def _seconds(self) -> dict[str, float]:
-        ticks = os.sysconf("SC_CLK_TCK")
-        found = {}
-        for name in NAMES:
-            fields = Path(f"/proc/{self._roles.processes[name].pid}/stat").read_text().rpartition(")")[2].split()
-            found[name] = (int(fields[11]) + int(fields[12])) / ticks
-        return found
+        return {name: processor_seconds(self._roles.processes[name].pid) for name in NAMES}
 
 
-def measured(preset: str, method: str, seconds: float) -> tuple[Phase, Phase, dict[str, float]]:
-    """The phase in which the learner is busy, the one in which the actor is, and the memory of the processes."""
+def processor_seconds(pid: int) -> float:
+    """What a process has taken so far; 0 before its start, where the id is 0."""
+    if not pid:
+        return 0.0
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measured(preset: str, method: str, seconds: float) -> tuple[list[Phase], dict[str, float]]:
+    """The phases in which nobody is busy, the learner is, and the actor is; and the memory of the processes."""
     at = free_endpoint(), free_endpoint()
     with tempfile.TemporaryDirectory() as folder:
         roles = Roles.of_run(Path(folder), RUN, at, (f"--preset={preset}", f"--method={method}", *FLAGS), actors=1)
         with (
-            running(roles),
+            running(roles, "actor 1"),
             RunWatch(RUN, at[0]) as watch,
             Node(open_session((), at), RUN, "watch", new_incarnation()) as node,
         ):
-            wait_until("updates", lambda: watch.updates() > 50, 120)
             meter = Meter(roles, node)
+            wait_until("the replay service", lambda: bool(node.presence.members("replay")), 120)
+            time.sleep(1)
+            idle = meter.phase(seconds)
+            roles.processes["actor 1"].start()
+            wait_until("updates", lambda: watch.updates() > 50, 120)
             learning = meter.phase(seconds)
             limits = command("coop-limits", f"--run={RUN}", "--connect", at[0], f"--ratio={FEW}")
             subprocess.run(limits, stdout=subprocess.DEVNULL, check=True)
             time.sleep(1)
-            return learning, meter.phase(seconds), meter.memory()
+            return [idle, learning, meter.phase(seconds)], meter.memory()
 
 
 def main() -> None:
@@ -95,16 +102,16 @@ def main() -> None:
     print(f"{'preset':24}{'step':>8}{'dqn':>8}{'coop':>8}{'insert':>9}{'draw':>8}   MiB of {', '.join(NAMES)}")
     try:
         for preset in options.presets:
-            phases, updates = [], {}
+            phases: list[Phase] = []
+            updates = {}
             for method in ("dqn", "coop"):
-                learning, acting, memory = measured(preset, method, options.seconds)
-                phases += [learning, acting]
+                (idle, learning, acting), memory = measured(preset, method, options.seconds)
+                phases += [idle, learning, acting]
                 updates[method] = learning.seconds["learner"] / learning.drawn
-            steps = sum(phase.seconds["actor 1"] for phase in phases[1::2]) / sum(p.inserted for p in phases[1::2])
-            counts = np.array([(phase.inserted, phase.drawn) for phase in phases])
-            insert, draw = np.linalg.lstsq(counts, np.array([phase.seconds["replay"] for phase in phases]), rcond=None)[
-                0
-            ]
+            steps = sum(phase.seconds["actor 1"] for phase in phases[2::3]) / sum(p.inserted for p in phases[2::3])
+            counts = np.array([(phase.inserted, phase.drawn, options.seconds) for phase in phases])
+            taken = np.array([phase.seconds["replay"] for phase in phases])
+            insert, draw, _ = np.linalg.lstsq(counts, taken, rcond=None)[0]  # the third: for a second without either
             costs = (f"{1000 * steps:8.3f}", *(f"{1000 * updates[method]:8.3f}" for method in updates))
             held = ", ".join(f"{memory[name]:.0f}" for name in NAMES)
             print(f"{preset:24}{''.join(costs)}{1000 * insert:9.4f}{1000 * draw:8.3f}   {held}", flush=True)

@@ -16,7 +16,7 @@ from common.process.lifecycle import run_main
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, preset_names, resolve, validated
 from common.types import EnvSpec
-from deploy.sizing import Sizing, enough_actors, size
+from deploy.sizing import COSTS, Sizing, enough_actors, size
 
 TABLE = (10, 100, 1_000, 10_000)  # actors
 
@@ -58,7 +58,7 @@ def _run() -> None:
     network = build_network(config.network.kind, spec, config.network.hidden, seed=0)
     parameters = sum(parameter.numel() for parameter in network.parameters())
     sizings = [
-        size(config, spec, parameters, actors, options.learner_speedup, options.gbits)
+        size(COSTS[options.env], config, spec, parameters, actors, options.learner_speedup, options.gbits)
         for actors in (TABLE if options.table else (options.actors,))
     ]
     print(table(config, sizings) if options.table else page(config, options.env, sizings[0]))

@@ -12,8 +12,7 @@ from common.settings.methods import METHODS
 from common.types import EnvSpec
 
 MIB = 2**20
-ACTOR_BYTES = 280 * MIB  # resident (docs/robustness.md)
-LEARNER_BYTES = 300 * MIB
+LEARNER_BYTES = 400 * MIB  # resident
 REPLAY_BYTES = 90 * MIB  # without its table (docs/benchmarks.md)
 LINK_BYTES = 0.8 * MIB  # of either service, for each actor
 HEADER_BYTES = 300  # of a message
@@ -22,10 +21,10 @@ COPIES = 6  # of the parameters: two networks, and two running means of each opt
 
 @dataclass(frozen=True)
 class Costs:
-    """Processor time in milliseconds on a core of an AMD EPYC (Zen 4), from the measurements of docs/benchmarks.md.
+    """Processor time in milliseconds on a core of an Intel Xeon at 2 GHz; docs/scaling.md says how it was measured.
 
     step: of an actor, for one environment step. gradient, error_driven: an update of the learner, with receiving its
-    batch. insert, draw: of the replay service, for one transition and for one batch.
+    batch. insert, draw: of the replay service, for one transition and for one batch. actor: resident MiB.
     """
 
     step: float
@@ -33,11 +32,28 @@ class Costs:
     error_driven: float
     insert: float
     draw: float
+    actor: float
+
+    def update(self, method: str) -> float:
+        """Of the learner, an update by a method; raises UsageError for one that was not measured."""
+        if method not in MEASURED:
+            raise UsageError(f"--method {method}: its updates have not been measured; allowed: {', '.join(MEASURED)}")
+        return self.error_driven if METHODS.get(method).error_driven else self.gradient
 
 
-COSTS = {
-    "nature": Costs(0.82, 33.5, 50.5, 0.0074, 0.95),
+MEASURED = ("dqn", "edql", "g-coop", "coop")
+_MEASURED_COSTS = {
+    ("breakout",): Costs(0.96, 53.1, 79.3, 0.0266, 1.91, 336),
+    ("pong", "space-invaders"): Costs(0.873, 64.2, 84.2, 0.04, 2.17, 331),
+    ("breakout-small",): Costs(1.11, 28.1, 41.2, 0.0375, 2.22, 308),
+    ("pong-small", "space-invaders-small"): Costs(0.727, 26.4, 46.6, 0.0236, 2.15, 308),
+    ("catch",): Costs(0.773, 32.7, 36.3, 0.0686, 2.2, 292),
+    ("cartpole", "cartpole-paper", "cartpole-authors"): Costs(0.412, 2.9, 3.55, 0.352, 0.925, 77),
+    ("minatar-asterix", "minatar-breakout", "minatar-freeway", "minatar-seaquest", "minatar-space-invaders"): Costs(
+        0.262, 3.95, 5.76, 0.079, 1.05, 417
+    ),
 }
+COSTS = {preset: costs for presets, costs in _MEASURED_COSTS.items() for preset in presets}
 
 
 @dataclass(frozen=True)
@@ -93,31 +109,34 @@ class Sizing:
 
 
 def size(
-    config: RunConfig, spec: EnvSpec, parameters: int, actors: int, learner_speedup: float = 1.0, gbits: float = 10.0
+    costs: Costs,
+    config: RunConfig,
+    spec: EnvSpec,
+    parameters: int,
+    actors: int,
+    learner_speedup: float = 1.0,
+    gbits: float = 10.0,
 ) -> Sizing:
     """Size a run whose learner and replay service have a host each, and its actors a core each.
 
     Args:
-        parameters: of one network.
+        costs: of the config's preset. parameters: of one network.
         learner_speedup: how many times as fast as one measured core the learner computes.
         gbits: bandwidth of each of the two hosts, in each direction, in Gbit/s.
 
     Raises:
-        UsageError: nothing has been measured for the config's network.
+        UsageError: updates by the config's method have not been measured.
     """
-    costs = COSTS.get(config.network.kind)
-    if costs is None:
-        raise UsageError(f"network.kind = {config.network.kind!r}: not measured; allowed: {', '.join(COSTS)}")
     ratio, bandwidth = config.replay.ratio, gbits * 1e9 / 8
     traffic = _traffic(config, spec, parameters, actors)
-    update = (costs.error_driven if METHODS.get(config.method).error_driven else costs.gradient) / learner_speedup
+    update = costs.update(config.method) / learner_speedup
     links = LINK_BYTES * actors
     table = estimated_bytes(spec, min(config.replay.capacity, config.total_steps))
     return Sizing(
         (
             Part(
-                *("actors", actors, actors * ACTOR_BYTES, actors * 1000 / costs.step),
-                "more actors, or --network.dtype bfloat16",
+                *("actors", actors, actors * costs.actor * MIB, actors * 1000 / costs.step),
+                "more actors",
             ),
             Part(
                 *("replay service", 1, REPLAY_BYTES + table + links, 1000 / (costs.insert + ratio * costs.draw)),
@@ -125,7 +144,7 @@ def size(
             ),
             Part(
                 *("learner", 1, LEARNER_BYTES + 4 * parameters * COPIES + links, 1000 / (ratio * update)),
-                "a faster learner (--learner.device cuda), or a lower --replay.ratio; more actors gain nothing",
+                "a faster learner, or a lower --replay.ratio; more actors gain nothing",
             ),
             Part(
                 *("learner's link", 0, 0.0, bandwidth / traffic.draws),

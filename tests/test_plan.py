@@ -1,12 +1,12 @@
 """What a run needs: the arithmetic, the page that coop-plan prints, and the tables of docs/scaling.md."""
 
 import re
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import pytest
 
-from common.settings.tables import load_tables, resolve
+from common.settings.tables import load_tables, preset_names, resolve
 from common.types import EnvSpec
 from deploy import plan
 from deploy.sizing import COSTS, LINK_BYTES, Sizing, enough_actors, size
@@ -20,11 +20,11 @@ def breakout(actors: int, method: str = "coop", **changes: float) -> Sizing:
     config = resolve(load_tables("breakout", None), method)
     if "ratio" in changes:
         config = replace(config, replay=replace(config.replay, ratio=changes.pop("ratio")))
-    return size(config, ATARI, NATURE, actors, **changes)
+    return size(COSTS["breakout"], config, ATARI, NATURE, actors, **changes)
 
 
 def test_a_slow_learner_limits_many_actors() -> None:
-    sizing, costs = breakout(200), COSTS["nature"]
+    sizing, costs = breakout(200), COSTS["breakout"]
     assert sizing.bottleneck.name == "learner"
     assert sizing.speed == pytest.approx(1000 / costs.error_driven / 0.25)
     assert enough_actors(sizing) == 1
@@ -34,7 +34,7 @@ def test_a_slow_learner_limits_many_actors() -> None:
 
 def test_each_part_can_be_the_bottleneck() -> None:
     assert breakout(1, ratio=0.001).bottleneck.name == "actors"
-    assert breakout(1, ratio=0.001).speed == pytest.approx(1000 / COSTS["nature"].step)
+    assert breakout(1, ratio=0.001).speed == pytest.approx(1000 / COSTS["breakout"].step)
     assert breakout(10_000, ratio=1e-6, gbits=1000).bottleneck.name == "replay service"
     assert breakout(10_000, learner_speedup=1e6, gbits=1).bottleneck.name == "learner's link"
     assert breakout(10_000, ratio=1e-6, gbits=1).bottleneck.name == "replay's link"
@@ -69,7 +69,7 @@ def test_the_page(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Monkey
     assert text.startswith("breakout, coop: 200 actors of 8 emulators, 0.25 updates per step\n")
     assert re.search(r"^learner +1 +\d\.\d GiB +\d+ +100%$", text, re.MULTILINE)
     assert re.search(
-        r"^bottleneck  learner: a faster learner .*\n +1 of the 200 actors would keep it busy$", text, re.M
+        r"^bottleneck  learner: a faster learner, .*\n +1 of the 200 actors would keep it busy$", text, re.M
     )
     assert f"speed       {breakout(200).speed:,.0f} steps/s" in text
 
@@ -79,8 +79,9 @@ def test_the_page(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Monkey
     [
         (["--actors", "0"], "--actors 0: must be positive"),
         (["--gbits", "-1"], "--gbits -1.0: must be positive"),
-        (["--env", "breakuot"], "breakuot: unknown; did you mean breakout?"),
-        (["--env", "pong-small"], "network.kind = 'nips2013': not measured; allowed: nature"),
+        (["--env", "breakuot"], "'breakuot': unknown; did you mean breakout?"),
+        (["--method", "medqn"], "--method medqn: its updates have not been measured; allowed: dqn, edql, g-coop, coop"),
+        (["--method", "stream-q"], "--method stream-q: its updates have not been measured"),
         (["--ratio", "0"], "replay.ratio = 0"),
     ],
 )
@@ -105,3 +106,26 @@ def test_the_tables_of_the_documentation_are_the_commands(
         monkeypatch.setattr("sys.argv", command.split())
         plan.main()
         assert capsys.readouterr().out == table
+
+
+def test_what_was_measured_is_what_the_documentation_says() -> None:
+    rows = re.findall(r"^\| ((?:`[a-z0-9-]+`(?:, )?)+) \|(.*)\|$", SCALING.read_text(encoding="utf-8"), re.MULTILINE)
+    told = {
+        preset.strip("`"): tuple(map(float, row.split("|"))) for presets, row in rows for preset in presets.split(", ")
+    }
+    assert told == {preset: astuple(costs) for preset, costs in COSTS.items()}
+
+
+@pytest.mark.parametrize("preset", preset_names())
+def test_every_preset_can_be_planned(
+    preset: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if preset.startswith("minatar"):
+        pytest.importorskip("minatar")
+    monkeypatch.setattr("sys.argv", ["coop-plan", "--actors", "1", "--env", preset])
+    plan.main()
+    text = capsys.readouterr().out
+    costs, ratio = COSTS[preset], resolve(load_tables(preset, None)).replay.ratio
+    each = costs.step, costs.insert + ratio * costs.draw, ratio * costs.error_driven
+    for part, milliseconds in zip(("actors", "replay service", "learner"), each, strict=True):
+        assert re.search(rf"^{part} +1 +[\d.]+ GiB +{1000 / milliseconds:,.0f} ", text, re.MULTILINE)

@@ -70,6 +70,14 @@ def test_no_router() -> None:
     assert open_client((nowhere,), None, False, 60.0, stop) is None
 
 
+def test_a_config_that_is_none(tmp_path: Path) -> None:
+    config = tmp_path / "zenoh.json5"
+    config.write_text("{mode: 1}")
+    done = run_command("coop-router", "--zenoh-config", config)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("coop-router: error: zenoh configuration: ")
+
+
 def test_a_run_behind_a_router(tmp_path: Path) -> None:
     learner, replay, router = (free_endpoint() for _ in range(3))
     health = [free_endpoint().partition("/")[2] for _ in range(4)]
@@ -78,12 +86,14 @@ def test_a_run_behind_a_router(tmp_path: Path) -> None:
     command = [Path(sysconfig.get_path("scripts"), "coop-router"), "--connect", learner, "--listen", router]
     with ThreadPoolExecutor() as pool:
         playing = ["--mode=client", "--connect", router, "--health", health[2]]
-        actor = pool.submit(run_command, "coop-actor", *playing, check=True)
-        pool.submit(run_command, "coop-replay", *serving, cwd=tmp_path)
         trained = pool.submit(run_command, "coop-learner", *settings, "--listen", learner, "--health", health[0])
-        with subprocess.Popen([*command, "--health", health[3]], stdout=subprocess.DEVNULL) as process:
+        with subprocess.Popen([*command, "--health", health[3]], stdout=subprocess.PIPE, text=True) as process:
             try:
-                for address in health:
+                for address in (health[3], health[0]):  # they work without the others
+                    wait_for(partial(is_ready, address))
+                actor = pool.submit(run_command, "coop-actor", *playing, check=True)
+                pool.submit(run_command, "coop-replay", *serving, cwd=tmp_path)
+                for address in health[1:3]:
                     wait_for(partial(is_ready, address))
                 done = trained.result()
                 assert done.returncode == 0
@@ -91,6 +101,8 @@ def test_a_run_behind_a_router(tmp_path: Path) -> None:
             finally:
                 process.send_signal(signal.SIGINT)
                 assert process.wait(30) == 130
+            assert process.stdout is not None
+            assert process.stdout.readline().endswith(f" router listens on {router}\n")
     assert "joined; it listens on tcp/replay:1\n" in done.stdout
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["exit"], summary["transitions_lost"]) == ("complete", 0)
