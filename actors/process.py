@@ -15,7 +15,8 @@ from common.errors import JoinError
 from common.messaging.joining import Membership, join, leave_run
 from common.messaging.messages.join import Join, Joined
 from common.messaging.route import ReplayRoute, RoutedReplay, open_client
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.console import Console, counted
 from common.process.health import answering
 from common.process.lifecycle import Stop

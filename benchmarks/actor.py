@@ -28,7 +28,8 @@ from actors.policy import Policy
 from common.envs.make import env_spec, make_vector_env
 from common.messaging.keys import replay_key
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import NoAnswer, Node, new_incarnation
 from common.networks.network import FlatNetwork, build_network
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.process.threads import use_threads

@@ -22,7 +22,8 @@ from roles import Roles, RunWatch, replay_stats, running, wait_until
 from soak import measure
 
 from common.errors import CoopError
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.processes import command, free_endpoint
 
 RUN = "costs"

@@ -30,7 +30,8 @@ from crowd import Share, percentile, serve
 from roles import Roles, replay_stats, running
 
 from common.errors import RunError
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.processes import free_endpoint
 
 RUN = "fan-in"

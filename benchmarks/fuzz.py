@@ -34,7 +34,8 @@ from common.messaging.keys import replay_key
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.join import Join
 from common.messaging.messages.weights import Current
-from common.messaging.transport import Node, Pending, Refused, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, Pending, Refused, new_incarnation
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
 

@@ -22,7 +22,8 @@ from table import ATARI, segments
 from common.messaging.clients import InsertClient
 from common.messaging.keys import replay_key
 from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import NoAnswer, Node, new_incarnation
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
 from common.process.processes import ChildProcess, command, free_endpoint

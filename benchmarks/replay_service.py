@@ -30,7 +30,8 @@ from table import ATARI, segments
 from common.messaging.clients import InsertClient, SampleClient
 from common.messaging.messages.insert import encode_segment
 from common.messaging.route import open_client
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
 from common.process.processes import ChildProcess, command, free_endpoint

@@ -29,7 +29,8 @@ from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.join import Join, Leave
 from common.messaging.messages.status import ActorStatus
 from common.messaging.messages.weights import Current, Role
-from common.messaging.transport import NoAnswer, Pending, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import NoAnswer, Pending, new_incarnation
 from common.messaging.wire import Message
 
 STEPS, STREAMS = 32, 8  # of a segment; emulators of an actor

@@ -31,7 +31,8 @@ from common.messaging.joining import join
 from common.messaging.keys import replay_key
 from common.messaging.messages.join import Join
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import NoAnswer, Node, new_incarnation
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
 from common.process.processes import ChildProcess, command, free_endpoint

@@ -8,7 +8,7 @@ from pathlib import Path
 import zenoh
 
 from common.messaging.links import close, described
-from common.messaging.transport import open_session
+from common.messaging.session import open_session
 from common.process import cli
 from common.process.console import Console, counted
 from common.process.health import answering

@@ -15,7 +15,8 @@ from common.errors import BadMessage
 from common.messaging.joining import no_learner
 from common.messaging.keys import status_key
 from common.messaging.messages.status import LearnerStatus
-from common.messaging.transport import Node, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node
 from common.process.console import PeerMonitor, progress_line, stamped
 from common.process.display import LiveDisplay
 from common.process.lifecycle import Stop

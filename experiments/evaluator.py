@@ -16,7 +16,8 @@ from common.messaging.joining import Membership, join, leave_run
 from common.messaging.keys import evaluations_key
 from common.messaging.messages.evaluate import Evaluated, Video
 from common.messaging.messages.join import Join, Joined
-from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from common.process.console import Console, counted
 from common.process.lifecycle import Stop
 from common.process.threads import use_threads

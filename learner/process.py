@@ -9,7 +9,8 @@ from pathlib import Path
 from common.errors import RunError, UsageError
 from common.messaging.clients import SampleClient
 from common.messaging.links import locators
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.console import Console, say
 from common.process.health import answering
 from common.process.lifecycle import Stop

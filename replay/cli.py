@@ -14,7 +14,8 @@ from common.messaging.joining import Membership, join, leave_run
 from common.messaging.links import locators
 from common.messaging.messages.join import MOST_EPOCHS, Join, Joined
 from common.messaging.presence import LEASE
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process import cli
 from common.process.console import Console
 from common.process.health import answering

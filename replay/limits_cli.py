@@ -9,7 +9,8 @@ from common.messaging.joining import join
 from common.messaging.keys import replay_key
 from common.messaging.messages.join import Join
 from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
-from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from common.process import cli
 from common.process.lifecycle import Stop, run_main
 from common.settings.options import RoleOptions

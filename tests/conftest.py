@@ -13,7 +13,8 @@ import hypothesis
 import pytest
 import torch  # noqa: F401 - `use_threads` limits what has been imported
 
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.threads import use_threads
 from common.types import EnvSpec
 

@@ -8,7 +8,8 @@ from common.errors import RunError, UsageError
 from common.messaging.endpoints import check_endpoints, unknown_hosts
 from common.messaging.joining import join
 from common.messaging.messages.join import Join
-from common.messaging.transport import Node, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node
 from common.process.lifecycle import Stop
 
 

@@ -14,7 +14,8 @@ from common.messaging.messages.epoch import Snapshot
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.weights import Current
-from common.messaging.transport import Node, Refused, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, Refused, new_incarnation
 from common.messaging.wire import Message
 from common.process.console import Console
 from common.process.lifecycle import Stop

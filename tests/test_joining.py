@@ -18,7 +18,8 @@ from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
 from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current
-from common.messaging.transport import Node, Refused, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, Refused
 from common.process.lifecycle import Stop
 from common.settings.config import RunConfig
 from common.types import EnvSpec

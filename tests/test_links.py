@@ -14,7 +14,7 @@ import zenoh
 
 from common.messaging import links
 from common.messaging.links import locators
-from common.messaging.transport import open_session
+from common.messaging.session import open_session
 
 LINKS = 20
 

@@ -19,7 +19,8 @@ from test_epochs import CONFIG, save
 from common.errors import RunError, UsageError
 from common.messaging.joining import join
 from common.messaging.messages.join import Join
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.files import truncate
 from common.process.lifecycle import Stop
 from common.process.locks import INHERITED, RunLock

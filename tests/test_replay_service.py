@@ -19,7 +19,8 @@ from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation
 from common.process.lifecycle import Stop
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec

@@ -19,7 +19,8 @@ from common.messaging.keys import replay_key
 from common.messaging.links import close
 from common.messaging.messages.answers import Ack
 from common.messaging.route import RoutedReplay, open_client
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
 from deploy.router import links

@@ -21,7 +21,8 @@ from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.route import ReplayRoute
-from common.messaging.transport import Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
 from common.settings.config import RunConfig

@@ -21,7 +21,8 @@ from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current
-from common.messaging.transport import NoAnswer, Node, new_incarnation, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import NoAnswer, Node, new_incarnation
 from common.process.processes import ChildProcess, command, free_endpoint
 
 MAKE_KEYS = Path(__file__).parents[1] / "deploy" / "zenoh" / "make_keys.sh"

@@ -14,7 +14,8 @@ from typing import Self
 import zenoh
 
 from common.errors import JoinError
-from common.messaging.transport import NoAnswer, Node, Pending, open_session
+from common.messaging.session import open_session
+from common.messaging.transport import NoAnswer, Node, Pending
 from common.process.lifecycle import Stop
 
 RETRY_PAUSE = 0.1  # seconds

@@ -7,47 +7,27 @@ loop answers in its own thread; weights, role and status are `publish`ed and rea
 from __future__ import annotations
 
 import contextlib
-import json
 import secrets
 import threading
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
 import zenoh
 
-from common.bounds import MAX_PAYLOAD
-from common.errors import BadMessage, CoopError, RunError, UsageError
+from common.errors import BadMessage, CoopError, RunError
 from common.messaging import wire
-from common.messaging.endpoints import check_endpoints, explain_listen_error, first_line
 from common.messaging.faults import Faults
 from common.messaging.keys import run_key, stop_key
-from common.messaging.links import close, never_linger, permit_many
+from common.messaging.links import close
 from common.messaging.messages.answers import Error
 from common.messaging.messages.status import Status
 from common.messaging.messages.stop import EndOfRun
-from common.messaging.presence import LEASE, Presence
+from common.messaging.presence import Presence
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
 
 ASK_TIMEOUT = 5.0  # seconds
-MAX_LINKS = 1 << 16  # of a session; Zenoh's own limit is 1,000
-
-_QUIET = {
-    "scouting/multicast/enabled": False,
-    "scouting/gossip/enabled": False,
-    "adminspace/enabled": True,
-    "connect/exit_on_failure": False,
-    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
-    "listen/exit_on_failure": True,
-    "transport/unicast/max_sessions": MAX_LINKS,
-    "transport/link/tx/lease": round(1000 * LEASE),
-    "transport/link/rx/buffer_size": 1 << 18,  # of each link, at once
-    "transport/link/rx/max_message_size": MAX_PAYLOAD + (1 << 16),
-    "transport/link/tx/queue/size/data": 16,
-    "transport/shared_memory/enabled": False,
-}
 
 
 class NoAnswer(RunError):
@@ -61,49 +41,6 @@ class Refused(RunError):
 def new_incarnation() -> int:
     """Draw a random id of 63 bits for a process."""
     return secrets.randbits(63)
-
-
-def open_session(
-    listen: Sequence[str] = (),
-    connect: Sequence[str] = (),
-    zenoh_config: Path | None = None,
-    shared_memory: bool = False,
-    mode: str = "peer",
-) -> zenoh.Session:
-    """Open a session with explicit endpoints, no scouting and quick reconnection.
-
-    mode: "peer"; "router", which forwards between others; "client", which has one link, to a router.
-
-    Raises:
-        UsageError: a Zenoh config file or an endpoint is invalid.
-        RunError: it cannot listen on an endpoint, for example because the port is in use.
-        NoAnswer: mode is "client", and no router has answered within a second.
-    """
-    zenoh.init_log_from_env_or("off")
-    check_endpoints((*listen, *connect))
-    if listen:
-        permit_many()
-    try:
-        config = zenoh.Config.from_file(str(zenoh_config)) if zenoh_config else zenoh.Config()
-        for key, value in _QUIET.items():
-            config.insert_json5(key, json.dumps(value))
-        config.insert_json5("mode", json.dumps(mode))
-        config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
-        config.insert_json5("listen/endpoints", json.dumps(list(listen)))
-        config.insert_json5("connect/endpoints", json.dumps(list(connect)))
-        config.insert_json5("connect/timeout_ms", "1000" if mode == "client" else "-1")  # a client waits for its link
-    except zenoh.ZError as error:
-        raise UsageError(f"zenoh configuration: {first_line(error)}") from error
-    try:
-        session = zenoh.open(config)
-    except zenoh.ZError as error:
-        if mode == "client":
-            raise NoAnswer(f"no router at {', '.join(connect)}") from error
-        raise RunError(
-            f"can't listen on {', '.join(listen) or 'any endpoint'}: {explain_listen_error(listen, error)}"
-        ) from error
-    never_linger(session)
-    return session
 
 
 class Pending:

@@ -1,0 +1,76 @@
+"""Opens Zenoh sessions: explicit endpoints, no scouting, quick reconnection, as many links as the system permits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import zenoh
+
+from common.bounds import MAX_PAYLOAD
+from common.errors import RunError, UsageError
+from common.messaging.endpoints import check_endpoints, explain_listen_error, first_line
+from common.messaging.links import never_linger, permit_many
+from common.messaging.presence import LEASE
+from common.messaging.transport import NoAnswer
+
+MAX_LINKS = 1 << 16  # of a session; Zenoh's own limit is 1,000
+
+_QUIET = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "adminspace/enabled": True,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+    "listen/exit_on_failure": True,
+    "transport/unicast/max_sessions": MAX_LINKS,
+    "transport/link/tx/lease": round(1000 * LEASE),
+    "transport/link/rx/buffer_size": 1 << 18,  # of each link, at once
+    "transport/link/rx/max_message_size": MAX_PAYLOAD + (1 << 16),
+    "transport/link/tx/queue/size/data": 16,
+    "transport/shared_memory/enabled": False,
+}
+
+
+def open_session(
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    zenoh_config: Path | None = None,
+    shared_memory: bool = False,
+    mode: str = "peer",
+) -> zenoh.Session:
+    """Open a session with explicit endpoints, no scouting and quick reconnection.
+
+    mode: "peer"; "router", which forwards between others; "client", which has one link, to a router.
+
+    Raises:
+        UsageError: a Zenoh config file or an endpoint is invalid.
+        RunError: it cannot listen on an endpoint, for example because the port is in use.
+        NoAnswer: mode is "client", and no router has answered within a second.
+    """
+    zenoh.init_log_from_env_or("off")
+    check_endpoints((*listen, *connect))
+    if listen:
+        permit_many()
+    try:
+        config = zenoh.Config.from_file(str(zenoh_config)) if zenoh_config else zenoh.Config()
+        for key, value in _QUIET.items():
+            config.insert_json5(key, json.dumps(value))
+        config.insert_json5("mode", json.dumps(mode))
+        config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
+        config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+        config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+        config.insert_json5("connect/timeout_ms", "1000" if mode == "client" else "-1")  # a client waits for its link
+    except zenoh.ZError as error:
+        raise UsageError(f"zenoh configuration: {first_line(error)}") from error
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        if mode == "client":
+            raise NoAnswer(f"no router at {', '.join(connect)}") from error
+        raise RunError(
+            f"can't listen on {', '.join(listen) or 'any endpoint'}: {explain_listen_error(listen, error)}"
+        ) from error
+    never_linger(session)
+    return session
