@@ -10,7 +10,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
@@ -47,6 +47,7 @@ def _bound(network: nn.Sequential, x: Tensor, e: Tensor, s: float) -> float:
     st.lists(st.integers(8, 24), min_size=1, max_size=3),
     st.floats(-2, 2),
 )
+@example(seed=3, actions=3, widths=[8, 9], s=1.0)  # one unit of eight is active: three rows of rank 1
 def test_the_costs_differ_by_less_than_theorem_1_says(seed: int, actions: int, widths: list[int], s: float) -> None:
     network = _network(seed, actions, tuple(widths))
     generator = torch.Generator().manual_seed(seed)

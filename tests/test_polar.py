@@ -80,6 +80,20 @@ def test_what_float32_is_too_coarse_for_is_named_and_left_at_0(gram: Array, accu
         np.testing.assert_allclose(white[layer, 2], e[0] / 3**0.5, rtol=1e-6)
 
 
+@LIBRARIES
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("size", "rank"), [(2, 1), (3, 1), (3, 2), (4, 1), (4, 3)])
+def test_no_matrix_that_lacks_rank_passes_for_accurate(size: int, rank: int, dtype: type, library: Any) -> None:
+    rng = np.random.default_rng(0)
+    rows = (rng.standard_normal((20_000, size, rank)) @ rng.standard_normal((20_000, rank, 6))).astype(dtype)
+    gram, e = np.einsum("bij,bkj->bik", rows, rows), np.eye(size, dtype=dtype)[0]
+    with np.errstate(all="ignore"):
+        white, doubtful = whitened(library(gram), library(e))
+    assert doubtful is not None
+    assert np.asarray(doubtful).all()
+    assert not np.asarray(white).any()
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("shape", [(3, 5), (5, 3), (12, 20), (20, 12)])
 def test_polar_factors_keep_shape_and_dtype_and_what_is_not_finite(shape: tuple[int, int], dtype: torch.dtype) -> None:

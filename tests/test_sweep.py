@@ -77,7 +77,7 @@ def test_one_cell_by_name_or_number() -> None:
         ("methods = []", "methods = []"),
         ('methods = ["sarsa"]', "'sarsa'"),
         ("seeds = [-1]", "-1"),
-        ('preset = "cartpol"', "cartpol: unknown; did you mean cartpole? allowed: "),
+        ('preset = "cartpol"', "'cartpol': unknown; did you mean cartpole? allowed: "),
         ('mode = "both"', "mode = 'both'"),
         ("vary.replay.capacity = [50]", "replay.learning_starts = 128: must not exceed replay.capacity = 50"),
         ("vary.replay.capacity = [500, 500]", "two cells collide: both are called coop-capacity=500-seed=0"),

@@ -87,6 +87,8 @@ def _whitened_triples(g: ArrayT, e: ArrayT, limits: _Limits) -> tuple[ArrayT, Ar
     shortest = xp.amin(lengths, 0)
     safe = (shortest > limits.square) & (shortest > limits.ratio * xp.amax(lengths, 0))
     safe &= (lengths * minors).sum(0) < limits.inflation * determinant
+    # Implied by the line above, but for rounding: of a matrix of rank 1, minors and determinant are nothing else.
+    safe &= determinant * limits.inflation**2 > lengths.prod(0)
     trace, minor, z = lengths.sum(0), minors.sum(0), determinant**0.5
     y = (minor + 2 * z * (3 * trace) ** 0.5) ** 0.5  # at most a tenth too large
     for _ in range(3):  # Newton's method doubles the digits
