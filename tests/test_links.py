@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import socket
+import threading
 import time
 from contextlib import ExitStack
 from itertools import pairwise
@@ -13,7 +14,7 @@ import pytest
 import zenoh
 
 from common.messaging import links
-from common.messaging.links import locators
+from common.messaging.links import close, locators
 from common.messaging.session import open_session
 
 LINKS = 20
@@ -67,3 +68,11 @@ def test_a_service_may_have_as_many_links_as_the_system_permits() -> None:
         assert resource.getrlimit(resource.RLIMIT_NOFILE) == (before[1], before[1])
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_a_closed_session_leaves_no_thread(endpoint: str) -> None:
+    before = set(threading.enumerate())
+    session = open_session((endpoint,))
+    assert {thread.name for thread in set(threading.enumerate()) - before} >= {"links"}
+    close(session)
+    assert not [thread for thread in set(threading.enumerate()) - before if thread.name == "links"]

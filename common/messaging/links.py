@@ -16,14 +16,15 @@ import socket
 import stat
 import struct
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
+PATIENCE = 1.0  # seconds for a thread to end once its session is closed
 PAUSE = 0.2  # seconds between looks at this process's sockets, far less than a peer's lease
 _LINGER_OFF = struct.pack("ii", 0, 0)
+_followers: dict[str, tuple[threading.Thread, threading.Event]] = {}  # by the session's id
 
 
 def described(session: zenoh.Session, mode: str = "peer") -> dict[str, Any]:
@@ -49,24 +50,30 @@ def permit_many() -> None:
 def never_linger(session: zenoh.Session) -> None:
     """Make Zenoh close all present and future links of this session at once; the kernel still delivers what it can."""
     changes = session.info.declare_link_events_listener(zenoh.handlers.RingChannel(1), history=True)
-    threading.Thread(target=_follow, args=(changes,), name="links", daemon=True).start()
+    closing = threading.Event()
+    thread = threading.Thread(target=_follow, args=(changes, closing), name="links", daemon=True)
+    _followers[str(session.zid())] = thread, closing
+    thread.start()
 
 
-def _follow(changes: Any) -> None:  # noqa: ANN401 (zenoh's listener)
+def _follow(changes: Any, closing: threading.Event) -> None:  # noqa: ANN401 (zenoh's listener)
     """Treat the sockets after each change of the links, and at most every `PAUSE` seconds, until the session closes."""
-    while True:
-        try:
+    with contextlib.suppress(zenoh.ZError):
+        while not closing.is_set():
             changes.recv()
-        except zenoh.ZError:
-            return
-        _linger_off()
-        time.sleep(PAUSE)
+            _linger_off()
+            closing.wait(PAUSE)
 
 
 def close(session: zenoh.Session) -> None:
     """Close a session; takes up to 10 s while it connects to a host that does not answer."""
+    thread, closing = _followers.pop(str(session.zid()), (None, None))
+    if closing is not None:
+        closing.set()
     with contextlib.suppress(zenoh.ZError):  # it then says that it took too long
         session.close()  # type: ignore[no-untyped-call]
+    if thread is not None:
+        thread.join(PATIENCE)  # a thread that comes back from Zenoh while the interpreter ends would abort the process
 
 
 def _linger_off() -> None:
