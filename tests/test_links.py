@@ -70,9 +70,14 @@ def test_a_service_may_have_as_many_links_as_the_system_permits() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
-def test_a_closed_session_leaves_no_thread(endpoint: str) -> None:
+def test_a_closed_session_leaves_no_thread(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(links, "PAUSE", 30.0)
     before = set(threading.enumerate())
-    session = open_session((endpoint,))
-    assert {thread.name for thread in set(threading.enumerate()) - before} >= {"links"}
-    close(session)
+    first, second = open_session((endpoint,)), open_session((), (endpoint,))
+    deadline = time.monotonic() + 20
+    while not list(first.info.peers_zid()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(0.1)  # both threads have looked at the sockets, and pause
+    close(first)
+    close(second)
     assert not [thread for thread in set(threading.enumerate()) - before if thread.name == "links"]
