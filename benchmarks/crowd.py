@@ -17,14 +17,15 @@ from common.messaging.joining import IDLE_ASK_EVERY
 from common.process.memory import keep_freed_memory
 
 AT_ONCE = 16  # actors of a process that join at the same time
-AGE_EVERY = 1.0  # seconds
-LOOK_EVERY = 0.001  # seconds between looks for acknowledgements
+AGE_EVERY = 4.0  # seconds
+LOOK_EVERY = 0.001  # seconds between looks for acknowledgements, and
+LOOK_PAUSE = 2e-5  # more for each actor of the process, so that many leave the processor to those they ask
 
 
 class Share(NamedTuple):
     """What the actors of one process have done; seconds.
 
-    sent, acked: transitions. ages: of the acting network's parameters since their broadcast, by actor, once a second.
+    sent, acked: transitions. ages: of the acting network's parameters since their broadcast, by actor, now and then.
     missing: broadcasts that an actor had to ask for. late: how far the process fell behind its own schedule.
     """
 
@@ -91,7 +92,7 @@ class Crowd:
                     ages.append(one.age())
                 now = time.monotonic()
             self._collect()
-            time.sleep(LOOK_EVERY)
+            time.sleep(LOOK_EVERY + LOOK_PAUSE * number)
         self._drain()
         done = [
             (one.sent - sent, one.acked - acked, one.waits[waits:], one.missing - missing, one.retries - retries)

@@ -243,7 +243,7 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=20.0, help="of playing")
     parser.add_argument("--rate", type=float, default=20_000, help="transitions/s of all actors together")
-    parser.add_argument("--publish-every", type=int, default=40, help="updates between broadcasts of the parameters")
+    parser.add_argument("--publish-every", type=int, default=10, help="updates between broadcasts of the parameters")
     parser.add_argument("--network", choices=NETWORKS, default="small")
     parser.add_argument("--processes", type=int, default=2, help="that hold the synthetic actors")
     parser.add_argument("--out", type=Path, default=Path("fan_in.md"))
@@ -264,7 +264,7 @@ def main() -> None:
     options.out.write_text(f"{text}\n", encoding="utf-8")
     print(text)
     problems = [problem for row in rows for one in row for problem in one.problems]
-    sys.exit("\n".join(problems))
+    sys.exit("\n".join(problems) or 0)
 
 
 if __name__ == "__main__":

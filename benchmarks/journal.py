@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
-from table import ATARI, segments
+from made_up import ATARI, segments
 
 from common.messaging.clients import InsertClient
 from common.messaging.keys import replay_key

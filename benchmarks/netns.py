@@ -183,7 +183,7 @@ def main() -> None:
     if not options.seconds > 5:
         parser.error(f"--seconds {options.seconds:g}: must be more than 5")
     if os.geteuid() or shutil.which("ip") is None:
-        print("netns: skipped: making network namespaces needs root and iproute2")
+        print("SKIP: making network namespaces needs root and iproute2")
         return
     names = dict.fromkeys(PLACES.values())
     try:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import zenoh
-from table import ATARI, segments
+from made_up import ATARI, segments
 from zenoh.handlers import FifoChannel, RingChannel
 
 from actors.weights import GRACE
@@ -24,6 +24,7 @@ from common.messaging import wire
 from common.messaging.clients import INSERT_TIMEOUT
 from common.messaging.joining import RETRY_PAUSE
 from common.messaging.keys import join_key, replay_key, role_key, run_key, status_key, weights_key
+from common.messaging.members import ROUTE
 from common.messaging.messages.answers import Ack
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.join import Join, Leave
@@ -86,6 +87,7 @@ class SyntheticActor:
         self._space = space
         self._broadcasts = broadcasts
         self._numbers = count()
+        self._permitted = 1
         self._in_flight: deque[_Sent] = deque()
         self._again_at = 0.0
         self._asked: list[Pending] = []  # answers that nobody reads
@@ -101,7 +103,7 @@ class SyntheticActor:
         self._weights = [self._subscribe(weights_key(space, network)) for network in (1, 2)]
         endpoints = self._join()
         self._route = open_session((), endpoints)
-        self._route_token = self._route.liveliness().declare_token(space.key("alive", "route", name))
+        self._route_token = self._route.liveliness().declare_token(space.key("alive", ROUTE, name))
         self._fetch()
 
     @property
@@ -111,7 +113,7 @@ class SyntheticActor:
 
     def send(self) -> bool:
         """Send the next segment; return False if the window is full."""
-        if len(self._in_flight) >= WINDOW:
+        if len(self._in_flight) >= self._permitted:
             return False
         sequence, stream = divmod(next(self._numbers), STREAMS)
         segment = msgspec.structs.replace(
@@ -137,6 +139,7 @@ class SyntheticActor:
                 return
             if message.kind == Ack.kind:
                 self.waits.append(time.monotonic() - sent.first)
+                self._permitted = min(WINDOW, Ack.decode(message).window or WINDOW)
                 self.acked += STEPS
                 self._in_flight.popleft()
             else:

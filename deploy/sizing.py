@@ -14,7 +14,7 @@ from common.types import EnvSpec
 MIB = 2**20
 LEARNER_BYTES = 400 * MIB  # resident
 REPLAY_BYTES = 90 * MIB  # without its table (docs/benchmarks.md)
-LINK_BYTES = 0.8 * MIB  # of either service, for each actor
+LINK_BYTES = 0.7 * MIB  # of either service, for each actor (benchmarks/fan_in.py)
 HEADER_BYTES = 300  # of a message
 COPIES = 6  # of the parameters: two networks, and two running means of each optimizer
 

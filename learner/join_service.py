@@ -15,6 +15,7 @@ from common.messaging.messages.join import Farewell, Join, Joined, Leave
 from common.messaging.transport import Node
 from common.messaging.wire import Message
 from common.settings.config import RunConfig
+from common.settings.tables import to_tables
 from common.types import EnvSpec
 from learner.members import MemberTracker
 from learner.roster import AlreadyServed, Roster
@@ -80,6 +81,7 @@ class JoinService:
         self.departure = Departure()
         self._node = node
         self._config = config
+        self._tables = to_tables(config)
         self._spec = spec
         self._layout = layout
         self._run_id = run_id
@@ -124,7 +126,7 @@ class JoinService:
             anew,
             replay=self._replay,
         )
-        return joined.answer()
+        return joined.answer(self._node.run, self._tables)
 
     def _admit(self, request: Join) -> int:
         """Admit a replay service, and send actors to it; return its number. Raises as `Roster.replay`."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from common.errors import RunError, UsageError
 from common.messaging.clients import SampleClient
 from common.messaging.links import locators
-from common.messaging.session import open_session
+from common.messaging.session import SHORT_QUEUE, open_session
 from common.messaging.transport import Node, new_incarnation
 from common.process.console import Console, say
 from common.process.health import answering
@@ -54,7 +54,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
     agent = trainer.agent
     epochs = SharedEpochs(held, str(path), restart=options.restart)
     incarnation = new_incarnation()
-    session = open_session(options.listen, (), options.zenoh_config, options.shared_memory)
+    session = open_session(options.listen, (), options.zenoh_config, options.shared_memory, send_queue=SHORT_QUEUE)
     with Node(session, config.run, "learner", incarnation) as node, answering(options.health, console):
         run_id = claim_run_directory(path, config)
         roster = Roster(path, time.monotonic())

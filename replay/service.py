@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from common.errors import BadMessage, CoopError, RunError
 from common.messaging.keys import replay_key
+from common.messaging.members import ROUTE
 from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import SegmentReader
@@ -33,7 +34,8 @@ from replay.persistence.epochs import ReplayEpochs
 LEAVING = "the replay service is stopping"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"
 STATUS_EVERY = 0.5  # seconds
-INSERT_QUEUE = 256
+IN_FLIGHT = 256  # segments of all actors together, but at least one of each
+INSERT_QUEUE = 1 << 14  # never full while actors keep to their windows: a full one blocks Zenoh's receiving threads
 
 T = TypeVar("T")
 
@@ -140,7 +142,12 @@ class ReplayService:
         outcome = self._admit(self._inserts, lambda: self._core.insert(segment, message.payload))
         if isinstance(outcome, Wait):
             return Retry(outcome.reason).encode(self._node.run)
-        return Ack(outcome).encode(self._node.run)
+        return Ack(outcome, self._window()).encode(self._node.run)
+
+    def _window(self) -> int:
+        """Segments that each actor may have in flight; behind a router, actors have no connections of their own."""
+        there = self._node.presence.counts()
+        return max(1, IN_FLIGHT // max(1, there.get(ROUTE, 0), there.get("actor", 0)))
 
     def _sample(self, message: Message) -> bytearray:
         request = DrawRequest.decode(message)

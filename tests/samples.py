@@ -1,6 +1,7 @@
 """Small valid messages for tests to send and to break, and real play cut into segments."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -46,6 +47,14 @@ def await_service(asker: Node, key: str) -> None:
         assert time.monotonic() < deadline, f"nobody answers on {key}"
         time.sleep(0.01)
     querier.undeclare()
+
+
+def until(reached: Callable[[], object], seconds: float = 20.0) -> None:
+    """Wait for a condition; fail if it is not reached in time."""
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 Seen = list[tuple[Array, Array, Steps, Array]]

@@ -1,12 +1,10 @@
 """Errors of this program in threads: answered, counted, printed once; and a table that they left half changed."""
 
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from samples import await_service, make_segment
+from samples import await_service, make_segment, until
 
 from common.messaging.keys import replay_key
 from common.messaging.messages.answers import Ack, Retry
@@ -24,13 +22,6 @@ from common.types import EnvSpec
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
 from replay.service import ReplayService
-
-
-def _until(reached: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not reached():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_a_serving_thread_outlives_an_error(nodes: tuple[Node, Node], capfd: pytest.CaptureFixture[str]) -> None:
@@ -61,12 +52,12 @@ def test_a_callback_of_zenoh_outlives_an_error(nodes: tuple[Node, Node], endpoin
     def look() -> None:
         raise ZeroDivisionError
 
-    _until(lambda: learner.presence.counts().get("actor") == 1)  # the fixture's own, whose coming is no change any more
+    until(lambda: learner.presence.counts().get("actor") == 1)  # the fixture's own, whose coming is no change any more
     learner.presence.on_change(look)
     with Node(open_session((), (endpoint,)), "test", "replay", new_incarnation()):
-        _until(lambda: learner.faults.count == 1)
+        until(lambda: learner.faults.count == 1)
         assert learner.presence.counts()["replay"] == 1
-    _until(lambda: learner.faults.count == 2)
+    until(lambda: learner.faults.count == 2)
 
 
 @pytest.mark.parametrize("question", ["insert", "snapshot"])
@@ -90,7 +81,7 @@ def test_a_table_that_may_be_half_changed_is_not_used_any_more(
     payload = second if question == "insert" else Snapshot(1, []).encode("test")
     with pytest.raises(Refused, match="half way"):
         client.ask(replay_key(client, question), payload)
-    _until(stop.is_set)
+    until(stop.is_set)
     running.join(20)
     assert stop.failed
     assert "may have left the table half changed: ZeroDivisionError" in stop.reason

@@ -43,16 +43,17 @@ def test_another_protocol_is_refused_with_both_versions(
 ) -> None:
     learner, actor = nodes
     with monkeypatch.context() as patch:
-        patch.setattr(wire, "PROTOCOL", 7)
+        patch.setattr(wire, "PROTOCOL", wire.PROTOCOL + 2)
         payload = REQUEST.encode("test")
         newer = EndOfRun.because("an answer of another protocol").encode("test")
     # Before the join service, so that who has joined knows of it too.
     learner.serve(learner.key("newer"), lambda message: newer)
     _receive(learner, spec)
     assert join(actor, Stop(), REQUEST, (), 5) is not None
-    with pytest.raises(Refused, match="version 7; this process speaks 5"):
+    refusal = f"version {wire.PROTOCOL + 2}; this process speaks {wire.PROTOCOL}"
+    with pytest.raises(Refused, match=refusal):
         actor.ask(join_key(actor, "actor"), payload)
-    with pytest.raises(Refused, match="version 7; this process speaks 5"):
+    with pytest.raises(Refused, match=refusal):
         actor.ask(actor.key("newer"), Current().encode("test"))
 
 

@@ -45,7 +45,7 @@ def test_of_many_new_links_none_lingers_after_a_few_looks(monkeypatch: pytest.Mo
     monkeypatch.setattr(links, "_linger_off", look)
     with ExitStack() as stack:
         session = open_session(("tcp/127.0.0.1:0",))
-        stack.callback(session.close)
+        stack.callback(close, session)
         at = locators(session)
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
@@ -64,20 +64,27 @@ def test_a_service_may_have_as_many_links_as_the_system_permits() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (before[1] // 2, before[1]))
     try:
-        open_session(("tcp/127.0.0.1:0",)).close()  # type: ignore[no-untyped-call]
+        close(open_session(("tcp/127.0.0.1:0",)))
         assert resource.getrlimit(resource.RLIMIT_NOFILE) == (before[1], before[1])
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
-def test_a_closed_session_leaves_no_thread(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_thread_for_all_sessions_ends_with_the_last(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(links, "PAUSE", 30.0)
     before = set(threading.enumerate())
     first, second = open_session((endpoint,)), open_session((), (endpoint,))
     deadline = time.monotonic() + 20
     while not list(first.info.peers_zid()) and time.monotonic() < deadline:
         time.sleep(0.02)
-    time.sleep(0.1)  # both threads have looked at the sockets, and pause
+    time.sleep(0.1)  # the thread has looked at the sockets, and pauses
+
+    def followers() -> int:
+        return sum(thread.name == "links" for thread in set(threading.enumerate()) - before)
+
     close(first)
+    assert followers() == 1
     close(second)
-    assert not [thread for thread in set(threading.enumerate()) - before if thread.name == "links"]
+    assert followers() == 0
+    close(open_session((endpoint,)))
+    assert followers() == 0, "and so again"

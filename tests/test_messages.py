@@ -73,7 +73,7 @@ def _encoded_batch() -> bytearray:
 
 READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "join": (JOIN.encode("r"), Join.decode),
-    "joined": (JOINED.answer(), Joined.decode),
+    "joined": (JOINED.encode("r"), Joined.decode),
     "leave": (Leave(5).encode("r"), Leave.decode),
     "insert": (encode_segment("r", make_segment(SPEC)), SegmentReader(SPEC)),
     "ack": (Ack(9).encode("r"), Ack.decode),

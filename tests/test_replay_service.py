@@ -2,18 +2,20 @@
 
 import threading
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import await_service, make_segment
+from samples import await_service, make_segment, until
 
 from common.bounds import MAX_COUNT
 from common.errors import RunError
 from common.messaging.clients import InsertClient, SampleClient
 from common.messaging.keys import replay_key
 from common.messaging.links import locators
+from common.messaging.members import ROUTE
 from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import encode_segment
@@ -215,14 +217,41 @@ def test_segments_wait_behind_their_window_without_being_sent_again(
     assert len(told) > 50, "and whoever looks is told meanwhile"
 
 
+def test_actors_share_what_may_be_in_flight(
+    nodes: tuple[Node, Node], endpoint: str, spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("replay.service.IN_FLIGHT", 5)
+    server, client = nodes
+    _serve(server, ReplayCore(CONFIG, spec), tmp_path, client)
+
+    def permitted(sequence: int) -> int:
+        payload = encode_segment("test", make_segment(spec, sequence))
+        return Ack.decode(client.ask(replay_key(client, "insert"), payload)).window
+
+    assert permitted(0) == 5, "one actor has all of it"
+    with ExitStack() as stack:
+        for number in range(1, 8):
+            stack.enter_context(Node(open_session((), (endpoint,)), "test", ROUTE, number))
+            until(lambda number=number: server.presence.counts().get(ROUTE) == number)
+            assert permitted(0) == max(1, 5 // number), "but no actor has none"
+    until(lambda: ROUTE not in server.presence.counts())
+
+    stop = Stop()
+    inserts = InsertClient(client, stop, window=16)
+    for number in range(1, 10):  # the limiter lets 4 more in
+        assert inserts.submit(make_segment(spec, number))
+    threading.Timer(0.3, stop.set, ("enough",)).start()
+    assert not inserts.submit(make_segment(spec, 10)), "5 are in flight"
+
+
 def test_a_stop_ends_the_waiting(endpoint: str, spec: EnvSpec) -> None:
     stop = Stop()
     with Node(open_session((endpoint,)), "test", "actor", new_incarnation()) as client:
         told: list[str] = []
-        inserts = InsertClient(client, stop, window=1, on_wait=lambda: told.append(inserts.waiting))
+        inserts = InsertClient(client, stop, window=4, on_wait=lambda: told.append(inserts.waiting))
         threading.Timer(0.3, stop.set, ("enough",)).start()
         assert inserts.submit(make_segment(spec, 0))
-        assert not inserts.submit(make_segment(spec, 1))
+        assert not inserts.submit(make_segment(spec, 1)), "until it is acknowledged, the first one goes alone"
         assert inserts.waiting == "the replay service does not answer"
         assert told.count(inserts.waiting) > 1, "the reason is told again and again"
         with pytest.raises(NoAnswer):

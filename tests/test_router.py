@@ -4,15 +4,14 @@ import json
 import signal
 import subprocess
 import sysconfig
-import time
 import urllib.request
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
 import pytest
 from commands import run_command
+from samples import until
 
 from common.errors import JoinError
 from common.messaging.keys import replay_key
@@ -25,12 +24,7 @@ from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
 from deploy.router import links
 
-
-def wait_for(what: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 60
-    while not what():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+wait_for = partial(until, seconds=60.0)
 
 
 def test_one_link_carries_everything() -> None:
@@ -57,6 +51,7 @@ def test_one_link_carries_everything() -> None:
 
                 wait_for(told)
                 wait_for(lambda: learner.presence.members("actor"))
+                wait_for(lambda: replay.presence.members("actor"))  # by which it shares out what may be in flight
                 assert links(router) == "connected: 2 services, 1 actor"
         finally:
             close(router)
@@ -96,6 +91,10 @@ def test_a_run_behind_a_router(tmp_path: Path) -> None:
                 pool.submit(run_command, "coop-replay", *serving, cwd=tmp_path)
                 for address in health[1:3]:
                     wait_for(partial(is_ready, address))
+                another = open_client((router,), None, False, 10.0, Stop())
+                assert another is not None
+                assert len(another.info.routers_zid()) == 1, "not a peer, which would forward as well"
+                close(another)
                 done = trained.result()
                 assert done.returncode == 0
                 actor.result()

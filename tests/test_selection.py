@@ -170,7 +170,7 @@ def test_sum_tree_equals_running_sums(capacity: int, updates: list[tuple[int, fl
 
 
 @pytest.mark.parametrize("value", [2.0, 2.0**-20])
-@pytest.mark.parametrize("capacity", [1, 16, 17, 300, 5000])
+@pytest.mark.parametrize("capacity", [1, 16, 17, 300, 5000, 70_000])
 def test_sum_tree_finds_every_row(capacity: int, value: float) -> None:
     tree = SumTree(capacity)
     tree.update(np.arange(capacity), np.full(capacity, value))

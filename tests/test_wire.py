@@ -47,6 +47,13 @@ def test_arrays_are_aligned_and_viewed_in_place() -> None:
     assert 0 < start < len(payload)
 
 
+def test_arrays_need_not_be_contiguous() -> None:
+    array = np.arange(24, dtype=np.int32).reshape(4, 6)
+    for part in (array.T, array[::2, 1:3], array[0, 0]):
+        sent = wire.decode(bytes(wire.encode("k", "r", {}, {"a": np.asarray(part)}))).arrays["a"]
+        np.testing.assert_array_equal(sent, part)
+
+
 def _with(**changes: object) -> bytes:
     header = {"protocol": wire.PROTOCOL, "kind": "k", "run": "r", "fields": {}, "arrays": [], **changes}
     return _packed(msgpack.packb({name: value for name, value in header.items() if value is not ...}))

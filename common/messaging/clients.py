@@ -68,6 +68,8 @@ class _Sent:
 class InsertClient:
     """Sends each segment until it is acknowledged, with at most `window` segments in flight.
 
+    The first one goes alone; each acknowledgement says how many the replay service permits from then on.
+
     Args:
         on_wait: called repeatedly while inserts wait.
 
@@ -84,6 +86,7 @@ class InsertClient:
         self._node = node
         self._stop = stop
         self._window = window
+        self._permitted = 1
         self._on_wait = on_wait
         self._key = replay_key(node, "insert")
         self._outstanding: deque[_Sent] = deque()
@@ -96,7 +99,7 @@ class InsertClient:
             Refused: the replay service rejected a segment as invalid.
         """
         self._collect_acks()
-        while len(self._outstanding) >= self._window:
+        while len(self._outstanding) >= self._permitted:
             if not self._await_ack(self._outstanding[0]):
                 return False
             self._outstanding.popleft()
@@ -162,7 +165,9 @@ class InsertClient:
         if message.kind == Retry.kind:
             self.waiting = Retry.decode(message).reason
             return False
-        self.inserted = max(self.inserted, Ack.decode(message).inserted)
+        ack = Ack.decode(message)
+        self.inserted = max(self.inserted, ack.inserted)
+        self._permitted = min(self._window, ack.window or self._window)
         self.acked += sent.steps
         self.waiting = ""
         self._backoff.reset()

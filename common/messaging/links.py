@@ -21,10 +21,9 @@ from typing import Any
 
 import zenoh
 
-PATIENCE = 1.0  # seconds for a thread to end once its session is closed
+PATIENCE = 1.0  # seconds for the thread to end once the last session is closed
 PAUSE = 0.2  # seconds between looks at this process's sockets, far less than a peer's lease
 _LINGER_OFF = struct.pack("ii", 0, 0)
-_followers: dict[str, tuple[threading.Thread, threading.Event]] = {}  # by the session's id
 
 
 def described(session: zenoh.Session, mode: str = "peer") -> dict[str, Any]:
@@ -47,33 +46,62 @@ def permit_many() -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
+class _Follower:
+    """Treats the sockets after each change of a session's links, and at most every `PAUSE` seconds.
+
+    One thread for all sessions of the process, from the first one's opening to the last one's closing.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._listeners: dict[str, Any] = {}  # by the session's id
+        self._changed = threading.Event()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def add(self, session: zenoh.Session) -> None:
+        """Follow a session's links."""
+        changed: Any = zenoh.handlers.Callback(lambda _: self._changed.set(), indirect=False)
+        listener = session.info.declare_link_events_listener(changed, history=True)
+        with self._lock:
+            self._listeners[str(session.zid())] = listener
+            if self._thread is None:
+                self._closing.clear()
+                self._thread = threading.Thread(target=self._run, name="links", daemon=True)
+                self._thread.start()
+
+    def drop(self, identity: str) -> None:
+        """Forget a session; with the last one, end the thread."""
+        with self._lock:
+            self._listeners.pop(identity, None)
+            if self._listeners or self._thread is None:
+                return
+            self._closing.set()
+            self._changed.set()
+            self._thread.join(PATIENCE)
+            self._thread = None
+
+    def _run(self) -> None:
+        while self._changed.wait() and not self._closing.is_set():
+            self._changed.clear()
+            _linger_off()
+            self._closing.wait(PAUSE)
+
+
+_follower = _Follower()
+
+
 def never_linger(session: zenoh.Session) -> None:
     """Make Zenoh close all present and future links of this session at once; the kernel still delivers what it can."""
-    changes = session.info.declare_link_events_listener(zenoh.handlers.RingChannel(1), history=True)
-    closing = threading.Event()
-    thread = threading.Thread(target=_follow, args=(changes, closing), name="links", daemon=True)
-    _followers[str(session.zid())] = thread, closing
-    thread.start()
-
-
-def _follow(changes: Any, closing: threading.Event) -> None:  # noqa: ANN401 (zenoh's listener)
-    """Treat the sockets after each change of the links, and at most every `PAUSE` seconds, until the session closes."""
-    with contextlib.suppress(zenoh.ZError):
-        while not closing.is_set():
-            changes.recv()
-            _linger_off()
-            closing.wait(PAUSE)
+    _follower.add(session)
 
 
 def close(session: zenoh.Session) -> None:
     """Close a session; takes up to 10 s while it connects to a host that does not answer."""
-    thread, closing = _followers.pop(str(session.zid()), (None, None))
-    if closing is not None:
-        closing.set()
+    identity = str(session.zid())
     with contextlib.suppress(zenoh.ZError):  # it then says that it took too long
         session.close()  # type: ignore[no-untyped-call]
-    if thread is not None:
-        thread.join(PATIENCE)  # a thread that comes back from Zenoh while the interpreter ends would abort the process
+    _follower.drop(identity)
 
 
 def _linger_off() -> None:

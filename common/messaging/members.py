@@ -11,6 +11,7 @@ from msgspec import Meta
 from common.bounded import Name
 
 ROLES = ("learner", "replay", "actor", "evaluator")
+ROUTE = "route"  # in place of a role: an actor's own connection to the replay service
 # Roles that ask the learner for the run's data; "watch" takes no part.
 JOINING = ("replay", "actor", "evaluator", "watch")
 

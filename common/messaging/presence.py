@@ -12,7 +12,7 @@ from collections.abc import Callable
 import zenoh
 
 from common.messaging.faults import Faults
-from common.messaging.members import ROLES
+from common.messaging.members import ROLES, ROUTE
 
 LEASE = 1.5  # seconds of silence after which a link is given up and the learner's last answer expires
 
@@ -31,7 +31,7 @@ class Presence:
         self._lock = threading.Lock()
         self._on_change: Callable[[int, bool], None] = lambda incarnation, there: None
         self._began = time.monotonic()
-        for role in ROLES:  # one subscriber each: access control may let a process see only some roles
+        for role in (*ROLES, ROUTE):  # one subscriber each: access control may let a process see only some roles
             session.liveliness().declare_subscriber(
                 f"{prefix}/{role}/*", faults.guarded("watching who is there", self._on_token), history=True
             )
@@ -41,7 +41,7 @@ class Presence:
         self._on_change = call
 
     def counts(self) -> dict[str, int]:
-        """Number of connected processes by role."""
+        """Number of connected processes by role, and of connections of actors by `ROUTE`."""
         with self._lock:
             return {role: len(incarnations) for role, incarnations in self._there.items() if incarnations}
 

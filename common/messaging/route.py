@@ -14,6 +14,7 @@ from typing import Self
 import zenoh
 
 from common.errors import JoinError
+from common.messaging.members import ROUTE
 from common.messaging.session import open_session
 from common.messaging.transport import NoAnswer, Node, Pending
 from common.process.lifecycle import Stop
@@ -96,7 +97,7 @@ class ReplayRoute:
         self._node.close()
 
     def _open(self, endpoints: Sequence[str]) -> Node:
-        return Node(self._open_route(endpoints), self.run, "route", self._incarnation)
+        return Node(self._open_route(endpoints), self.run, ROUTE, self._incarnation)
 
 
 class RoutedReplay:

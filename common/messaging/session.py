@@ -16,6 +16,7 @@ from common.messaging.presence import LEASE
 from common.messaging.transport import NoAnswer
 
 MAX_LINKS = 1 << 16  # of a session; Zenoh's own limit is 1,000
+LONG_QUEUE, SHORT_QUEUE = 16, 4  # parts of messages, of 64 KiB each, that a link keeps memory for once it has sent them
 
 _QUIET = {
     "scouting/multicast/enabled": False,
@@ -26,9 +27,7 @@ _QUIET = {
     "listen/exit_on_failure": True,
     "transport/unicast/max_sessions": MAX_LINKS,
     "transport/link/tx/lease": round(1000 * LEASE),
-    "transport/link/rx/buffer_size": 1 << 18,  # of each link, at once
     "transport/link/rx/max_message_size": MAX_PAYLOAD + (1 << 16),
-    "transport/link/tx/queue/size/data": 16,
     "transport/shared_memory/enabled": False,
 }
 
@@ -39,10 +38,12 @@ def open_session(
     zenoh_config: Path | None = None,
     shared_memory: bool = False,
     mode: str = "peer",
+    send_queue: int = LONG_QUEUE,
 ) -> zenoh.Session:
     """Open a session with explicit endpoints, no scouting and quick reconnection.
 
     mode: "peer"; "router", which forwards between others; "client", which has one link, to a router.
+    send_queue: `SHORT_QUEUE` saves memory where there are many links; batches leave faster with `LONG_QUEUE`.
 
     Raises:
         UsageError: a Zenoh config file or an endpoint is invalid.
@@ -59,6 +60,7 @@ def open_session(
             config.insert_json5(key, json.dumps(value))
         config.insert_json5("mode", json.dumps(mode))
         config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
+        config.insert_json5("transport/link/tx/queue/size/data", str(send_queue))
         config.insert_json5("listen/endpoints", json.dumps(list(listen)))
         config.insert_json5("connect/endpoints", json.dumps(list(connect)))
         config.insert_json5("connect/timeout_ms", "1000" if mode == "client" else "-1")  # a client waits for its link

@@ -21,17 +21,19 @@ from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage
 from common.types import Array
 
-PROTOCOL = 5
-ON_DISK = frozenset({1, 2, 3, 4, 5})  # protocols whose segments and batches in journals and snapshots can be read
+PROTOCOL = 6
+ON_DISK = frozenset({1, 2, 3, 4, 5, 6})  # protocols whose segments and batches in journals and snapshots can be read
 MAGIC = 0x434F4F50  # "COOP"
 ALIGNMENT = 64
 MAX_HEADER = 1 << 20
 MAX_ARRAYS = 64
 MAX_DIMENSIONS = 8
 MAX_NAME = 64
-DTYPES = frozenset({"uint8", "bool", "int32", "int64", "uint64", "float32", "float64"})
-# A table, because numpy derives a dtype's name anew each time, which takes as long as a small message.
-_DTYPES = {name: np.dtype(name).newbyteorder("<") for name in DTYPES}
+# Tables, because numpy derives a dtype and its name anew each time, which takes as long as a small message.
+DTYPES = {
+    name: np.dtype(name).newbyteorder("<")
+    for name in ("uint8", "bool", "int32", "int64", "uint64", "float32", "float64")
+}
 _NAMES = {np.dtype(name): name for name in DTYPES}
 
 _PREFIX = struct.Struct("<II")
@@ -91,17 +93,18 @@ def encode(
     start = _aligned(len(head))
     payload = _sized(into, start + size)
     payload[:start] = head.ljust(start, b"\0")
+    whole = memoryview(payload)
     end = start
     for (_, dtype, shape, offset), array in zip(table, arrays.values(), strict=True):
         begin = start + offset
-        payload[end:begin] = bytes(begin - end)
+        whole[end:begin] = bytes(begin - end)
         end = begin + array.nbytes
-        if array.nbytes:
-            place = np.frombuffer(payload, _DTYPES[dtype], math.prod(shape), begin).reshape(shape)
-            if isinstance(array, np.ndarray):
-                place[...] = array
-            else:
-                array.copy_to(place)
+        if not array.nbytes:
+            continue
+        if isinstance(array, np.ndarray):
+            whole[begin:end] = np.ascontiguousarray(array, DTYPES[dtype]).data.cast("B")
+        else:
+            array.copy_to(np.ndarray(shape, DTYPES[dtype], payload, begin))
     return payload
 
 
@@ -171,19 +174,19 @@ def _view(payload: bytes, start: int, entry: Any) -> tuple[str, Array]:  # noqa:
         raise BadMessage(f"arrays.{name}", f"dtype {shown(dtype)}; allowed: {', '.join(sorted(DTYPES))}")
     if not isinstance(shape, list) or len(shape) > MAX_DIMENSIONS or not all(map(_is_length, shape)):
         raise BadMessage(f"arrays.{name}", f"shape {shown(shape)}")
-    if math.prod(filter(None, shape)) > MAX_PAYLOAD:  # numpy refuses even an empty array of such a shape
-        raise BadMessage(f"arrays.{name}", f"shape {shape}; at most {MAX_PAYLOAD} items")
     size = math.prod(shape)
+    if (size or math.prod(filter(None, shape))) > MAX_PAYLOAD:  # numpy refuses even an empty array of such a shape
+        raise BadMessage(f"arrays.{name}", f"shape {shape}; at most {MAX_PAYLOAD} items")
     if not _is_length(offset) or offset % ALIGNMENT:
         raise BadMessage(f"arrays.{name}", f"offset {shown(offset)}; a multiple of {ALIGNMENT}")
-    kind = _DTYPES[dtype]
+    kind = DTYPES[dtype]
     if size and start + offset + size * kind.itemsize > len(payload):
         raise BadMessage(
             f"arrays.{name}", f"{dtype}{shape} at {offset} reaches beyond the payload's {len(payload)} bytes"
         )
     if not size:
         return name, np.empty(shape, kind)
-    return name, np.frombuffer(payload, kind, size, start + offset).reshape(shape)
+    return name, np.ndarray(shape, kind, payload, start + offset)
 
 
 def _is_length(value: Any) -> bool:  # noqa: ANN401 (whatever the peer sent)

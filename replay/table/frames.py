@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 from types import TracebackType
 from typing import Any
@@ -28,8 +29,8 @@ class FrameStore:
     def __init__(self, frame_shape: tuple[int, ...], frame_dtype: str) -> None:
         self.frame_shape = frame_shape
         self.dtype = np.dtype(frame_dtype)
-        self._elements = int(np.prod(frame_shape))
-        self.frame_bytes = self._elements * self.dtype.itemsize
+        self.frame_bytes = math.prod(frame_shape) * self.dtype.itemsize
+        self._whole = np.dtype((np.void, self.frame_bytes))  # a frame as one item, which numpy copies fastest
         self._used = 0  # slots ever used; those above were never written
         self._free_count = 0
         self._references = np.zeros(FIRST_SLOTS, np.int32)
@@ -66,7 +67,7 @@ class FrameStore:
         if fresh:
             slots[recycled:] = np.arange(self._used, self._used + fresh)
             self._used += fresh
-        self._rows[slots] = frames.reshape(count, self._elements)
+        self._rows[slots] = self._items(frames)
         self._references[slots] = references
         return slots
 
@@ -76,11 +77,11 @@ class FrameStore:
 
     def drop(self, slots: Slots) -> None:
         """Remove one reference for each occurrence of a slot; slots without references become free."""
-        np.subtract.at(self._references, slots, 1)
+        np.subtract.at(self._references, slots, np.int32(1))  # a Python 1 would be an int64, and take six times as long
         gone = slots[self._references[slots] == 0]
         if len(gone):
             if len(gone) > 1:
-                gone = self._distinct(gone)
+                gone, _ = self._distinct(gone)
             self._free[self._free_count : self._free_count + len(gone)] = gone
             self._free_count += len(gone)
 
@@ -91,30 +92,33 @@ class FrameStore:
         the time of sorting.
         """
         flat = slots.reshape(-1)
-        distinct = self._distinct(flat)
-        self._mark[distinct] = np.arange(len(distinct), dtype=np.int32)
+        distinct, order = self._distinct(flat)
+        self._mark[distinct] = order[: len(distinct)]
         return distinct, self._mark[flat].reshape(slots.shape)
 
     def read(self, slots: Slots, out: Array | None = None) -> Array:
         """Copy the frames in `slots`, [n, *frame_shape], to `out`, contiguous memory, or to a new array."""
         if out is None:
-            return self._rows.take(slots, axis=0).reshape(len(slots), *self.frame_shape)
-        # mode: without it numpy first copies to a buffer
-        self._rows.take(slots, axis=0, out=out.reshape(len(slots), self._elements), mode="clip")
+            return self._rows.take(slots).view(self.dtype).reshape(len(slots), *self.frame_shape)
+        self._rows.take(slots, out=self._items(out), mode="clip")  # mode: without it numpy first copies to a buffer
         return out
 
     def pin(self, slots: Slots) -> PinnedFrames:
         """Keep the frames of distinct slots unchanged, to be copied later."""
         return PinnedFrames(self, slots)
 
-    def _distinct(self, slots: Slots) -> Slots:
+    def _distinct(self, slots: Slots) -> tuple[Slots, NDArray[np.int32]]:
+        """The distinct slots among slots intp [n], and the numbers 0..n-1."""
         order = np.arange(len(slots), dtype=np.int32)
         self._mark[slots] = order  # the last of equal slots wins
-        distinct: Slots = slots[self._mark[slots] == order]
-        return distinct
+        return slots[self._mark[slots] == order], order
 
-    def _view(self, slots: int) -> Array:
-        return np.frombuffer(self._memory, self.dtype, slots * self._elements).reshape(slots, self._elements)
+    def _items(self, frames: Array) -> NDArray[np.void]:
+        """Frames [n, *frame_shape] as void [n], without a copy if they are contiguous."""
+        return np.ascontiguousarray(frames).reshape(-1).view(self._whole)
+
+    def _view(self, slots: int) -> NDArray[np.void]:
+        return np.frombuffer(self._memory, self._whole, slots)
 
     def _grow(self, needed: int) -> None:
         slots = max(needed, int(len(self._references) * GROWTH))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from replay.table.policies import Eviction, Floats, Rows, Sampling, TableView
 
 PRIORITY_FLOOR = 1e-6
+SEARCHED = 4096  # nodes
 
 
 class Fifo(Eviction):
@@ -79,7 +80,9 @@ class Uniform(Sampling):
         else:
             everything = np.tile(np.arange(size), count // size)
             rows = np.concatenate((everything, self.table.rng.choice(size, count % size, replace=False)))
-        return rows, np.ones(count, np.float32)
+        weights = np.empty(count, np.float32)
+        weights.fill(1)  # np.ones takes three times as long
+        return rows, weights
 
 
 class Proportional(Sampling):
@@ -96,9 +99,10 @@ class Proportional(Sampling):
 
     def draw(self, count: int, size: int) -> tuple[Rows, NDArray[np.float32]]:
         """Draw once from each share, with importance-sampling weights."""
+        total = self._tree.total
         shares = (np.arange(count) + self.table.rng.random(count)) / count
-        rows = self._tree.find(shares * self._tree.total)
-        weights = (size * self._tree.values(rows) / self._tree.total) ** -self._beta
+        rows = self._tree.find(shares * total)
+        weights = (size * self._tree.values(rows) / total) ** -self._beta
         return rows, (weights / weights.max()).astype(np.float32)
 
     def prioritise(self, rows: Rows, priorities: Floats) -> None:
@@ -110,7 +114,8 @@ class SumTree:
     """Sums of non-negative values, sixteen to a node: values are set and found by running sum in O(log n).
 
     Every node is always the sum of its sixteen, added from left to right, so the tree depends only on its values, not
-    on the order of updates: a restored tree equals the saved one to the bit.
+    on the order of updates: a restored tree equals the saved one to the bit. A search begins at the lowest level of at
+    most `SEARCHED` nodes, whose running sums take as long as a level's descent.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -119,6 +124,7 @@ class SumTree:
         while not self._levels or groups > 1:
             groups = -(-groups // 16)
             self._levels.append(np.zeros((groups, 16)))
+        self._searched = next(number for number, level in enumerate(self._levels) if level.size <= SEARCHED)
 
     @property
     def total(self) -> float:
@@ -135,17 +141,23 @@ class SumTree:
         self._levels[0].ravel()[rows] = values
         for below, above in pairwise(self._levels):
             rows = rows >> 4
-            above.ravel()[rows] = below[rows].cumsum(axis=1)[:, -1]
+            above.ravel()[rows] = below.take(rows, axis=0).cumsum(axis=1)[:, -1]
 
     def find(self, sums: Floats) -> Rows:
         """For each running sum in [0, total), the row whose value covers it; never a row whose value is 0."""
         lines = np.arange(len(sums))
-        nodes = np.zeros(len(sums), np.intp)
-        for level in reversed(self._levels):
-            running = level[nodes].cumsum(axis=1)
-            # Rounding may move a sum to the end of its node, which no value covers.
+        top = self._levels[self._searched]
+        running = np.zeros(1 + top.size)  # the sum before each node, and the total
+        top.cumsum(out=running[1:])
+        # Rounding may move a sum to the end of its node, which no value covers.
+        sums = np.minimum(sums, np.nextafter(running[-1], 0))
+        nodes = running.searchsorted(sums, "right") - 1
+        sums = sums - running[nodes]
+        for level in reversed(self._levels[: self._searched]):
+            running = np.zeros((len(sums), 17))
+            level.take(nodes, axis=0).cumsum(axis=1, out=running[:, 1:])
             sums = np.minimum(sums, np.nextafter(running[:, -1], 0))
-            child = np.count_nonzero(running <= sums[:, None], axis=1)
-            sums = sums - np.where(child > 0, running[lines, child - 1], 0)
+            child = (running[:, 1:] > sums[:, None]).argmax(axis=1)
+            sums = sums - running[lines, child]
             nodes = nodes * 16 + child
         return nodes

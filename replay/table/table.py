@@ -165,8 +165,8 @@ class Table:
         columns = self._columns.read(rows)
         return distinct, {
             **columns,
-            "obs_index": np.ascontiguousarray(index[:, : self.spec.stack]),
-            "next_index": np.ascontiguousarray(index[:, self.spec.stack :]),
+            "obs_index": index[:, : self.spec.stack].copy(),
+            "next_index": index[:, self.spec.stack :].copy(),
             "weights": weights,
             "age": self.inserted - 1 - columns["ids"],
         }
@@ -179,7 +179,7 @@ class Table:
         not finite, and for different lengths.
         """
         given = np.asarray(priorities, np.float64)
-        if len(ids) != len(given) or not np.all(np.isfinite(given) & (given >= 0)):
+        if len(ids) != len(given) or not ((given >= 0) & (given < np.inf)).all():
             raise ValueError("priorities: must be finite, at least 0, and one for each id")
         if not self._prioritized:
             return
@@ -187,11 +187,11 @@ class Table:
             rows = ids.astype(np.intp) % self.capacity
         else:
             rows = np.array([self._row_of.get(number, self.capacity) for number in ids.tolist()], np.intp)
-        held = np.flatnonzero(rows < len(self))
-        held = held[self._columns.ids[rows[held]] == ids[held]]
-        if len(held):
-            self._max_priority = max(self._max_priority, float(given[held].max()))
-            self._set_priorities(rows[held], given[held])
+        held = (rows < len(self)) & (self._columns.ids.take(rows, mode="clip") == ids)
+        rows, given = rows[held], given[held]
+        if len(rows):
+            self._max_priority = max(self._max_priority, float(given.max()))
+            self._set_priorities(rows, given)
 
     def stats(self) -> TableStats:
         """Compute counts and diagnostics, in time proportional to the number of transitions held."""

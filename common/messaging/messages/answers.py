@@ -16,12 +16,14 @@ LONGEST_PROBLEM = 4096  # characters
 class Ack(Body, frozen=True):
     """The receipt for a segment or for a request that succeeded.
 
-    inserted: the table's count of accepted transitions.
+    inserted: the table's count of accepted transitions. window: segments that the sender may have in flight from now
+    on; 0 for any number.
     """
 
     kind: ClassVar[str] = "ack"
 
     inserted: Counter
+    window: Counter = 0
 
 
 class Retry(Body, frozen=True):

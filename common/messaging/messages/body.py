@@ -57,7 +57,7 @@ def check_arrays(message: Message, layout: Layout, optional: Set[str] = frozense
         array = message.arrays.get(name)
         if array is None:
             continue
-        if array.dtype != dtype:
+        if array.dtype != wire.DTYPES[dtype]:
             raise BadMessage(f"arrays.{name}", f"dtype {array.dtype.name} instead of {dtype}")
         expected = tuple(
             lengths.setdefault(length, have) if isinstance(length, str) else length

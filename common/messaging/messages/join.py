@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Self
 
 import msgspec
@@ -68,13 +69,13 @@ class Joined(Body, frozen=True):
     learner: Origin = msgspec.field(default_factory=Origin.here)
     replay: Origin | None = None
 
-    def answer(self) -> bytearray:
-        """Build the message; the config gives the run's name."""
-        return self.encode(self.config.run)
-
     def encode(self, run: str) -> bytearray:
         """Build the message."""
-        return wire.encode(self.kind, run, {**msgspec.structs.asdict(self), "config": to_tables(self.config)})
+        return self.answer(run, to_tables(self.config))
+
+    def answer(self, run: str, tables: Mapping[str, Any]) -> bytearray:
+        """Build the message with the config's tables, which take longer to make than all the rest."""
+        return wire.encode(self.kind, run, {**msgspec.structs.asdict(self), "config": tables})
 
     @classmethod
     def decode(cls, message: Message) -> Self:
