@@ -32,7 +32,7 @@ def test_keyword_arguments_on_the_command_line_in_files_and_in_messages(monkeypa
     assert hash(config) == hash(resolve(tomllib.loads(to_toml(config))))
     assert resolve(tomllib.loads(to_toml(config))) == config
     joined = Joined(config, EnvSpec("x", (2, 2, 3), "bool", 2, 2), "0", 0, [], 1, 0)
-    received = Joined.decode(wire.decode(bytes(joined.answer())))
+    received = Joined.decode(wire.decode(bytes(joined.encode("r"))))
     assert (received.config, received.spec) == (config, joined.spec)
 
 

@@ -8,7 +8,9 @@ import pytest
 from common.errors import RunError, UsageError
 from experiments.report import cli
 from experiments.report.packed import FILES, PackedStudy, pack, unpack
+from experiments.report.study import load_study
 from experiments.report.writer import write_report
+from experiments.sweep.grid import load_grid
 
 CONFIG = 'method = "{method}"\nseed = {seed}\ntotal_steps = 4000\n'
 HEADER = "episode,env_step,actor,return,epsilon,s,q1_mean,q2_mean\n"
@@ -73,6 +75,14 @@ def folder(tmp_path: Path) -> Path:
     )
     (tmp_path / "study" / "sweep.toml").write_text('methods = ["dqn"]\nseeds = [0, 1, 2, 3, 4, 5]\n')
     return tmp_path / "study"
+
+
+def test_a_study_outlives_the_rules_for_its_cells(folder: Path) -> None:
+    grid = folder / "sweep.toml"
+    grid.write_text(f"{grid.read_text()}fixed.learner.batch_size = 0\n")
+    assert load_study(folder).runs, "the runs say themselves what they were"
+    with pytest.raises(UsageError, match=r"learner\.batch_size = 0"):
+        load_grid(str(grid))
 
 
 def test_every_file_comes_back(folder: Path, tmp_path: Path) -> None:

@@ -9,10 +9,10 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from rliable import library, metrics
 
 from common.errors import RunError, UsageError
 from common.returns import running_mean
@@ -245,10 +245,18 @@ def test_a_breaking_point_has_an_interval() -> None:
     assert found == (50, 50, 500, False)
 
 
+def rliable() -> tuple[Any, Any]:
+    """Its `library` and `metrics`, which take two seconds: every worker collects this file, one runs it."""
+    from rliable import library, metrics  # noqa: PLC0415
+
+    return library, metrics
+
+
 def of_rliable(function: Callable[..., np.ndarray], *scores: np.ndarray) -> Interval:
     """What rliable gives, which draws from numpy's global generator."""
     np.random.seed(0)
     drawn = scores if len(scores) > 1 else scores[0]
+    library, _ = rliable()
     values, bounds = library.get_interval_estimates({"x": drawn}, function, reps=REPS)
     return Interval(values["x"], *bounds["x"])
 
@@ -259,6 +267,7 @@ def assert_equal(ours: Interval, theirs: Interval) -> None:
 
 
 def test_statistics_and_intervals_are_rliables() -> None:
+    library, metrics = rliable()
     generator = np.random.default_rng(3)
     x, y = generator.integers(0, 9, (7, 3)).astype(np.float64), generator.integers(0, 9, (5, 3)).astype(np.float64)
     assert_equal(iqm_overall(x), of_rliable(lambda sample: np.array([metrics.aggregate_iqm(sample)]), x))

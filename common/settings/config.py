@@ -188,7 +188,7 @@ class ActorSettings:
     segment_steps: Annotated[int, Field(gt=0, le=MAX_SEGMENT_STEPS)] = 16
     """Steps of one emulator that are sent together."""
     window: Annotated[int, Field(gt=0, le=MAX_GAPS)] = 2
-    """Unacknowledged segments that an actor may have in flight."""
+    """Unacknowledged segments that an actor may have in flight, for each emulator; many actors get fewer."""
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,10 @@ from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
@@ -26,6 +28,7 @@ OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
 COLUMNS = 3  # of panels
 WIDTH = 7.2  # inches, of a page's text; a single panel has two thirds of it
 HEIGHT = 1.9  # inches, of a panel
+DPI = 170
 TICK = 0.24  # inches, of a line of a label on the y axis
 LONG_TICK = 24  # letters in such a line
 DECADE = 10
@@ -110,16 +113,14 @@ class Figure:
 
 def draw(figure: Figure, path: Path) -> None:
     """Write a figure as a PNG, and beside it as a PDF; the same data give the same bytes."""
-    mpl.use("Agg")
     number, columns = len(figure.panels), figure.columns
     rows = math.ceil(number / columns)
     lines = [sum(1 + _wrapped(tick).count("\n") for tick in panel.ticks) for panel in figure.panels]
     tall = max(HEIGHT, 0.6 + TICK * max(lines))
     size = (figure.width, tall * rows + 0.4)
     with mpl.rc_context(STYLE):
-        canvas, grid = plt.subplots(
-            rows, columns, squeeze=False, figsize=size, layout="constrained", sharey=figure.same_y
-        )
+        canvas = Canvas(size, DPI, layout="constrained")
+        grid = canvas.subplots(rows, columns, squeeze=False, sharey=figure.same_y)
         colours: dict[str, str] = {}
         handles: dict[str, Line2D] = {}
         for place, (axes, panel) in enumerate(zip(grid.flat, figure.panels, strict=False)):
@@ -139,10 +140,10 @@ def draw(figure: Figure, path: Path) -> None:
             axes.axis("off")
         if len(handles) > 1 and not any(set(panel.ticks) >= handles.keys() for panel in figure.panels):
             canvas.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=6)
-        canvas.savefig(path, dpi=170, metadata={"Software": None})
-        canvas.set_layout_engine("none")  # which has placed everything, and takes half of the time
-        canvas.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
-        plt.close(canvas)
+        # Not by `savefig`, which draws each file twice; after the first one everything has its place.
+        FigureCanvasAgg(canvas).print_png(path, metadata={"Software": None})  # type: ignore[no-untyped-call]
+        canvas.set_layout_engine("none")
+        FigureCanvasPdf(canvas).print_pdf(path.with_suffix(".pdf"), metadata={"CreationDate": None})  # type: ignore[no-untyped-call]
 
 
 def _draw_line(axes: Axes, panel: Panel, line: Line, colour: str) -> None:

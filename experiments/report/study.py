@@ -173,8 +173,8 @@ def load_study(path: Path) -> Study:
         RunError: no run in it is finished, or a file is torn.
     """
     source = open_source(path)
-    grid = None if source.sweep is None else parse_grid(source.sweep, f"{path}/{SWEEP}")
-    names = source.names if grid is None else [cell.name for cell in grid.cells]
+    grid = None if source.sweep is None else parse_grid(source.sweep, f"{path}/{SWEEP}", check=False)
+    names = source.names if grid is None else [choice.name for choice in grid.choices]
     if not names:
         raise UsageError(f"{path}: holds no run and no {SWEEP}")
     runs, missing, diverged = [], {}, {}

@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import re
 import tomllib
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -60,11 +61,30 @@ class Cell:
 
 
 @dataclass(frozen=True)
+class Choice:
+    """What distinguishes a cell from the others; `values` of the fields that vary, `name` of its folder."""
+
+    name: str
+    method: str
+    seed: int
+    values: Mapping[FieldPath, Any]
+
+
+@dataclass(frozen=True)
 class Grid:
-    """A checked grid: its file's contents, and its cells, ordered by seed first."""
+    """A grid: its file's contents, and its cells, ordered by seed first."""
 
     file: GridFile
-    cells: tuple[Cell, ...]
+
+    @cached_property
+    def choices(self) -> tuple[Choice, ...]:
+        """The cells by their names, their values not yet checked. Raises UsageError for axes that are no lists."""
+        return tuple(_choices(self.file))
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """The cells, checked. Raises UsageError."""
+        return _cells(self.file, self.choices)
 
     @property
     def varied(self) -> tuple[str, ...]:
@@ -98,8 +118,11 @@ def load_grid(name: str, quick: bool = False) -> Grid:
     return parse_grid(text, name, quick)
 
 
-def parse_grid(text: str, name: str, quick: bool = False) -> Grid:
-    """Check and expand a grid's TOML; name: for error messages. Raises UsageError as `load_grid`."""
+def parse_grid(text: str, name: str, quick: bool = False, check: bool = True) -> Grid:
+    """Read and expand a grid's TOML; name: for error messages. Raises UsageError as `load_grid`.
+
+    check: its cells too, which takes milliseconds each; without it only `choices` is known to be valid.
+    """
     try:
         tables = tomllib.loads(text)
         small = tables.pop("quick", None)
@@ -111,7 +134,9 @@ def parse_grid(text: str, name: str, quick: bool = False) -> Grid:
             file = pydantic.TypeAdapter(GridFile).validate_python(tables)
         except pydantic.ValidationError as error:
             raise UsageError(first_problem(error, GridFile())) from error
-        return Grid(file, _cells(file))
+        grid = Grid(file)
+        _ = grid.cells if check else grid.choices
+        return grid
     except (tomllib.TOMLDecodeError, UsageError) as error:
         raise UsageError(f"grid {name}: {error}") from error
 
@@ -125,9 +150,20 @@ def _text(name: str) -> str:
     return Path(name).read_text(encoding="utf-8")
 
 
-def _cells(file: GridFile) -> tuple[Cell, ...]:
+def _choices(file: GridFile) -> Iterator[Choice]:
     axes = _axes(file)
     names = dict(zip(axes, _short_names(tuple(axes)), strict=True))
+    for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
+        chosen = dict(zip(axes, values, strict=True))
+        if METHODS.get(method).stream is not None:
+            if any(value != axes[path][0] for path, value in chosen.items() if path[0] == "replay"):
+                continue  # it has no replay buffer: one cell for all settings of the others'
+            chosen = {path: value for path, value in chosen.items() if path[0] != "replay"}
+        parts = [f"{names[path]}={_word(value)}" for path, value in chosen.items()]
+        yield Choice("-".join([method, *parts, f"seed={seed}"]), method, seed, chosen)
+
+
+def _cells(file: GridFile, choices: Iterable[Choice]) -> tuple[Cell, ...]:
     preset = load_tables(file.preset, None)
 
     @cache
@@ -135,21 +171,14 @@ def _cells(file: GridFile) -> tuple[Cell, ...]:
         return to_tables(resolve(preset if total_steps is None else shortened(preset, total_steps), method))
 
     cells = []
-    for seed, *values, method in itertools.product(file.seeds, *axes.values(), file.methods):
-        chosen = dict(zip(axes, values, strict=True))
-        if METHODS.get(method).stream is not None:
-            if any(value != axes[path][0] for path, value in chosen.items() if path[0] == "replay"):
-                continue  # it has no replay buffer: one cell for all settings of the others'
-            chosen = {path: value for path, value in chosen.items() if path[0] != "replay"}
-        total_steps = chosen.get(("total_steps",), file.fixed.get("total_steps"))
+    for choice in choices:
+        total_steps = choice.values.get(("total_steps",), file.fixed.get("total_steps"))
         fits = type(total_steps) is int and total_steps > 0  # other values are refused below
-        start = base(method, total_steps if fits else None)
+        start = base(choice.method, total_steps if fits else None)
         tables = merged(start, current(file.fixed, start["learner"]["optimizer"]))
-        for path, value in chosen.items():
+        for path, value in choice.values.items():
             tables = merged(tables, current(nested(path, value), tables["learner"]["optimizer"]))
-        parts = [f"{names[path]}={_word(value)}" for path, value in chosen.items()]
-        config = validated({**of_method(tables, method), "seed": seed})
-        cells.append(Cell("-".join([method, *parts, f"seed={seed}"]), config))
+        cells.append(Cell(choice.name, validated({**of_method(tables, choice.method), "seed": choice.seed})))
     for cell in cells:
         check_distributed(cell.config) if file.mode == "distributed" else _check_lockstep(cell.config)
     _check_environments(cells)
