@@ -6,8 +6,10 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 STAMP = $(shell date +%Y%m%d-%H%M%S)
+# The tests start hundreds of processes: they share what Python has compiled, also where it is told not to keep it.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants docs dist
+.PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants bench docs dist
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -54,6 +56,12 @@ compose-test:
 mutants: $(READY)
 	@$(PIP) --editable '.[dev,mutants]' > $(VENV)/mutants.log 2>&1 || { cat $(VENV)/mutants.log; exit 1; }
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/mutants.py
+
+# coop beside what people would use instead, whose packages get environments of their own. AREAS="table service" is a part of it;
+# AGAINST=benchmarks/results.json writes nothing, but names what has fallen since.
+bench:
+	@PYTHON=$(PYTHON) benchmarks/rivals.sh
+	@PYTHONPATH=benchmarks .bench/bench/bin/python -m bench $(AREAS) $(if $(AGAINST),--against $(AGAINST))
 
 # The documentation as a site, build/site/index.html; a broken link is an error. Says how many code blocks the tests run.
 docs: $(READY)

@@ -16,8 +16,8 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 
-import numpy as np
 import torch
+from made_up import random_batch
 
 from common.networks.network import build_network
 from common.process.threads import use_threads
@@ -33,28 +33,6 @@ BATCH, GAMMA, RATE = 32, 0.99, 0.1
 BLOCKS = 5
 
 Update = Callable[[], object]
-
-
-def random_batch(spec: EnvSpec) -> Batch:
-    """A batch of transitions that share no frames with each other."""
-    rng = np.random.default_rng(0)
-    span = spec.stack + 1
-    shape = (BATCH * span, *spec.frame_shape)
-    frames = rng.standard_normal(shape, np.float32) if spec.frame_dtype == "float32" else rng.integers(256, size=shape)
-    index = np.arange(BATCH * span, dtype=np.int32).reshape(BATCH, span)
-    return Batch(
-        frames=frames.astype(spec.frame_dtype),
-        obs_index=index[:, :-1],
-        next_index=index[:, 1:],
-        actions=rng.integers(spec.num_actions, size=BATCH).astype(np.int32),
-        rewards=rng.random(BATCH).astype(np.float32),
-        terminated=np.zeros(BATCH, np.bool_),
-        weights=np.ones(BATCH, np.float32),
-        ids=np.arange(BATCH),
-        param_version=np.zeros(BATCH, np.int64),
-        age=np.arange(BATCH),
-        reuse=np.ones(BATCH, np.int32),
-    )
 
 
 def settings(kind: str, method: str, double: bool) -> RunConfig:
@@ -86,7 +64,7 @@ class SvdRule(FeedbackRule):
 
 def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:
     """Make a function that does one update, always on the same batch."""
-    batch, config = random_batch(spec), settings(kind, method, double)
+    batch, config = random_batch(spec, BATCH), settings(kind, method, double)
     if method == "autograd":
         return autograd(config, spec, batch)
     agent = Agent(config, spec)

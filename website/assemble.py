@@ -20,7 +20,7 @@ _PARTS = {
     "presets": reference.presets_reference,
     "commands": reference.commands_reference,
 }
-_FILES = ("LICENSE", "CITATION.cff", "docs/**/*.svg", "results/**/*.png", "results/**/*.svg")
+_FILES = ("LICENSE", "CITATION.cff", "docs/**/*.svg", "results/**/*.png", "results/**/*.svg", "benchmarks/plots/*.png")
 
 
 def assembled(page: str) -> str:

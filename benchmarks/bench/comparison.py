@@ -1,0 +1,150 @@
+"""Subjects that do the same work take turns: each is a process of its own, which waits while the others have theirs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+ROOT = Path(__file__).parents[2]
+SUBJECTS = Path(__file__).parent / "subjects"
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+GRACE = 60.0  # seconds for a subject to end after its last turn
+
+# By round, the value of each measure.
+Rounds = dict[str, list[float]]
+
+
+class SubjectError(Exception):
+    """A subject ended before its turns did."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One of those compared.
+
+    Attributes:
+        script: of `subjects/`, without its suffix.
+        arguments: of the script.
+        venv: in .bench/, that holds its libraries.
+        cores: it may run on; all of them if 0.
+    """
+
+    script: str
+    arguments: tuple[str, ...] = ()
+    venv: str = "bench"
+    cores: int = 1
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The same work done by several subjects.
+
+    Attributes:
+        area: which "make bench" measures by itself.
+        title: unique.
+        subjects: by name.
+        reference: the subject whose figures count as 1.
+        rounds: turns of each.
+        seconds: that a turn lasts at least; 0 where a turn is a whole task.
+    """
+
+    area: str
+    title: str
+    subjects: dict[str, Subject]
+    reference: str
+    rounds: int = 5
+    seconds: float = 2.0
+
+
+class Running:
+    """A subject's process."""
+
+    def __init__(self, name: str, subject: Subject, log: Path) -> None:
+        self.name = name
+        python = ROOT / ".bench" / subject.venv / "bin" / "python"
+        path = f"{SUBJECTS.parent}:{SUBJECTS.parents[1]}"
+        pin = ["taskset", "-c", f"0-{subject.cores - 1}"] if subject.cores else []
+        self._log = log
+        with log.open("w") as file:
+            self._process = subprocess.Popen(
+                [*pin, str(python), str(SUBJECTS / f"{subject.script}.py"), *subject.arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=file,
+                text=True,
+                env={**os.environ, **ONE_THREAD, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"},
+            )
+        self._answer()
+
+    def turn(self, seconds: float) -> dict[str, float]:
+        """One turn's measures."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{seconds}\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise self._ended() from None
+        return self._answer()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(GRACE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _answer(self) -> dict[str, float]:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.startswith("{"):  # a library may print something as it is imported
+                answer: dict[str, float] = json.loads(line)
+                return answer
+        raise self._ended()
+
+    def _ended(self) -> SubjectError:
+        status = self._process.wait()
+        words = self._log.read_text(errors="replace").strip().splitlines()[-1:] or ["it said nothing"]
+        return SubjectError(f"{self.name} ended (exit status {status}): {words[0]}; see {self._log}")
+
+
+@contextmanager
+def started(comparison: Comparison, logs: Path) -> Iterator[list[Running]]:
+    """All subjects of a comparison, ready for their first turn."""
+    with ExitStack() as stack:
+        yield [
+            stack.enter_context(Running(name, subject, logs / f"{comparison.title}-{name}.log".replace(" ", "_")))
+            for name, subject in comparison.subjects.items()
+        ]
+
+
+def compare(comparison: Comparison, rounds: int, logs: Path) -> dict[str, Rounds]:
+    """The measures of each subject, round by round, after a short turn of each that does not count.
+
+    The order is reversed every other round, so that nobody always follows the same one.
+
+    Raises:
+        SubjectError: one of them ended.
+    """
+    figures: dict[str, Rounds] = {name: {} for name in comparison.subjects}
+    with started(comparison, logs) as subjects:
+        if comparison.seconds:
+            for subject in subjects:
+                subject.turn(comparison.seconds / 2)
+        for number in range(rounds):
+            for subject in subjects[:: -1 if number % 2 else 1]:
+                for measure, value in subject.turn(comparison.seconds).items():
+                    figures[subject.name].setdefault(measure, []).append(value)
+            print(".", end="", file=sys.stderr, flush=True)
+    return figures

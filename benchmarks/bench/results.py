@@ -1,0 +1,187 @@
+"""The figures of `make bench`: kept as JSON, shown as tables of medians and ranges, and compared with earlier ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import subprocess
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from bench.areas import TARGETS, Target
+from bench.comparison import ROOT, Comparison, Rounds
+
+FIGURES = Path(__file__).parents[1] / "results.json"
+PAGE = Path(__file__).parents[1] / "RESULTS.md"
+PACKAGES = {
+    "bench": ("coop-rl", "torch", "numpy", "eclipse-zenoh", "stable-baselines3", "torchrl", "cpprb", "gymnasium"),
+    "reverb": ("dm-reverb", "tensorflow", "numpy"),
+}
+UNIT_COST = "us a unit"  # of the area growth
+Figures = dict[str, Any]  # by title of a comparison: area, reference, seconds, and "subjects": {name: Rounds}
+
+
+def load(path: Path) -> Figures:
+    """The figures of a file; none if there is no such file."""
+    found: Figures = json.loads(path.read_text()) if path.exists() else {"comparisons": {}}
+    return found
+
+
+def save(figures: Figures, path: Path) -> None:
+    """Write the figures to a file, with the rounds of a measure on one line."""
+    text = re.sub(r"(?<=\[)[^\[\]{}]*(?=\])", lambda found: " ".join(found[0].split()), json.dumps(figures, indent=1))
+    path.write_text(f"{text}\n")
+
+
+def add(figures: Figures, comparison: Comparison, measured: dict[str, Rounds]) -> None:
+    """Put a comparison's figures in the place of its earlier ones."""
+    figures["machine"] = machine()
+    figures["versions"] = {venv: versions(venv, names) for venv, names in PACKAGES.items()}
+    figures["comparisons"][comparison.title] = {
+        "area": comparison.area,
+        "reference": comparison.reference,
+        "seconds": comparison.seconds,
+        "subjects": {
+            name: {measure: [float(f"{value:.4g}") for value in values] for measure, values in rounds.items()}
+            for name, rounds in measured.items()
+        },
+        "commands": {name: asdict(subject) for name, subject in comparison.subjects.items()},
+    }
+
+
+def machine() -> dict[str, str]:
+    """Processor, cores, memory, system and Python."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
+    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
+    return {
+        "processor": model,
+        "cores": str(os.cpu_count()),
+        "memory": f"{pages:.0f} GiB",
+        "system": platform.platform(terse=True),
+        "python": platform.python_version(),
+    }
+
+
+def versions(venv: str, names: tuple[str, ...]) -> dict[str, str]:
+    """Versions of the packages of an environment in .bench/."""
+    script = "import sys, importlib.metadata as m\nfor name in sys.argv[1:]: print(m.version(name))"
+    python = ROOT / ".bench" / venv / "bin" / "python"
+    done = subprocess.run([python, "-c", script, *names], capture_output=True, text=True, check=True)
+    return dict(zip(names, done.stdout.split(), strict=True))
+
+
+def ratios(over: list[float], under: list[float]) -> list[float]:
+    """Of the same rounds."""
+    return [a / b for a, b in zip(over, under, strict=True)]
+
+
+def spread(values: list[float]) -> str:
+    """Median (lowest to highest), with three digits."""
+    return f"{_short(median(values))} ({_short(min(values))} to {_short(max(values))})"
+
+
+def _short(value: float) -> str:
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.{1 if abs(value) >= 10 else 2}f}"
+
+
+def reached(target: Target, figures: Figures) -> tuple[str, list[float]] | None:
+    """The subject that the target is measured by, and the ratio of each round; None if they were not measured."""
+    subjects = figures["comparisons"].get(target.comparison, {}).get("subjects", {})
+    if target.over not in subjects or not set(target.under) <= set(subjects):
+        return None
+    best = (min if target.at_most else max)(target.under, key=lambda name: median(subjects[name][target.measure]))
+    return best, ratios(subjects[target.over][target.measure], subjects[best][target.measure])
+
+
+def page(figures: Figures) -> str:
+    """The page of all figures, in Markdown."""
+    return "\n".join(_lines(figures)) + "\n"
+
+
+def _lines(figures: Figures) -> Iterator[str]:
+    yield "# Side by side\n"
+    yield (
+        "`make bench` writes this page from `results.json`. Subjects take turns in one run; a cell is the median over "
+        "the rounds (lowest to highest), and a ratio is that of the same round. Subjects of one process "
+        "have one thread and share one core; their rates count seconds of processor time, those of several processes "
+        "the clock's.\n"
+    )
+    yield "; ".join(f"{name}: {value}" for name, value in figures["machine"].items()) + ".\n"
+    for venv, packages in figures["versions"].items():
+        yield f"`.bench/{venv}`: " + ", ".join(f"{name} {version}" for name, version in packages.items()) + ".\n"
+    yield "## Targets\n"
+    yield "| what | over | ratio | target | |"
+    yield "| --- | --- | --- | --- | --- |"
+    for target in TARGETS:
+        if found := reached(target, figures):
+            best, values = found
+            met = median(values) <= target.bound if target.at_most else median(values) >= target.bound
+            bound = f"{'at most' if target.at_most else 'at least'} {_short(target.bound)}"
+            what = f"{target.comparison}: {target.over}, {target.measure}"
+            yield f"| {what} | {best} | {spread(values)} | {bound} | {'met' if met else 'short'} |"
+    shown = set()
+    for title, found in figures["comparisons"].items():
+        yield f"\n## {title[0].upper()}{title[1:]}\n"
+        yield from _tables(found)
+        if found["area"] == "growth":
+            yield "\n" + "; ".join(exponents(found["subjects"])) + "."
+        if (area := found["area"]) not in shown:
+            shown.add(area)
+            yield f"\n![The ratios of the area {area}](plots/{area}.png)"
+
+
+def reference(found: dict[str, Any]) -> Rounds:
+    """What the reference did, without measures that were 0 in some round: they have no ratio."""
+    rounds: Rounds = found["subjects"][found["reference"]]
+    return {measure: values for measure, values in rounds.items() if all(values)}
+
+
+def _tables(found: dict[str, Any]) -> Iterator[str]:
+    measures = list(dict.fromkeys(name for rounds in found["subjects"].values() for name in rounds))
+    base = reference(found)
+    yield "| | " + " | ".join(f"{name} | ratio" if name in base else name for name in measures) + " |"
+    yield "| --- " * (1 + len(measures) + len([name for name in measures if name in base])) + "|"
+    for subject, rounds in found["subjects"].items():
+        cells = []
+        for name in measures:
+            values = rounds.get(name)
+            cells.append(spread(values) if values else "")
+            if name in base:
+                cells.append(spread(ratios(values, base[name])) if values else "")
+        yield f"| {subject} | " + " | ".join(cells) + " |"
+
+
+def exponents(subjects: dict[str, Rounds]) -> Iterator[str]:
+    """How the whole cost of each measure grows with the sizes that name the subjects: the fitted power of the size."""
+    sizes = np.log([int(name.replace(",", "")) for name in subjects])
+    for measure in next(iter(subjects.values())):
+        costs = np.log([median(rounds[measure]) for rounds in subjects.values()])
+        slope = np.polyfit(sizes, costs, 1)[0] + (measure == UNIT_COST)
+        yield f"{'time' if measure == UNIT_COST else 'memory'} grows as size^{slope:.2f}"
+
+
+def fallen(new: Figures, old: Figures) -> Iterator[str]:
+    """The ratios to the reference that are worse than before by more than both ranges, one line each."""
+    for title, was in old["comparisons"].items():
+        now = new["comparisons"].get(title)
+        for subject, rounds in was["subjects"].items():
+            for measure, values in rounds.items():
+                measured = now["subjects"].get(subject, {}).get(measure) if now else None
+                if not measured or subject == was["reference"] or measure not in reference(was).keys() & reference(now):
+                    continue
+                before = ratios(values, reference(was)[measure])
+                after = ratios(measured, reference(now)[measure])
+                more_is_better = "/s" in measure or measure == "solved"
+                worse = max(after) < min(before) if more_is_better else min(after) > max(before)
+                if worse:
+                    yield f"{title}, {subject}, {measure}: {spread(after)} times the reference, was {spread(before)}"

@@ -1,0 +1,62 @@
+"""Whole runs to a mean return over 100 episodes, each turn with the next seed: learn.py WHO TASK.
+
+A turn is a new process, from its start to its end. A run that does not get there within the steps of its task counts
+with what it took, and is not solved.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from turns import attend
+
+# By task: our preset, the mean return, and the steps at most.
+TASKS = {"cartpole": ("cartpole", 195.0, 50_000), "minatar-breakout": ("minatar-breakout", 5.0, 150_000)}
+OURS = {"lockstep": ("coop-lockstep",), "distributed": ("coop-local", "--actors", "1")}
+
+
+def run(who: str, preset: str, seed: int, folder: Path, *more: str) -> dict[str, Any]:
+    """The summary of one run of ours."""
+    name, *flags = OURS[who]
+    flags += ["--preset", preset, "--method", "coop", "--seed", str(seed), "--run-dir", str(folder / "run"), *more]
+    subprocess.run([str(Path(sys.executable).with_name(name)), *flags], check=True, stdout=subprocess.DEVNULL)
+    summary: dict[str, Any] = json.loads((folder / "run" / "summary.json").read_text())
+    return summary
+
+
+def ours(who: str, task: str, seed: int, folder: Path) -> tuple[int, bool]:
+    """Steps, and whether it got there."""
+    preset, mean, most = TASKS[task]
+    summary = run(who, preset, seed, folder, "--target-return", str(mean), "--total-steps", str(most))
+    return summary["env_steps"], summary["return_mean_100"] >= mean
+
+
+def rival(who: str, task: str, seed: int) -> tuple[int, bool]:
+    """The same of a script beside this one."""
+    command = [sys.executable, str(Path(__file__).with_name(f"learn_{who}.py")), task, str(seed)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    steps, solved = json.loads(done.stdout.splitlines()[-1])
+    return steps, solved
+
+
+def main(who: str, task: str) -> None:
+    seeds = count()
+
+    def turn(_: float) -> dict[str, float]:
+        seed, begun = next(seeds), time.monotonic()
+        with tempfile.TemporaryDirectory() as folder:
+            steps, solved = ours(who, task, seed, Path(folder)) if who in OURS else rival(who, task, seed)
+        return {"seconds": time.monotonic() - begun, "steps": steps, "solved": solved}
+
+    attend(turn)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

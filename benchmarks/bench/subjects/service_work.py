@@ -1,0 +1,87 @@
+"""The work of a replay service, whichever it is: two processes insert, this one draws. Needs no other library."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from multiprocessing.connection import Connection
+
+from turns import attend
+
+INSERTERS = 2
+BATCH, STEPS = 32, 32  # transitions of a draw, and of a segment
+CAPACITY = 50_000
+INSERT_RATE = 5200.0  # transitions/s inserted while batches are drawn, by all
+
+# Inserts a segment, perhaps without waiting for its answer; waits for all answers.
+Insert = tuple[Callable[[], object], Callable[[], object]]
+
+
+def insert_on_demand(end: Connection, insert: Insert) -> None:
+    """Answer each (seconds, rate) with the transitions a second that were inserted, acknowledgements included."""
+    submit, drain = insert
+    submit()
+    drain()
+    end.send("ready")
+    while (work := end.recv()) is not None:
+        seconds, rate = work
+        done, begun = 0, time.monotonic()
+        while (now := time.monotonic() - begun) < seconds:
+            if done > rate * now:
+                time.sleep(STEPS / rate)
+            else:
+                submit()
+                done += STEPS
+        drain()
+        end.send(done / (time.monotonic() - begun))
+
+
+class Inserters:
+    """Processes that insert when they are told; each runs target(*arguments, end), which calls `insert_on_demand`."""
+
+    def __init__(self, stack: ExitStack, target: Callable[..., None], *arguments: object) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self._ends: list[Connection] = []
+        for _ in range(INSERTERS):
+            ours, theirs = spawn.Pipe()
+            process = spawn.Process(target=target, args=(*arguments, theirs))
+            process.start()
+            stack.callback(process.join)
+            stack.callback(ours.send, None)
+            assert ours.recv() == "ready"
+            self._ends.append(ours)
+
+    def insert(self, seconds: float, rate: float = math.inf, meanwhile: Callable[[], object] = lambda: None) -> float:
+        """Transitions/s of all."""
+        for end in self._ends:
+            end.send((seconds, rate / INSERTERS))
+        meanwhile()
+        return sum(end.recv() for end in self._ends)
+
+
+def attend_service(inserters: Inserters, draw: Callable[[], object]) -> None:
+    """Take turns: inserts alone, draws alone, then draws beside inserts at `INSERT_RATE`."""
+
+    def draws(seconds: float, name: str) -> dict[str, float]:
+        waits, begun = [], time.perf_counter()
+        last = begun
+        while last - begun < seconds:
+            draw()
+            waits.append(-last + (last := time.perf_counter()))
+        waits.sort()
+        return {
+            f"batches/s {name}": len(waits) / (last - begun),
+            f"p99 of a batch {name}, ms": 1e3 * waits[int(0.99 * len(waits))],
+        }
+
+    def turn(seconds: float) -> Mapping[str, float]:
+        found = {"inserted/s alone": inserters.insert(seconds)}
+        found |= draws(seconds, "alone")
+        both: dict[str, float] = {}
+        inserted = inserters.insert(seconds, INSERT_RATE, lambda: both.update(draws(seconds, "beside inserts")))
+        return found | both | {"inserted/s beside draws": inserted}
+
+    attend(turn)
