@@ -16,6 +16,7 @@ import torch  # noqa: F401 - `use_threads` limits what has been imported
 from common.messaging.session import open_session
 from common.messaging.transport import Node, new_incarnation
 from common.process.threads import use_threads
+from common.settings.methods import METHODS
 from common.types import EnvSpec
 
 # torch.compile's own processes would outlive the tests.
@@ -123,8 +124,9 @@ def nothing_left_behind() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def modules_of_ones_own() -> Iterator[None]:
-    """Tests write modules `my_...` of the same names into folders of their own: none of them meets another test's."""
+def parts_of_ones_own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No test meets the methods that another one registered, nor its modules `my_...`, which have the same names."""
+    monkeypatch.setattr(METHODS, "_all", {**METHODS._all})
     yield
     for name, module in list(sys.modules.items()):
         if name.startswith("my_") and not Path(module.__file__ or "").is_relative_to(Path(__file__).parent):
