@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any, Generic, Protocol, TypeVar
 
 from common.errors import UsageError
@@ -38,7 +38,7 @@ class Registry(Generic[EntryT]):
         self.setting = setting
         self.group = group
         self._kind = kind
-        self._entries: dict[str, EntryT | str | EntryPoint] = {**entries}
+        self._entries: dict[str, EntryT | str] = {**entries}
 
     def names(self) -> tuple[str, ...]:
         """All names: those of this package first."""
@@ -53,9 +53,8 @@ class Registry(Generic[EntryT]):
         found = self._all.get(name)
         if found is None:
             raise UsageError(f"{self.setting} = {name!r}: {self.unknown(name)}")
-        if isinstance(found, str | EntryPoint):
-            reference = found if isinstance(found, str) else found.value
-            found = self._all[name] = self._checked(name, loaded(reference, f"{self.setting} {name!r}"), reference)
+        if isinstance(found, str):
+            found = self._all[name] = self._checked(name, loaded(found, f"{self.setting} {name!r}"), found)
         return found
 
     def unknown(self, name: str) -> str:
@@ -69,9 +68,10 @@ class Registry(Generic[EntryT]):
         self._all[entry.name] = self._checked(entry.name, entry, "it")
 
     @cached_property
-    def _all(self) -> dict[str, EntryT | str | EntryPoint]:
+    def _all(self) -> dict[str, EntryT | str]:
+        # Names and values alone: their class is another one once a package, such as Dask, imports `importlib_metadata`.
         points = sorted(entry_points(group=self.group), key=lambda point: point.name)
-        return {**self._entries, **{point.name: point for point in points if point.name not in self._entries}}
+        return {**{point.name: point.value for point in points}, **self._entries}
 
     def _checked(self, name: str, entry: Any, source: str) -> EntryT:  # noqa: ANN401 (whatever a package gives)
         if not isinstance(entry, self._kind):

@@ -164,6 +164,13 @@ def test_a_run_with_parts_of_another_package(package: Path, tmp_path: Path) -> N
     assert "most-drawn" in shown.stdout
 
 
+def test_entry_points_of_the_backport_are_read_alike(package: Path) -> None:
+    """Dask imports `importlib_metadata`, which takes the standard library's place in the whole process."""
+    code = "import importlib_metadata; from common.settings.methods import METHODS; print(METHODS.get('soft-max').summary)"
+    run = python(package, code)
+    assert (run.stdout, run.stderr) == ("a mean of both\n", "")
+
+
 def test_the_replay_service_knows_every_name_without_torch() -> None:
     code = (
         "import sys, replay.cli\n"
