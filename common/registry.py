@@ -71,7 +71,7 @@ class Registry(Generic[EntryT]):
     def _all(self) -> dict[str, EntryT | str]:
         # Names and values alone: their class is another one once a package, such as Dask, imports `importlib_metadata`.
         points = sorted(entry_points(group=self.group), key=lambda point: point.name)
-        return {**{point.name: point.value for point in points}, **self._entries}
+        return {**self._entries, **{point.name: point.value for point in points if point.name not in self._entries}}
 
     def _checked(self, name: str, entry: Any, source: str) -> EntryT:  # noqa: ANN401 (whatever a package gives)
         if not isinstance(entry, self._kind):

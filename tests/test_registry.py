@@ -166,8 +166,8 @@ def test_a_run_with_parts_of_another_package(package: Path, tmp_path: Path) -> N
 
 def test_entry_points_of_the_backport_are_read_alike(package: Path) -> None:
     """Dask imports `importlib_metadata`, which takes the standard library's place in the whole process."""
-    code = "import importlib_metadata; from common.settings.methods import METHODS; print(METHODS.get('soft-max').summary)"
-    run = python(package, code)
+    code = "from common.settings.methods import METHODS; print(METHODS.get('soft-max').summary)"
+    run = python(package, f"import importlib_metadata; {code}")
     assert (run.stdout, run.stderr) == ("a mean of both\n", "")
 
 
