@@ -11,7 +11,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-import torch  # noqa: F401 - `use_threads` limits what has been imported
+import torch
 
 from common.messaging.session import open_session
 from common.messaging.transport import Node, new_incarnation
@@ -131,6 +131,12 @@ def parts_of_ones_own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for name, module in list(sys.modules.items()):
         if name.startswith("my_") and not Path(module.__file__ or "").is_relative_to(Path(__file__).parent):
             del sys.modules[name]
+
+
+@pytest.fixture(autouse=True)
+def the_same_random_numbers() -> None:
+    """PyTorch's own generator, which initialises layers, otherwise differs from process to process."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture

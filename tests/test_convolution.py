@@ -1,5 +1,7 @@
 """Networks of one convolution as matrix products in numpy: the values and gradients of the same networks in PyTorch."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -15,8 +17,9 @@ from learner.edl.feedback import FEEDBACKS, FeedbackRule
 from learner.optimizers import make_optimizer
 
 
-def _network(conv: nn.Conv2d, shape: tuple[int, int], hidden: list[int], actions: int) -> nn.Sequential:
+def _network(geometry: tuple[Any, ...], shape: tuple[int, int], hidden: list[int], actions: int) -> nn.Sequential:
     torch.manual_seed(0)
+    conv = nn.Conv2d(*geometry)
     width = nn.Flatten()(conv(torch.zeros(1, conv.in_channels, *shape))).shape[1]
     steps: list[nn.Module] = [conv, nn.ReLU(), nn.Flatten()]
     for size in hidden:
@@ -29,25 +32,25 @@ def _pictures(batch: int, channels: int, shape: tuple[int, int]) -> Array:
     return (np.random.default_rng(0).random((batch, channels, *shape)) < 0.3).astype(np.float64)
 
 
-CASES = [
-    (nn.Conv2d(4, 16, 3), (10, 10), [128], 3, 32),
-    (nn.Conv2d(4, 16, 3), (10, 10), [128], 6, 7),
-    (nn.Conv2d(2, 5, (2, 3), (1, 2)), (6, 9), [40, 30], 2, 20),
-    (nn.Conv2d(1, 6, 4, 3), (11, 8), [], 4, 3),
-    (nn.Conv2d(3, 8, 3), (5, 5), [20], 1, 4),
-    (nn.Conv2d(3, 8, 3), (5, 5), [20], 3, 1),
+CASES: list[tuple[tuple[Any, ...], tuple[int, int], list[int], int, int]] = [  # the first: arguments of the convolution
+    ((4, 16, 3), (10, 10), [128], 3, 32),
+    ((4, 16, 3), (10, 10), [128], 6, 7),
+    ((2, 5, (2, 3), (1, 2)), (6, 9), [40, 30], 2, 20),
+    ((1, 6, 4, 3), (11, 8), [], 4, 3),
+    ((3, 8, 3), (5, 5), [20], 1, 4),
+    ((3, 8, 3), (5, 5), [20], 3, 1),
 ]
 
 
 @pytest.mark.parametrize("feedback", FEEDBACKS)
-@pytest.mark.parametrize(("conv", "shape", "hidden", "actions", "batch"), CASES)
+@pytest.mark.parametrize(("geometry", "shape", "hidden", "actions", "batch"), CASES)
 def test_values_and_gradients_agree(
-    conv: nn.Conv2d, shape: tuple[int, int], hidden: list[int], actions: int, batch: int, feedback: str
+    geometry: tuple[Any, ...], shape: tuple[int, int], hidden: list[int], actions: int, batch: int, feedback: str
 ) -> None:
-    network = _network(conv, shape, hidden, actions)
+    network = _network(geometry, shape, hidden, actions)
     # The gradients of a wide layer in a small batch lack rank, and have more than one polar factor.
     s = 0.0 if feedback == "weight-gradient" and hidden else 0.3
-    x, error = _pictures(batch, conv.in_channels, shape), np.random.default_rng(1).standard_normal((batch, actions))
+    x, error = _pictures(batch, geometry[0], shape), np.random.default_rng(1).standard_normal((batch, actions))
     for dtype, rtol in ((np.float64, 1e-9), (np.float32, 1e-5)):
         network.double() if dtype is np.float64 else network.float()
         found = {name: np.full(p.shape, np.nan, dtype) for name, p in network.named_parameters()}
@@ -67,7 +70,7 @@ def test_values_and_gradients_agree(
 
 
 def test_the_head_of_a_tape_is_the_tape_of_the_first_samples() -> None:
-    module = _network(nn.Conv2d(2, 5, 3), (6, 6), [20], 3)
+    module = _network((2, 5, 3), (6, 6), [20], 3)
     chain, x, error = ConvolutionChain(ConvolutionNetwork(module)), _pictures(8, 2, (6, 6)), np.ones((3, 3))
     gradients = []
     for tape in (chain.forward(x).head(3), chain.forward(x[:3])):
@@ -79,7 +82,7 @@ def test_the_head_of_a_tape_is_the_tape_of_the_first_samples() -> None:
 
 
 def test_it_follows_the_parameters() -> None:
-    network = FlatNetwork(_network(nn.Conv2d(2, 5, 3), (6, 6), [20], 3).float())
+    network = FlatNetwork(_network((2, 5, 3), (6, 6), [20], 3).float())
     assert isinstance(network.in_numpy, ConvolutionNetwork)
     x = _pictures(2, 2, (6, 6)).astype(np.float32)
     before = network.in_numpy(x)
