@@ -208,6 +208,12 @@ def test_without_the_largest_capacity_there_is_no_breaking_point(study: Path, tm
     assert coop == ["coop", None, None, None, None, 300, None, None]
 
 
+def test_a_figure_that_can_t_be_written(study: Path, tmp_path: Path) -> None:
+    (tmp_path / "returns_steps.pdf").mkdir()
+    with pytest.raises(UsageError, match=r"--out .*: Is a directory"):
+        write_report(study, tmp_path)
+
+
 def test_what_is_no_study(study: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds no run"):
         write_report(tmp_path, tmp_path / "out")
