@@ -97,13 +97,11 @@ class Running:
         return self
 
     def __exit__(self, *_: object) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
         try:
-            self._process.wait(GRACE)
+            self._process.communicate(timeout=GRACE)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            self._process.wait()
+            self._process.communicate()
 
     def _answer(self) -> dict[str, float]:
         assert self._process.stdout is not None
@@ -114,7 +112,8 @@ class Running:
         raise self._ended()
 
     def _ended(self) -> SubjectError:
-        status = self._process.wait()
+        self._process.communicate()
+        status = self._process.returncode
         words = self._log.read_text(errors="replace").strip().splitlines()[-1:] or ["it said nothing"]
         return SubjectError(f"{self.name} ended (exit status {status}): {words[0]}; see {self._log}")
 

@@ -1,0 +1,147 @@
+"""`make bench`: turns of real processes, ratios of rounds, the guard, and the committed page."""
+
+import copy
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SUBJECT = """
+import sys
+from turns import attend
+
+if sys.argv[1] == "broken":
+    sys.exit("it lacks a library")
+taken = []
+
+def turn(seconds):
+    with open(sys.argv[2], "a") as file:
+        print(sys.argv[1], seconds, file=file)
+    taken.append(seconds)
+    return {"work/s": 10.0 * len(taken)}
+
+print("noise")
+attend(turn)
+"""
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A function that imports a module of the benchmark."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return lambda name: importlib.import_module(f"bench.{name}")
+
+
+@pytest.fixture
+def comparison(bench: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The module that runs subjects, with a subject `own` and a virtual environment, this one."""
+    module = bench("comparison")
+    subjects = tmp_path / "bench" / "subjects"
+    subjects.mkdir(parents=True)
+    (subjects / "own.py").write_text(SUBJECT)
+    (subjects.parent / "turns.py").symlink_to(BENCHMARKS / "bench" / "turns.py")
+    folder = tmp_path / ".bench" / "bench" / "bin"
+    folder.mkdir(parents=True)
+    (folder / "python").write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    (folder / "python").chmod(0o755)
+    monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(module, "SUBJECTS", subjects)
+    return module
+
+
+def test_subjects_take_turns(comparison: Any, tmp_path: Path) -> None:
+    notes = tmp_path / "notes"
+    subjects = {name: comparison.Subject("own", (name, str(notes))) for name in ("a", "b")}
+    found = comparison.compare(comparison.Comparison("x", "a and b", subjects, "a", seconds=0.5), 3, tmp_path)
+    turns = notes.read_text().split()
+    assert turns[::2] == ["a", "b", "a", "b", "b", "a", "a", "b"], (
+        "a short one of each; then everybody is first in turn"
+    )
+    assert turns[1::2] == ["0.25"] * 2 + ["0.5"] * 6
+    assert found == {name: {"work/s": [20.0, 30.0, 40.0]} for name in ("a", "b")}, "the short turn does not count"
+
+
+def test_a_subject_that_ends_is_named(comparison: Any, tmp_path: Path) -> None:
+    subjects = {"a": comparison.Subject("own", ("broken",))}
+    with pytest.raises(
+        comparison.SubjectError, match=r"^a ended \(exit status 1\): it lacks a library; see .*-a\.log$"
+    ):
+        comparison.compare(comparison.Comparison("x", "one", subjects, "a"), 1, tmp_path)
+
+
+def _figures(**subjects: dict[str, list[float]]) -> dict[str, Any]:
+    return {"comparisons": {"work": {"area": "x", "reference": "base", "subjects": subjects}}}
+
+
+BASE = {"work/s": [10.0, 20.0, 10.0], "seconds": [1.0, 2.0, 1.0], "solved": [1.0, 0.0, 1.0]}
+OURS = {"work/s": [20.0, 44.0, 18.0], "seconds": [0.5, 1.1, 0.4], "solved": [1.0, 1.0, 0.0]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({}, []),
+        ({"work/s": [18.0, 36.0, 17.0]}, []),
+        (
+            {"work/s": [17.0, 35.0, 17.9]},
+            ["work, ours, work/s: 1.75 (1.70 to 1.79) times the reference, was 2.00 (1.80 to 2.20)"],
+        ),
+        ({"work/s": [90.0, 90.0, 90.0]}, []),
+        ({"seconds": [0.1, 0.1, 0.1]}, []),
+        (
+            {"seconds": [0.6, 1.3, 0.7]},
+            ["work, ours, seconds: 0.65 (0.60 to 0.70) times the reference, was 0.50 (0.40 to 0.55)"],
+        ),
+        ({"solved": [0.0, 0.0, 0.0]}, []),  # the reference has 0 in a round: no ratio
+    ],
+)
+def test_the_guard_names_what_left_its_range_for_the_worse(
+    bench: Any, changes: dict[str, list[float]], named: list[str]
+) -> None:
+    fallen = bench("results").fallen
+    assert list(fallen(_figures(base=BASE, ours={**OURS, **changes}), _figures(base=BASE, ours=OURS))) == named
+
+
+def test_the_guard_passes_over_what_was_not_measured(bench: Any) -> None:
+    fallen, old = bench("results").fallen, _figures(base=BASE, ours=OURS)
+    assert not list(fallen({"comparisons": {}}, old))
+    assert not list(fallen(_figures(base=BASE), old))
+
+
+def test_a_target_is_measured_by_the_best_of_the_others(bench: Any) -> None:
+    results, target = bench("results"), bench("areas").Target
+    figures = _figures(ours={"work/s": [9.0, 8.0]}, one={"work/s": [3.0, 2.0]}, two={"work/s": [1.0, 1.0]})
+    assert results.reached(target("work", "work/s", "ours", ("one", "two"), 2.0), figures) == ("one", [3.0, 4.0])
+    fastest = target("work", "work/s", "ours", ("one", "two"), 2.0, at_most=True)
+    assert results.reached(fastest, figures) == ("two", [9.0, 8.0])
+    assert results.reached(target("work", "work/s", "ours", ("one", "third"), 2.0), figures) is None
+
+
+def test_the_cost_of_growing_work(bench: Any) -> None:
+    subjects = {"10": {"us a unit": [2.0], "MiB": [5.0]}, "1,000": {"us a unit": [20.0], "MiB": [50.0]}}
+    assert list(bench("results").exponents(subjects)) == ["time grows as size^1.50", "memory grows as size^0.50"]
+
+
+def test_the_committed_page_shows_the_committed_figures(bench: Any) -> None:
+    results = bench("results")
+    figures = results.load(results.FIGURES)
+    assert results.PAGE.read_text() == results.page(figures)
+    other = copy.deepcopy(figures)
+    other["comparisons"]["replay service"]["subjects"]["coop tcp"]["batches/s alone"][0] *= 2
+    assert results.page(other) != results.PAGE.read_text()
+
+
+def test_every_area_has_a_name_that_can_be_asked_for(bench: Any) -> None:
+    areas = bench("areas")
+    titles = [comparison.title for comparison in areas.COMPARISONS]
+    assert len(titles) == len(set(titles))
+    for comparison in areas.COMPARISONS:
+        assert comparison.reference in comparison.subjects
+        for subject in comparison.subjects.values():
+            assert (BENCHMARKS / "bench" / "subjects" / f"{subject.script}.py").exists()
+    for target in areas.TARGETS:
+        subjects = next(c.subjects for c in areas.COMPARISONS if c.title == target.comparison)
+        assert {target.over, *target.under} <= set(subjects)
