@@ -149,11 +149,50 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
     assert done.stdout.endswith("the run has ended: interrupted\n")
 
     pictures = [lines for lines in terminal.pictures() if lines[0].startswith("coop  CartPole-v0, coop, seed 0")]
-    assert all(len(lines) == 24 for lines in pictures)
+    assert [lines for lines in pictures if len(lines) != 24] == []
     assert any("lost      does not answer" in line for lines in pictures for line in lines)
     left = terminal.text().partition("\x1b[?1049l")[2]
     assert "killed by SIGKILL" in left, "the events remain when the screen has gone"
     assert left.rstrip().endswith(f"; coop-local --resume --run-dir {tmp_path / 'r'} goes on")
+
+
+NOISY = """
+import sys
+from common.process.display import LiveDisplay
+
+class Pictures(LiveDisplay):
+    def picture(self):
+        return "the picture"
+    def line(self):
+        return ""
+
+with Pictures(0.0, 1000, screen=True) as display:
+    for _ in range(3):
+        print("an error", "of a library", file=sys.stderr)
+        display.update()
+    sys.stderr.write("half")
+    assert sys.stderr.fileno() == 2
+print("later", file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("both", [True, False])
+def test_what_others_write_to_standard_error_does_not_move_the_picture(both: bool, tmp_path: Path) -> None:
+    errors = tmp_path / "errors"
+    with contextlib.closing(Terminal()) as terminal, errors.open("w") as file:
+        environment = {**os.environ, "TERM": "xterm"}
+        streams = {"stdout": terminal.writing, "stderr": terminal.writing if both else file}
+        with started(["python", "-c", NOISY], env=environment, **streams) as process:
+            assert process.wait(60) == 0
+    begun, *pictures = terminal.pictures()
+    assert begun == [""]
+    assert {(len(lines), lines[0].strip()) for lines in pictures} == {(24, "the picture")}
+    left = terminal.text().partition("\x1b[?1049l")[2]
+    if both:
+        assert left.count("an error of a library\r\n") == 3
+        assert left.endswith("half\r\nlater\r\n")
+    else:
+        assert errors.read_text() == "an error of a library\n" * 3 + "halflater\n"
 
 
 def test_watch_refuses_json_for_a_live_screen() -> None:

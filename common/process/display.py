@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, redirect_stderr
 from typing import Self
 
 from rich.console import Console, RenderableType
@@ -19,14 +22,18 @@ class LiveDisplay(ABC):
 
     plain_every: seconds between lines if the output is no terminal; a line is never repeated.
     refreshes: pictures per second on a terminal.
-    screen: the picture fills the terminal; the lines said meanwhile are printed at the end.
+    screen: the picture fills the terminal; the lines said meanwhile are printed at the end, and so are those that
+        anything in this process writes to standard error, if that is a terminal.
     """
 
     def __init__(self, plain_every: float, refreshes: float, *, screen: bool = False) -> None:
         self._console = Console()
         self._draws = self._console.is_terminal and not self._console.is_dumb_terminal
-        self._live = Live(console=self._console, auto_refresh=False, transient=True, screen=screen)
+        self._live = Live(
+            console=self._console, auto_refresh=False, transient=True, screen=screen, redirect_stderr=not screen
+        )
         self._screen = screen
+        self._redirected = ExitStack()
         self._said: deque[str] = deque(maxlen=KEPT)
         self._every = 1 / refreshes if self._draws else plain_every
         self._due = time.monotonic() + (0 if self._draws else plain_every)
@@ -35,9 +42,13 @@ class LiveDisplay(ABC):
     def __enter__(self) -> Self:
         if self._draws:
             self._live.start()
+            if self._screen and sys.stderr.isatty():
+                lines = self._redirected.enter_context(closing(_Lines(self.say, sys.stderr.fileno())))
+                self._redirected.enter_context(redirect_stderr(lines))
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._redirected.close()
         if self._live.is_started:
             self._live.stop()
             for text in self._said if self._screen else ():
@@ -76,6 +87,29 @@ class LiveDisplay(ABC):
     @abstractmethod
     def line(self) -> str:
         """The present state in one line."""
+
+
+class _Lines(io.TextIOBase):
+    """Gives each line that is written to `say`. Signal handlers write to the file itself."""
+
+    def __init__(self, say: Callable[[str], None], file: int) -> None:
+        self._say = say
+        self._file = file
+        self._rest = ""
+
+    def write(self, text: str) -> int:
+        *lines, self._rest = (self._rest + text).split("\n")
+        for line in lines:
+            self._say(line)
+        return len(text)
+
+    def close(self) -> None:
+        if self._rest:
+            self.write("\n")
+        super().close()
+
+    def fileno(self) -> int:
+        return self._file
 
 
 def printable(text: str) -> str:
