@@ -111,6 +111,29 @@ def test_the_guard_passes_over_what_was_not_measured(bench: Any) -> None:
     assert not list(fallen(_figures(base=BASE), old))
 
 
+def test_figures_say_on_which_machine_they_were_measured(bench: Any) -> None:
+    results, module = bench("results"), bench("comparison")
+    machines = [{"machine": {"cores": cores}, "versions": {"bench": {"torch": "2"}}} for cores in ("1", "2")]
+    figures = results.none()
+
+    def measure(title: str, machine: int) -> list[str]:
+        subjects = {"a": module.Subject("own")}
+        results.put(figures, module.Comparison("x", title, subjects, "a"), {"a": {"s": [1.0]}}, machines[machine])
+        return [
+            line
+            for line in results.page(figures).splitlines()
+            if line.startswith(("## F", "## S", "On m", "1. ", "2. "))
+        ]
+
+    one, two = (f"cores: {cores}; `.bench/bench`: torch 2." for cores in (1, 2))
+    assert measure("first", 0) == [f"1. {one}", "## First"]
+    assert measure("second", 0) == [f"1. {one}", "## First", "## Second"]
+    both = [f"1. {one}", f"2. {two}", "## First", "On machine 2.", "## Second", "On machine 1."]
+    assert measure("first", 1) == both
+    assert measure("first", 1) == both
+    assert measure("second", 1) == [f"1. {two}", "## First", "## Second"], "nothing is left of the other machine"
+
+
 def test_a_target_is_measured_by_the_best_of_the_others(bench: Any) -> None:
     results, target = bench("results"), bench("areas").Target
     figures = _figures(ours={"work/s": [9.0, 8.0]}, one={"work/s": [3.0, 2.0]}, two={"work/s": [1.0, 1.0]})

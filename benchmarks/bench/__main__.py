@@ -15,7 +15,7 @@ from pathlib import Path
 from bench.areas import AREAS, COMPARISONS, ON_REQUEST
 from bench.comparison import SubjectError, compare
 from bench.plots import draw
-from bench.results import FIGURES, PAGE, Figures, add, fallen, load, page, save
+from bench.results import FIGURES, PAGE, Figures, add, fallen, load, none, page, save
 
 
 def main() -> None:
@@ -27,7 +27,7 @@ def main() -> None:
     if unknown := set(options.areas) - set(AREAS):
         parser.error(f"no area {unknown.pop()!r}; there are {', '.join(AREAS)}")
     old = load(options.against) if options.against else None
-    figures: Figures = {"comparisons": {}} if old else load(FIGURES)
+    figures: Figures = none() if old else load(FIGURES)
     for comparison in COMPARISONS:
         if comparison.area not in (options.areas or set(AREAS) - {ON_REQUEST}):
             continue

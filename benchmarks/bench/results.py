@@ -25,13 +25,19 @@ PACKAGES = {
     "reverb": ("dm-reverb", "tensorflow", "numpy"),
 }
 UNIT_COST = "us a unit"  # of the area growth
-Figures = dict[str, Any]  # by title of a comparison: area, reference, seconds, and "subjects": {name: Rounds}
+# "comparisons", by title: area, reference, seconds, "on", which of "machines", and "subjects": {name: Rounds}
+Figures = dict[str, Any]
 
 
 def load(path: Path) -> Figures:
     """The figures of a file; none if there is no such file."""
-    found: Figures = json.loads(path.read_text()) if path.exists() else {"comparisons": {}}
+    found: Figures = json.loads(path.read_text()) if path.exists() else none()
     return found
+
+
+def none() -> Figures:
+    """No figures yet."""
+    return {"machines": [], "comparisons": {}}
 
 
 def save(figures: Figures, path: Path) -> None:
@@ -42,10 +48,21 @@ def save(figures: Figures, path: Path) -> None:
 
 def add(figures: Figures, comparison: Comparison, measured: dict[str, Rounds]) -> None:
     """Put a comparison's figures in the place of its earlier ones."""
-    figures["machine"] = machine()
-    figures["versions"] = {venv: versions(venv, names) for venv, names in PACKAGES.items()}
-    figures["comparisons"][comparison.title] = {
+    here = {"machine": machine(), "versions": {venv: versions(venv, names) for venv, names in PACKAGES.items()}}
+    put(figures, comparison, measured, here)
+
+
+def put(figures: Figures, comparison: Comparison, measured: dict[str, Rounds], here: dict[str, Any]) -> None:
+    """`add`, measured on the machine `here`; machines of which no figure is left are forgotten."""
+    before, found = figures["machines"], figures["comparisons"]
+    others = [old for title, old in found.items() if title != comparison.title]
+    kept = [each for number, each in enumerate(before) if any(old["on"] == number for old in others)]
+    for old in others:
+        old["on"] = kept.index(before[old["on"]])
+    figures["machines"] = kept if here in kept else [*kept, here]
+    found[comparison.title] = {
         "area": comparison.area,
+        "on": figures["machines"].index(here),
         "reference": comparison.reference,
         "seconds": comparison.seconds,
         "subjects": {
@@ -116,9 +133,12 @@ def _lines(figures: Figures) -> Iterator[str]:
         "have one thread and share one core; their rates count seconds of processor time, those of several processes "
         "the clock's.\n"
     )
-    yield "; ".join(f"{name}: {value}" for name, value in figures["machine"].items()) + ".\n"
-    for venv, packages in figures["versions"].items():
-        yield f"`.bench/{venv}`: " + ", ".join(f"{name} {version}" for name, version in packages.items()) + ".\n"
+    for number, here in enumerate(figures["machines"], start=1):
+        facts = [f"{name}: {value}" for name, value in here["machine"].items()]
+        for venv, packages in here["versions"].items():
+            facts.append(f"`.bench/{venv}`: " + ", ".join(f"{name} {version}" for name, version in packages.items()))
+        yield f"{number}. " + "; ".join(facts) + "."
+    yield ""
     yield "## Targets\n"
     yield "| what | over | ratio | target | |"
     yield "| --- | --- | --- | --- | --- |"
@@ -132,6 +152,8 @@ def _lines(figures: Figures) -> Iterator[str]:
     shown = set()
     for title, found in figures["comparisons"].items():
         yield f"\n## {title[0].upper()}{title[1:]}\n"
+        if len(figures["machines"]) > 1:
+            yield f"On machine {found['on'] + 1}.\n"
         yield from _tables(found)
         if found["area"] == "growth":
             yield "\n" + "; ".join(exponents(found["subjects"])) + "."
