@@ -44,6 +44,25 @@ def test_while_a_command_starts(name: str, number: signal.Signals, tmp_path: Pat
     assert not list(tmp_path.iterdir()), "nothing had begun"
 
 
+INSIDE_WAIT = """
+import os, signal, time
+from common.process.lifecycle import Stop
+stop = Stop()
+stop.on_signals()
+with stop._event._cond:  # as `wait` does for a moment
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(0.01)
+print(stop.wait(60), stop.reason, stop.exit_status)
+"""
+
+
+def test_a_signal_at_the_worst_moment() -> None:
+    done = subprocess.run(
+        [SCRIPTS / "python", "-c", INSIDE_WAIT], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "True interrupted 143\n"
+
+
 def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "run"
     flags = ("--total-steps", "3000", "--run-dir", str(path), "--resume")

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from queue import SimpleQueue
 from types import FrameType
 
 from common.errors import CoopError, PeerLost
@@ -54,13 +55,19 @@ class Stop:
         scheduler has told all processes by SIGTERM.
         """
         received: set[int] = set()
+        told: SimpleQueue[int] = SimpleQueue()
 
         def handle(number: int, frame: FrameType | None) -> None:
             if number == signal.SIGINT and number in received:
                 raise KeyboardInterrupt
             received.add(number)
-            self.set("interrupted", exit_status=status_after(number))
+            # Not `set`: the code that the signal interrupts may hold the event's lock, and would wait for itself.
+            told.put(number)
 
+        def follow() -> None:
+            self.set("interrupted", exit_status=status_after(told.get()))
+
+        threading.Thread(target=follow, name="signals", daemon=True).start()
         for number in SIGNALS:
             signal.signal(number, handle)
 
