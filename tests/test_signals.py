@@ -49,7 +49,7 @@ import os, signal, time
 from common.process.lifecycle import Stop
 stop = Stop()
 stop.on_signals()
-with stop._event._cond:  # as `wait` does for a moment
+with stop._changed:  # as `wait` does for a moment
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(0.01)
 print(stop.wait(60), stop.reason, stop.exit_status)

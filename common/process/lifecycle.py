@@ -6,14 +6,15 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
-from queue import SimpleQueue
 from types import FrameType
 
 from common.errors import CoopError, PeerLost
 from common.process.files import NO_SPACE
 
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
+LOOK_EVERY = 0.5  # seconds after which a wait notices a signal that came just before it began
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -24,7 +25,9 @@ class Stop:
     """
 
     def __init__(self) -> None:
-        self._event = threading.Event()
+        # Reentrant, unlike that of an Event: a signal may interrupt code that holds it, and its handler sets the stop.
+        self._changed = threading.Condition(threading.RLock())
+        self._set = False
         supervisor = os.environ.get(SUPERVISED)
         self._parent = int(supervisor) if supervisor else None
         self.reason = ""
@@ -33,19 +36,23 @@ class Stop:
 
     def set(self, reason: str, failed: bool = False, exit_status: int = 0) -> None:
         """Request the stop; a later call does not change the reason, `failed` or `exit_status`."""
-        if not self._event.is_set():
-            self.reason, self.failed, self.exit_status = reason, failed, exit_status
-        self._event.set()
+        with self._changed:
+            if not self._set:
+                self.reason, self.failed, self.exit_status, self._set = reason, failed, exit_status, True
+            self._changed.notify_all()
 
     def is_set(self) -> bool:
         """True once a stop was requested, or once this process's supervisor has gone."""
         if self._parent is not None and os.getppid() != self._parent:
             self.set("the supervisor is gone")
-        return self._event.is_set()
+        return self._set
 
     def wait(self, seconds: float) -> bool:
         """Sleep until the stop or for `seconds`; return True if the stop has been requested."""
-        self._event.wait(seconds)
+        end = time.monotonic() + seconds
+        with self._changed:
+            while not self._set and (left := end - time.monotonic()) > 0:
+                self._changed.wait(min(left, LOOK_EVERY))
         return self.is_set()
 
     def on_signals(self) -> None:
@@ -55,19 +62,13 @@ class Stop:
         scheduler has told all processes by SIGTERM.
         """
         received: set[int] = set()
-        told: SimpleQueue[int] = SimpleQueue()
 
         def handle(number: int, frame: FrameType | None) -> None:
             if number == signal.SIGINT and number in received:
                 raise KeyboardInterrupt
             received.add(number)
-            # Not `set`: the code that the signal interrupts may hold the event's lock, and would wait for itself.
-            told.put(number)
+            self.set("interrupted", exit_status=status_after(number))
 
-        def follow() -> None:
-            self.set("interrupted", exit_status=status_after(told.get()))
-
-        threading.Thread(target=follow, name="signals", daemon=True).start()
         for number in SIGNALS:
             signal.signal(number, handle)
 
