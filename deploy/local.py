@@ -92,12 +92,13 @@ class Topology:
             RunError: a role failed by itself, or was killed too often.
             UsageError: a role rejected the config.
         """
-        if self.learner.exit_status() == 0 or self.learner.was_interrupted():
+        status = self.learner.exit_status()  # once: it may end while this looks at the others
+        if status == 0 or self.learner.was_interrupted():
             return True
         for process in self._all():
             if process.exit_status() is not None and not self._interrupted:
                 self._restart(process, display)
-        if self._interrupted and self.learner.exit_status() is not None:
+        if self._interrupted and status is not None:
             raise RunError(f"{self.learner.why()}; interrupted before it was back, --resume goes on")
         return False
 
