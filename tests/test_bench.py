@@ -132,6 +132,8 @@ def test_figures_say_on_which_machine_they_were_measured(bench: Any) -> None:
     assert measure("first", 1) == both
     assert measure("first", 1) == both
     assert measure("second", 1) == [f"1. {two}", "## First", "## Second"], "nothing is left of the other machine"
+    back = [f"1. {two}", f"2. {one}", "## First", "On machine 1.", "## Second", "On machine 2."]
+    assert measure("second", 0) == back, "and those that stay are numbered anew"
 
 
 def test_a_target_is_measured_by_the_best_of_the_others(bench: Any) -> None:
