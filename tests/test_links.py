@@ -12,10 +12,15 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from samples import await_service
 
 from common.messaging import links
+from common.messaging.keys import weights_key
 from common.messaging.links import close, locators
+from common.messaging.messages.weights import Current
 from common.messaging.session import open_session
+from common.messaging.transport import Node, new_incarnation
+from common.process.processes import ChildProcess, command
 
 LINKS = 20
 
@@ -88,3 +93,29 @@ def test_one_thread_for_all_sessions_ends_with_the_last(endpoint: str, monkeypat
     assert followers() == 0
     close(open_session((endpoint,)))
     assert followers() == 0, "and so again"
+
+
+def test_an_actor_s_link_costs_the_learner_a_third_of_a_mebibyte(endpoint: str, tmp_path: Path) -> None:
+    """Parameters fill a link's send queue, and its buffers remain: with those of other links, 0.8 MiB each."""
+    wide = ("--network.hidden", "700", "700")  # 2 MB, more than the longest queue holds
+    flags = ("--run=test", f"--run-dir={tmp_path / 'run'}", "--listen", endpoint, *wide)
+    learner = ChildProcess("learner", command("coop-learner", *flags), tmp_path / "log")
+    learner.start()
+
+    def resident() -> float:
+        pages = int(Path(f"/proc/{learner.pid}/statm").read_text().split()[1])
+        return pages * resource.getpagesize() / 2**20
+
+    with ExitStack() as stack:
+        stack.callback(learner.end, 0.0)
+
+        def fetch() -> float:
+            node = stack.enter_context(Node(open_session((), (endpoint,)), "test", "actor", new_incarnation()))
+            key = weights_key(node, 1)
+            await_service(node, key)
+            assert node.ask(key, Current().encode("test")).kind == "weights"
+            return resident()
+
+        first = fetch()
+        after = [fetch() for _ in range(LINKS)]
+        assert (after[-1] - first) / LINKS < 0.55, (first, after)

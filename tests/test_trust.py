@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from samples import until
 
 from common.messaging.keys import evaluations_key, join_key, replay_key
+from common.messaging.members import ROUTE
 from common.messaging.messages.epoch import Snapshot
 from common.messaging.messages.evaluate import Evaluated, EvaluationRow
 from common.messaging.messages.join import Join
@@ -149,6 +151,15 @@ def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, s
         assert overheard.try_recv() is None
         token.undeclare()
         assert stats(inside).bad_messages == before.bad_messages, "nothing of it came through"
+
+
+def test_an_actor_s_own_link_to_the_replay_service_is_counted(keys: Path) -> None:
+    """The service shares out what may be in flight among the links that it sees."""
+    at = free_endpoint("tls/127.0.0.1:0")
+    with Node(open_session((at,), (), keys / "replay.json5"), RUN, "replay", new_incarnation()) as replay:
+        with Node(open_session((), (at,), keys / "actor.json5"), RUN, ROUTE, new_incarnation()):
+            until(lambda: replay.presence.counts().get(ROUTE) == 1)
+        until(lambda: ROUTE not in replay.presence.counts())
 
 
 def test_an_evaluator_s_certificate_reads_weights_and_reports(run: tuple[str, str], keys: Path) -> None:
