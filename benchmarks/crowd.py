@@ -18,7 +18,8 @@ from common.process.memory import keep_freed_memory
 
 AT_ONCE = 16  # actors of a process that join at the same time
 AGE_EVERY = 4.0  # seconds
-LOOK_EVERY = 0.001  # seconds between looks for acknowledgements, and
+LOOK_AT_LEAST = 0.02  # seconds between looks for acknowledgements at most, also where sending is late
+LOOK_EVERY = 0.001  # seconds between them otherwise, and
 LOOK_PAUSE = 2e-5  # more for each actor of the process, so that many leave the processor to those they ask
 
 
@@ -77,7 +78,8 @@ class Crowd:
         ]
         heapq.heapify(agenda)
         while (now := time.monotonic()) < began + seconds:
-            while agenda[0][0] <= now:
+            until = now + LOOK_AT_LEAST
+            while agenda[0][0] <= now < until:
                 due, index, what = agenda[0]
                 late = max(late, now - due)
                 heapq.heapreplace(agenda, (max(due + every[what], now - 1.0), index, what))

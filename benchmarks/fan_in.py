@@ -4,7 +4,8 @@ Learner and replay service are the real commands, started anew for each measurem
 updates per step that the learner limits nobody; `--network small` makes the parameters 0.45 MB instead of 6.7, for
 broadcasting them to many actors is a wall of its own. The actors are synthetic (`synthetic.py`): many Zenoh sessions in
 few processes, each with an actor's messages, segments of 32 Atari steps and a window of 16 of them. They join at once,
-and insert `--rate` transitions per second in all. At the end every transition sent must have been accepted once.
+and insert `--rate` transitions per second in all: a few seconds of warm-up, in which each link makes its buffers, and
+then those that are measured. At the end every transition sent must have been accepted once.
 
 Raises the limit of open descriptors to what the system permits. Prints a table, and writes it to `--out`.
 """
@@ -38,6 +39,7 @@ RUN = "fan-in"
 CAPACITY = 20_000  # transitions; the table is full before the actors join, so its growth is not theirs
 UPDATES_PER_STEP = 0.0001  # two updates a second at 20,000 transitions
 SETTLE = 3.0  # seconds between joining and measuring
+WARM_UP = 5.0  # seconds of playing before measuring
 EVERY = 0.25  # seconds between looks at the roles' processes
 FLAGS = (
     *("--preset=breakout", f"--total-steps={10**12}", f"--replay.capacity={CAPACITY}", "--replay.learning-starts=1000"),
@@ -163,10 +165,11 @@ def measure(number: int, options: argparse.Namespace) -> Row:
             joining = time.monotonic() - began
             print(f"{number:,} actors joined in {joining:.1f} s", flush=True)
             time.sleep(SETTLE)
-            roles.check(*pids)
-            before, began = {name: usage(pid) for name, pid in pids.items()}, time.monotonic()
             parts = clients.shares(number)
             rates = [options.rate * part / number for part in parts]
+            first: list[Share] = clients.call("play", rates, [WARM_UP] * processes)
+            roles.check(*pids)
+            before, began = {name: usage(pid) for name, pid in pids.items()}, time.monotonic()
             done: list[Share] = clients.call("play", rates, [options.seconds] * processes)
             seconds = time.monotonic() - began
             print(f"{sum(one.acked for one in done):,} transitions acknowledged in {seconds:.1f} s", flush=True)
@@ -178,13 +181,14 @@ def measure(number: int, options: argparse.Namespace) -> Row:
             time.sleep(1.0)
             stats = replay_stats(node)
         summary = roles.finish()
-    waits = [wait for one in done for wait in one.waits]
+    early, waits = ([wait for one in shares for wait in one.waits] for shares in (first, done))
     ages = [age for one in done for age in one.ages]
-    sent, acked = sum(one.sent for one in done), sum(one.acked for one in done)
+    sent, acked = (sum(getattr(one, what) for one in (*first, *done)) for what in ("sent", "acked"))
     figures = {
         "actors": number,
         "joins/s": (number - 1) / joining if number > 1 else math.nan,
-        "inserts/s": acked / seconds,
+        "warm-up: ack p99, ms": 1000 * percentile(early, 0.99),
+        "inserts/s": sum(one.acked for one in done) / seconds,
         "ack p50, ms": 1000 * percentile(waits, 0.5),
         "ack p99, ms": 1000 * percentile(waits, 0.99),
         "age p50, s": percentile(ages, 0.5),
@@ -203,7 +207,7 @@ def measure(number: int, options: argparse.Namespace) -> Row:
     figures |= {
         "clients: cores": sum(one.processor for one in done) / seconds,
         "clients: late, s": max(one.late for one in done),
-        "retries": sum(one.retries for one in done),
+        "retries": sum(one.retries for one in (*first, *done)),
         "lost": stats.lost + sent - acked,
         "duplicates": stats.duplicates,
     }
