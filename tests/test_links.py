@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from samples import await_service
+from samples import await_service, until
 
 from common.messaging import links
 from common.messaging.keys import weights_key
@@ -119,3 +119,15 @@ def test_an_actor_s_link_costs_the_learner_a_third_of_a_mebibyte(endpoint: str, 
         first = fetch()
         after = [fetch() for _ in range(LINKS)]
         assert (after[-1] - first) / LINKS < 0.55, (first, after)
+
+
+def test_zenoh_s_threads_end_with_the_last_session(endpoint: str) -> None:
+    """A process that ends before them would be killed by SIGABRT now and then."""
+    for _ in range(LINKS):
+        before = set(threading.enumerate())
+        with (
+            Node(open_session((endpoint,)), "test", "learner", new_incarnation()) as learner,
+            Node(open_session((), (endpoint,)), "test", "actor", new_incarnation()) as actor,
+        ):
+            until(lambda: learner.presence.members("actor") and actor.presence.members("learner"))
+        assert set(threading.enumerate()) <= before

@@ -16,13 +16,15 @@ import socket
 import stat
 import struct
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-PATIENCE = 1.0  # seconds for the thread to end once the last session is closed
+PATIENCE = 1.0  # seconds for threads to end once the last session is closed
 PAUSE = 0.2  # seconds between looks at this process's sockets, far less than a peer's lease
+_CALLBACKS = "(pyo3-closure)"  # ends the names of the threads in which Zenoh calls back
 _LINGER_OFF = struct.pack("ii", 0, 0)
 
 
@@ -71,15 +73,18 @@ class _Follower:
                 self._thread.start()
 
     def drop(self, identity: str) -> None:
-        """Forget a session; with the last one, end the thread."""
+        """Forget a session; with the last one, end the thread, and wait for those of Zenoh."""
         with self._lock:
-            self._listeners.pop(identity, None)
+            listener = self._listeners.pop(identity, None)
+            if listener is not None:
+                listener.undeclare()
             if self._listeners or self._thread is None:
                 return
             self._closing.set()
             self._changed.set()
             self._thread.join(PATIENCE)
             self._thread = None
+        _await_callbacks()
 
     def _run(self) -> None:
         while self._changed.wait() and not self._closing.is_set():
@@ -102,6 +107,17 @@ def close(session: zenoh.Session) -> None:
     with contextlib.suppress(zenoh.ZError):  # it then says that it took too long
         session.close()  # type: ignore[no-untyped-call]
     _follower.drop(identity)
+
+
+def _await_callbacks() -> None:
+    """Wait for the threads in which Zenoh called back: they end a moment after their session is closed.
+
+    Python ends those that remain when it exits by unwinding their stack, which Zenoh's code answers with SIGABRT.
+    """
+    deadline = time.monotonic() + PATIENCE
+    for thread in threading.enumerate():
+        if thread.name.endswith(_CALLBACKS):
+            thread.join(max(0.0, deadline - time.monotonic()))
 
 
 def _linger_off() -> None:
