@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,9 @@ from numpy.typing import NDArray
 from replay.table.policies import Eviction, Floats, Rows, Sampling, TableView
 
 PRIORITY_FLOOR = 1e-6
-SEARCHED = 4096  # nodes
+GROUP_BITS = 6
+GROUP = 1 << GROUP_BITS
+TOP = 2048  # nodes, whose running sums take less time than another level
 
 
 class Fifo(Eviction):
@@ -111,25 +112,28 @@ class Proportional(Sampling):
 
 
 class SumTree:
-    """Sums of non-negative values, sixteen to a node: values are set and found by running sum in O(log n).
+    """Sums of non-negative values, `GROUP` to a node: values are set and found by running sum in O(log n).
 
-    Every node is always the sum of its sixteen, added from left to right, so the tree depends only on its values, not
-    on the order of updates: a restored tree equals the saved one to the bit. A search begins at the lowest level of at
-    most `SEARCHED` nodes, whose running sums take as long as a level's descent.
+    Every node is always the sum of its group, added from left to right, so the tree depends only on its values, not
+    on the order of updates: a restored tree equals the saved one to the bit. The running sums of each group
+    are kept, so that a search only compares. The lowest level of at most `TOP` nodes is the last, one group.
     """
 
     def __init__(self, capacity: int) -> None:
-        self._levels: list[Floats] = []  # [groups, 16], from the values up; the last level has one group
-        groups = capacity
-        while not self._levels or groups > 1:
-            groups = -(-groups // 16)
-            self._levels.append(np.zeros((groups, 16)))
-        self._searched = next(number for number, level in enumerate(self._levels) if level.size <= SEARCHED)
+        self._levels: list[Floats] = []  # [groups, GROUP], from the values up; the last one is [1, nodes]
+        self._running: list[Floats] = []  # of each level, [groups, GROUP + 1]: 0, and the sums of a group's first
+        nodes = capacity
+        while nodes > TOP:
+            nodes = -(-nodes // GROUP)
+            self._levels.append(np.zeros((nodes, GROUP)))
+            self._running.append(np.zeros((nodes, GROUP + 1)))
+        self._levels.append(np.zeros((1, nodes)))
+        self._running.append(np.zeros((1, nodes + 1)))
 
     @property
     def total(self) -> float:
         """Sum of all values."""
-        return float(self._levels[-1].cumsum()[-1])
+        return float(self._running[-1][0, -1])
 
     def values(self, rows: Rows) -> Floats:
         """Values at these rows."""
@@ -139,25 +143,25 @@ class SumTree:
     def update(self, rows: Rows, values: Floats) -> None:
         """Set values; if a row repeats, its last value counts."""
         self._levels[0].ravel()[rows] = values
-        for below, above in pairwise(self._levels):
-            rows = rows >> 4
-            above.ravel()[rows] = below.take(rows, axis=0).cumsum(axis=1)[:, -1]
+        for below, running, above in zip(self._levels, self._running, self._levels[1:], strict=False):
+            rows = rows >> GROUP_BITS
+            sums = below.take(rows, axis=0).cumsum(axis=1)
+            running[rows, 1:] = sums
+            above.ravel()[rows] = sums[:, -1]
+        self._levels[-1].cumsum(out=self._running[-1][0, 1:])
 
     def find(self, sums: Floats) -> Rows:
         """For each running sum in [0, total), the row whose value covers it; never a row whose value is 0."""
         lines = np.arange(len(sums))
-        top = self._levels[self._searched]
-        running = np.zeros(1 + top.size)  # the sum before each node, and the total
-        top.cumsum(out=running[1:])
+        top = self._running[-1][0]
         # Rounding may move a sum to the end of its node, which no value covers.
-        sums = np.minimum(sums, np.nextafter(running[-1], 0))
-        nodes = running.searchsorted(sums, "right") - 1
-        sums = sums - running[nodes]
-        for level in reversed(self._levels[: self._searched]):
-            running = np.zeros((len(sums), 17))
-            level.take(nodes, axis=0).cumsum(axis=1, out=running[:, 1:])
-            sums = np.minimum(sums, np.nextafter(running[:, -1], 0))
-            child = (running[:, 1:] > sums[:, None]).argmax(axis=1)
-            sums = sums - running[lines, child]
-            nodes = nodes * 16 + child
+        sums = np.minimum(sums, np.nextafter(top[-1], 0))
+        nodes: Rows = top.searchsorted(sums, "right") - 1
+        before = top[nodes]
+        for running in self._running[-2::-1]:
+            inside = running.take(nodes, axis=0)
+            sums = np.minimum(sums - before, np.nextafter(inside[:, -1], 0))
+            child = (inside > sums[:, None]).argmax(axis=1) - 1
+            before = inside[lines, child]
+            nodes = nodes * GROUP + child
         return nodes
