@@ -38,7 +38,7 @@ NETWORKS = {
     "q_share": "mean |Q| / its bound",
     "terminal_share": "share of terminal transitions",
 }
-SHARES = frozenset({"evicted_unsampled", "policy_churn", "dormant_share", "terminal_share"})
+SHARES = frozenset({"evicted_unsampled", "dormant_share"})  # drawn from 0 to 1; others are small
 MEANING = (
     "On the first transitions drawn, which stay as they are; changes are those since the last row of metrics, 200 "
     "updates before. The share of terminal transitions is that of the buffer."

@@ -27,6 +27,7 @@ from experiments.report.table import ResultTable, Value
 OTHERS = ["#000000", "#0072B2", "#CC79A7", "#999933", "#882255", "#44AA99"]
 COLUMNS = 3  # of panels
 WIDTH = 7.2  # inches, of a page's text; a single panel has two thirds of it
+LEGEND = 6  # labels beside each other in a legend as wide as a page's text
 HEIGHT = 1.9  # inches, of a panel
 DPI = 170
 TICK = 0.24  # inches, of a line of a label on the y axis
@@ -44,7 +45,7 @@ STYLE: dict[Any, Any] = {
 class Line:
     """Points with their intervals; x and each y are float64 [n]. An interval of nan only is not drawn.
 
-    faint: small dots without a line, of single runs.
+    dashed: a level to compare with, with a marker at x = 0 only. faint: small dots without a line, of single runs.
     """
 
     label: str
@@ -139,7 +140,9 @@ def draw(figure: Figure, path: Path) -> None:
         for axes in grid.flat[number:]:
             axes.axis("off")
         if len(handles) > 1 and not any(set(panel.ticks) >= handles.keys() for panel in figure.panels):
-            canvas.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=6)
+            legend_rows = math.ceil(len(handles) / (LEGEND * figure.width / WIDTH))
+            per_row = math.ceil(len(handles) / legend_rows)
+            canvas.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=per_row)
         # Not by `savefig`, which draws each file twice; after the first one everything has its place.
         FigureCanvasAgg(canvas).print_png(path, metadata={"Software": None})  # type: ignore[no-untyped-call]
         canvas.set_layout_engine("none")
@@ -150,9 +153,12 @@ def _draw_line(axes: Axes, panel: Panel, line: Line, colour: str) -> None:
     value, low, high = line.y
     if line.faint:
         axes.plot(value, line.x, "o", color=colour, alpha=0.4, markersize=3, markeredgewidth=0, zorder=3)
+    elif line.dashed:
+        axes.plot(line.x, value, "o--", color=colour, markevery=line.x == 0)
+        axes.fill_between(line.x, low, high, color=colour, alpha=0.1, linewidth=0)
     elif panel.marks:
         bounds = np.nan_to_num(np.stack([(value - low).clip(0), (high - value).clip(0)]))
-        style = "o" if panel.ticks else "o--" if line.dashed else "o-"
+        style = "o" if panel.ticks else "o-"
         if panel.ticks:
             axes.errorbar(value, line.x, xerr=bounds, fmt=style, capsize=2, color=colour, elinewidth=1)
         else:
@@ -195,7 +201,7 @@ def _name_axes(axes: Axes, panel: Panel, *, x: bool, y: bool) -> None:
     if x or panel.ticks:
         axes.set_xlabel(across)
     if y or panel.ticks:
-        axes.set_ylabel("\n".join(textwrap.wrap(up, 34)))
+        axes.set_ylabel("\n".join(textwrap.wrap(up, 26)))
 
 
 def _wrapped(tick: str) -> str:
@@ -218,6 +224,7 @@ def _spread_x(axes: Axes, panel: Panel, columns: int) -> None:
         axes.set_xscale("log")
     else:
         axes.set_xscale("symlog", linthresh=sizes[0], linscale=0.5)  # 0 has no place on a logarithmic axis
+    axes.autoscale_view()  # or the labels would be placed by the limits before the scale was set
     axes.set_xticks(values, _labels(axes, values, columns))
     axes.xaxis.set_minor_locator(NullLocator())
 
@@ -225,15 +232,15 @@ def _spread_x(axes: Axes, panel: Panel, columns: int) -> None:
 def _labels(axes: Axes, values: Sequence[float], columns: int) -> list[str]:
     """Labels of ticks, of which one that would touch another is empty; the last and then the first ones stay."""
     scale = axes.transData + axes.transAxes.inverted()
-    letter = 0.005 + 0.02 * columns  # share of the axis
+    letter = 0.0025 + 0.01 * columns  # share of the axis
     labels = list(map(_short, values))
-    kept: list[float] = []
+    kept: list[tuple[float, int]] = []
     for number in (len(values) - 1, *range(len(values) - 1)):
-        place = float(scale.transform((values[number], 1.0))[0])
-        if any(abs(place - other) < letter * (1 + len(labels[number])) / 2 for other in kept):
+        place, length = float(scale.transform((values[number], 1.0))[0]), len(labels[number])
+        if any(abs(place - other) < letter * (length + letters + 2) / 2 for other, letters in kept):
             labels[number] = ""
         else:
-            kept.append(place)
+            kept.append((place, length))
     return labels
 
 
