@@ -25,7 +25,7 @@ check: $(READY)
 
 # Every figure and table of results/, from the packed studies there.
 results: $(READY)
-	@for study in results/cartpole/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
+	@for study in results/cartpole/*.parquet results/minatar/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
 	@$(BIN)/coop-report results/pong.parquet --curves results/pong
 
 # Checks that take longer; docs/robustness.md says what each shows.

@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from experiments.registered import RULES, areas
 from experiments.report import comparisons, results
 from experiments.report.study import Study, load_study
 
@@ -17,7 +18,14 @@ RESULTS = Path(__file__).parent.parent / "results"
 CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]
 PAGES = {
     page: " ".join((RESULTS / page).read_text().split())
-    for page in ("README.md", "cartpole/README.md", "../README.md", "../docs/cartpole.md")
+    for page in (
+        "README.md",
+        "cartpole/README.md",
+        "minatar/README.md",
+        "minatar/plan.md",
+        "../README.md",
+        "../docs/cartpole.md",
+    )
 }
 TABLES = {
     "table1": results.paper_table,
@@ -36,11 +44,13 @@ TABLES = {
 
 @cache
 def study_of(name: str) -> Study:
-    return load_study(RESULTS / "cartpole" / f"{name}.parquet")
+    return load_study(RESULTS / (f"{name}.parquet" if "/" in name else f"cartpole/{name}.parquet"))
 
 
 @cache
 def table_of(study: str, name: str) -> pd.DataFrame:
+    if name in RULES:
+        return RULES[name](areas(study_of(study)))
     table = TABLES[name](study_of(study))
     return pd.DataFrame(table.rows, columns=list(table.columns))
 

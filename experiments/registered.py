@@ -1,0 +1,135 @@
+"""The rules of the registered MinAtar study (results/minatar/plan.md), applied to packed studies.
+
+`python -m experiments.registered pilot|rates|outcome FILE` prints the table that a rule reads and what it decides.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from common.settings.config import value_of
+from experiments.report.learning import area
+from experiments.report.study import Study, load_study
+
+LARGE = 100_000  # transitions
+LOSS = 45.0  # percent, of dqn's area at LARGE: "small" is the capacity whose loss is nearest
+ENOUGH = 10.0  # points: the least advantage that confirms the hypothesis
+RESAMPLES = 10_000
+PRIMARY = "two networks - one"
+PAIRS = (("coop", "edql"), ("g-coop", "dqn"))  # two networks, one network
+
+
+def areas(study: Study) -> pd.DataFrame:
+    """A row for each run: method, game, capacity, learning rate, seed and area.
+
+    Raises ValueError if a run diverged or is missing, since the plan says otherwise than the report how it counts.
+    """
+    if study.diverged or study.missing:
+        raise ValueError(f"not finished: {', '.join([*study.diverged, *study.missing])}")
+    rows = [
+        {
+            "method": run.config.method,
+            "game": run.config.env.id.removeprefix("MinAtar/").removesuffix("-v1"),
+            "capacity": value_of(run.config, "replay.capacity"),
+            "rate": value_of(run.config, "learner.learning_rate"),
+            "seed": run.config.seed,
+            "area": area(run),
+        }
+        for run in study.runs
+    ]
+    return pd.DataFrame(rows)
+
+
+def losses(runs: pd.DataFrame) -> pd.DataFrame:
+    """Pilot: of each game and capacity the mean area, its standard deviation, and the loss against LARGE in percent.
+
+    The column `small` marks the capacity of each game whose loss is nearest to LOSS; of two equally near, the smaller.
+    """
+    groups = runs.groupby(["game", "capacity"])["area"]
+    table = pd.DataFrame({"area": groups.mean(), "sd": groups.std()}).reset_index()
+    large = table[table["capacity"] == LARGE].set_index("game")["area"]
+    table["loss"] = 100 * (1 - table["area"] / table["game"].map(large))
+    candidates = table[table["capacity"] < LARGE]
+    distances = (candidates["loss"] - LOSS).abs()
+    table["small"] = table.index.isin(distances.groupby(candidates["game"]).idxmin())
+    return table
+
+
+def rates(runs: pd.DataFrame) -> pd.DataFrame:
+    """Rates: of each method and rate the share of each game's largest mean area, in percent, and their mean.
+
+    The column `chosen` marks the rate of each method with the largest mean.
+    """
+    means = runs.groupby(["method", "rate", "game"], sort=False)["area"].mean().unstack()
+    shares = 100 * means / means.max()
+    shares["mean"] = shares.mean(axis=1)
+    best = shares["mean"].groupby("method").idxmax()
+    shares["chosen"] = shares.index.isin(best)
+    return shares.reset_index()
+
+
+def points(runs: pd.DataFrame) -> pd.DataFrame:
+    """Study: the runs with `score`, their area in percent of dqn's mean area at LARGE in the same game, and `size`."""
+    large = runs[(runs["method"] == "dqn") & (runs["capacity"] == LARGE)].groupby("game")["area"].mean()
+    size = np.where(runs["capacity"] == LARGE, "large", "small")
+    return runs.assign(score=100 * runs["area"] / runs["game"].map(large), size=size)
+
+
+def outcome(runs: pd.DataFrame) -> pd.DataFrame:
+    """Study: the primary outcome and what stands beside it, in points, with 95 % bootstrap intervals over seeds.
+
+    Primary: two networks minus one, the mean over PAIRS, at the small size minus the same at LARGE, mean over games.
+    """
+    scores = points(runs).set_index(["method", "game", "size", "seed"])["score"].unstack("method")
+    made = {f"{two} - {one}": scores[two] - scores[one] for two, one in PAIRS if two in scores and one in scores}
+    both = {PRIMARY: sum(made.values()) / len(made), **made}
+    if "medqn" in scores:
+        both["medqn - dqn"] = scores["medqn"] - scores["dqn"]
+    rows = []
+    for name, values in both.items():
+        by_size = values.groupby(["seed", "size"]).mean().unstack()
+        of_seeds = {
+            "small": by_size["small"],
+            "large": by_size["large"],
+            "small - large": by_size["small"] - by_size["large"],
+        }
+        rows += [[name, what, *_estimate(each.to_numpy(np.float64)), len(each)] for what, each in of_seeds.items()]
+    return pd.DataFrame(rows, columns=["difference", "size", "points", "low", "high", "seeds"])
+
+
+def verdict(points: float, low: float, high: float) -> str:
+    """The registered rule on the primary outcome."""
+    if low > 0 and points >= ENOUGH:
+        return "confirmed"
+    return "denied" if high < ENOUGH else "inconclusive"
+
+
+def _estimate(values: np.ndarray) -> tuple[float, float, float]:
+    """Mean over seeds with its percentile bootstrap interval."""
+    drawn = np.random.default_rng(0).choice(values, (RESAMPLES, len(values))).mean(axis=1)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return float(values.mean()), float(low), float(high)
+
+
+RULES = {"pilot": losses, "rates": rates, "outcome": outcome}
+
+
+def main() -> None:
+    """Print the table of a rule for a packed study."""
+    parser = argparse.ArgumentParser("python -m experiments.registered", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("rule", choices=RULES)
+    parser.add_argument("file", type=Path, help="packed study")
+    args = parser.parse_args()
+    table = RULES[args.rule](areas(load_study(args.file)))
+    print(table.to_string(index=False, float_format="{:.2f}".format))
+    if args.rule == "outcome":
+        primary = table[(table["difference"] == PRIMARY) & (table["size"] == "small - large")]
+        print(verdict(*primary[["points", "low", "high"]].iloc[0]))
+
+
+if __name__ == "__main__":
+    main()
