@@ -41,7 +41,7 @@ class Block:
 
 def page_names() -> list[str]:
     """The pages, as paths below the repository's root."""
-    folders = ("*.md", "docs/*.md", "results/*.md", "results/*/README.md", "results/minatar/*.md", "benchmarks/*.md")
+    folders = ("*.md", "docs/*.md", "results/*.md", "results/*/README.md", "results/minatar/plan.md", "benchmarks/*.md")
     return [path.relative_to(ROOT).as_posix() for folder in folders for path in sorted(ROOT.glob(folder))]
 
 
