@@ -19,7 +19,7 @@ from common.networks.convolution import ConvolutionNetwork
 from common.networks.custom import custom_network
 from common.networks.dense import Dense
 from common.networks.inputs import preprocess
-from common.networks.layout import ArrayT, Layout, digest, views
+from common.networks.layout import ArrayT, Layout, digest, mlp_layout, views
 from common.networks.normalised import NormalisedNetwork
 from common.settings.config import NETWORK_KINDS
 from common.types import EnvSpec
@@ -57,12 +57,11 @@ def _mlp(spec: EnvSpec, hidden: Sequence[int]) -> nn.Sequential:
     layers: OrderedDict[str, nn.Module] = OrderedDict()
     if len(spec.input_shape) > 1:
         layers["flatten"] = nn.Flatten()
-    width = math.prod(spec.input_shape)
-    for i, size in enumerate(hidden, start=1):
-        layers[f"fc{i}"] = nn.Linear(width, size)
-        layers[f"relu{i}"] = nn.ReLU()
-        width = size
-    layers["out"] = nn.Linear(width, spec.num_actions)
+    for name, (outputs, inputs) in mlp_layout(spec, hidden)[::2]:  # weights; each is followed by its bias
+        layer = name.removesuffix(".weight")
+        layers[layer] = nn.Linear(inputs, outputs)
+        if layer != "out":
+            layers[layer.replace("fc", "relu")] = nn.ReLU()
     return nn.Sequential(layers)
 
 
