@@ -120,6 +120,27 @@ def test_a_method_with_settings_of_its_own_varies_in_them(tmp_path: Path) -> Non
         load_grid(str(path))
 
 
+def test_a_grid_sets_fields_of_single_methods(tmp_path: Path) -> None:
+    path = tmp_path / "g.toml"
+    text = 'methods = ["dqn", "coop"]\nfixed.learner.learning_rate = 0.25\n'
+    path.write_text(text + "fixed.methods.coop.learner.learning_rate = 0.5\n")
+    grid = load_grid(str(path))
+    assert [(cell.name, cell.config.learner.learning_rate) for cell in grid.cells] == [
+        ("dqn-seed=0", 0.25),
+        ("coop-seed=0", 0.5),
+    ]
+    (tmp_path / "sweep.toml").write_text(grid.to_toml())
+    assert load_grid(str(tmp_path / "sweep.toml")).cells == grid.cells
+    for wrong, words in (
+        ("fixed.methods.coop.learner.rate = 1", "learner.rate = 1: no such field"),
+        ("fixed.methods.sarsa.gamma = 1", "methods.sarsa: no such method"),
+        ("fixed.methods.coop.learner.gamma = 0.5\nvary.learner.gamma = [0.5, 0.9]", "are the same run"),
+    ):
+        path.write_text(text + wrong)
+        with pytest.raises(UsageError, match=words):
+            load_grid(str(path))
+
+
 def test_bad_flags_are_refused_before_anything_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
