@@ -12,6 +12,7 @@ import pytest
 
 from experiments.registered import RULES, areas
 from experiments.report import comparisons, results
+from experiments.report.baseline import baseline_table, find_baseline
 from experiments.report.study import Study, load_study
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -51,7 +52,11 @@ def study_of(name: str) -> Study:
 def table_of(study: str, name: str) -> pd.DataFrame:
     if name in RULES:
         return RULES[name](areas(study_of(study)))
-    table = TABLES[name](study_of(study))
+    kind, _, baseline = name.partition(" ")
+    if kind == "baseline":
+        table = baseline_table(study_of(study), find_baseline(study_of(study), baseline))
+    else:
+        table = TABLES[name](study_of(study))
     return pd.DataFrame(table.rows, columns=list(table.columns))
 
 
