@@ -10,10 +10,13 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from experiments.film import Film
 from experiments.registered import RULES, areas
 from experiments.report import comparisons, results
 from experiments.report.baseline import baseline_table, find_baseline
+from experiments.report.sources import open_source
 from experiments.report.study import Study, load_study
+from experiments.saved import SavedRun
 
 RESULTS = Path(__file__).parent.parent / "results"
 CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]
@@ -103,6 +106,33 @@ def test_a_number_that_is_not_in_the_page_is_found() -> None:
     (text,) = texts(claim)
     assert re.fullmatch(r"a return of \d+\.\d{3} here", text)
     assert text not in PAGES["README.md"]
+
+
+def test_what_the_page_of_pong_says() -> None:
+    page = " ".join((RESULTS / "pong" / "README.md").read_text().split())
+    columns = open_source(RESULTS / "pong.parquet").columns("coop", "episodes.csv", ("env_step", "return"))
+    games = pd.DataFrame(columns)
+    last, late = games["return"][-100:], games["return"][games["env_step"] > 400_000]
+    best = games["return"].rolling(100).mean().idxmax()
+    first = games["env_step"][games["return"] > 0].iloc[0]
+    for text in (
+        f"a return of {last.mean():.1f} ({last.std(ddof=0):.1f}) over the last 100 games, {sum(last > 0)} of them won",
+        f"was {games['return'].rolling(100).mean().max():.1f}, at {games['env_step'][best]:,} steps",
+        f"Its first win came at {first:,} steps",
+        f"{(late >= 18).sum()} of {len(late)} games end at 18 or more and {(late < 10).sum()} below 10",
+    ):
+        assert text in page
+    for _, part in games.groupby((games["env_step"] - 1) // 100_000):
+        won = (part["return"] > 0).sum()
+        assert f"| {len(part)} | {won} | {part['return'].mean():.1f} |" in page
+
+
+def test_the_networks_of_pong_win() -> None:
+    run = SavedRun(RESULTS / "pong" / "coop")
+    film = Film(run.policy("mean"), run.config.env, seed=0)
+    for _ in film:
+        pass
+    assert film.episode_return > 0
 
 
 def test_studies_that_share_runs() -> None:
