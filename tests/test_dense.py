@@ -79,7 +79,7 @@ def test_samples_that_lack_rank_get_a_whole_polar_factor() -> None:
     out = {name: np.empty(p.shape) for name, p in network.named_parameters()}
     b = np.empty((4, 2, 5))
     for sample, row in np.ndindex(4, 2):  # the hidden layer's bias gradient is B^T e
-        with np.errstate(all="ignore"):  # as an update does
+        with np.errstate(divide="ignore", invalid="ignore"):  # as an update does
             rule.backward(rule.chain.forward(x[[sample]]), np.eye(2)[[row]], s, out)
         b[sample, row] = out["0.bias"]
     values = np.linalg.svd(b, compute_uv=False)

@@ -30,7 +30,7 @@ from deploy.status import RunStatus
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 # Unbuffered, Python drops what is left of a write that a signal has cut short.
-TERMINAL = {**os.environ, "TERM": "xterm", "PYTHONUNBUFFERED": ""}
+ENVIRONMENT = {**os.environ, "TERM": "xterm", "PYTHONUNBUFFERED": ""}
 
 
 class Terminal:
@@ -98,7 +98,7 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
         contextlib.closing(terminal),
         contextlib.closing(status),
         ThreadPoolExecutor() as threads,
-        started(local, stdout=terminal.writing, env=TERMINAL) as run,
+        started(local, stdout=terminal.writing, env=ENVIRONMENT) as run,
     ):
         before = wait_for(status, lambda now: now.measured is not None and "actor 0" in states(now))
         first = threads.submit(run_command, *watch)
@@ -183,7 +183,7 @@ def test_what_others_write_to_standard_error_does_not_move_the_picture(both: boo
     errors = tmp_path / "errors"
     with contextlib.closing(Terminal()) as terminal, errors.open("w") as file:
         streams = {"stdout": terminal.writing, "stderr": terminal.writing if both else file}
-        with started(["python", "-c", NOISY], env=TERMINAL, **streams) as process:
+        with started(["python", "-c", NOISY], env=ENVIRONMENT, **streams) as process:
             assert process.wait(60) == 0
     begun, *pictures = terminal.pictures()
     assert begun == [""]

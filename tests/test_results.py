@@ -63,8 +63,17 @@ def table_of(study: str, name: str) -> pd.DataFrame:
     return pd.DataFrame(table.rows, columns=list(table.columns))
 
 
+def cells_of(claim: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name, cell in claim["cells"].items():
+        (row,) = table_of(claim["study"], cell["table"]).query(claim["where"]).query(cell["where"]).to_dict("records")
+        yield name, row
+
+
 def texts(claim: dict[str, Any]) -> Iterator[str]:
     """The claim's texts with the numbers filled in."""
+    if "cells" in claim:
+        yield claim["text"].format_map(dict(cells_of(claim)))
+        return
     rows = table_of(claim["study"], claim["table"])
     if "where" in claim:
         rows = rows.query(claim["where"])
