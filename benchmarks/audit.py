@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from common.errors import RunError
 from common.types import Array
+from learner.records.epochs import newest_epoch
 
 RESET = 0.05  # CartPole begins an episode with all four numbers within this
 
@@ -19,7 +21,10 @@ def audit(run_dir: Path) -> tuple[int, int]:
 
     A gap is an observation without a predecessor that begins no episode: the transition before it is missing.
     """
-    (table,) = run_dir.glob("checkpoints/*/replay")
+    closing = newest_epoch(run_dir)
+    if closing is None:
+        raise RunError(f"{run_dir}: has no epoch")
+    table = closing / "replay"
     slots, frames = np.load(table / "slots.npy"), np.load(table / "frames.npy")
     obs, next_obs = frames[slots[:, 0]], frames[slots[:, 1]]
     begins = (np.abs(obs) <= RESET).all(1)
