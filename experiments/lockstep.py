@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -25,6 +26,8 @@ from learner.records.epochs import load_learner, save_epoch
 from learner.records.run_directory import RunDirectory
 from learner.trainer import Effects, Trainer
 from replay.persistence.storage import Mark
+
+Replaying = Callable[[int, int], None]  # actions played again, all of them
 
 
 class Lockstep:
@@ -107,23 +110,24 @@ class Lockstep:
             text = f"epoch {self.agent.updates} in {directory.path}: {error.strerror or error}"
             raise RunError(text) from error
 
-    def restore(self, epoch: Path) -> dict[str, int]:
+    def restore(self, epoch: Path, replaying: Replaying = lambda played, actions: None) -> dict[str, int]:
         """Restore an epoch from `save`; return the sizes of the run's files at that time, in bytes.
 
         The emulator's state is restored by playing the same actions again, which is exact for every deterministic
-        environment.
+        environment. replaying: called before each action with how many are played and how many there are.
 
         Raises:
             UsageError: the epoch does not belong to a lockstep run.
             RunError: the environment is not deterministic: its observations, rewards or ends differ from the run's.
         """
         state = load_learner(epoch)
+        replay_actions = partial(self._replay_actions, replaying=replaying)
         if isinstance(self.memory, TableMemory) and old_checkpoints.is_old(epoch):
-            state = old_checkpoints.load(epoch, state, self.memory.table, self._replay_actions)
+            state = old_checkpoints.load(epoch, state, self.memory.table, replay_actions)
         elif "player" not in state:
             raise UsageError(f"{epoch}: saved by a distributed run; coop-local --resume continues it")
         else:
-            self._replay_actions(state["player"]["actions"].tolist())
+            replay_actions(state["player"]["actions"].tolist())
             if state["player"].get("seen", self._seen) != self._seen:  # earlier versions did not save it
                 raise RunError(
                     f"{epoch}: {self.config.env.id} showed something else when the run's {len(self._actions):,} "
@@ -136,9 +140,10 @@ class Lockstep:
         sizes: dict[str, int] = state["sizes"]
         return sizes
 
-    def _replay_actions(self, actions: Iterable[int]) -> None:
+    def _replay_actions(self, actions: list[int], replaying: Replaying) -> None:
         """Play the actions of a run again; the memory is restored separately."""
         for step, action in enumerate(actions):
+            replaying(step, len(actions))
             turn = self._player.replay(np.array([action], np.int32))
             self.memory.follow(turn, step)
             self._follow(turn)

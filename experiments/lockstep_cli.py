@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable
 from contextlib import closing
 
 from common.errors import RunError
@@ -10,6 +12,8 @@ from common.process.console import say
 from common.process.importing import importing
 from common.process.lifecycle import Stop, run_main
 from common.settings.options import RunOptions, beginning, parse_run
+
+REPLAY_PROGRESS_EVERY = 5.0  # seconds
 
 
 def main() -> None:
@@ -27,13 +31,37 @@ def _run() -> None:
 
     stop = Stop()
     stop.on_signals()
-    with closing(LockstepRun(config, path, "coop-lockstep", resume=options.resume, wandb=options.wandb)) as run:
+    replaying = _replaying(stop)
+    opened = LockstepRun(
+        config, path, "coop-lockstep", resume=options.resume, wandb=options.wandb, replaying=replaying
+    )
+    with closing(opened) as run:
         if options.resume:
             print(beginning(path) if run.epoch is None else f"goes on from epoch {run.epoch.name}", flush=True)
-        summary = run.play(stop, lambda line: say(line, end="\r" if sys.stdout.isatty() else "\n"))
+        summary = run.play(stop, _progress)
     stopped = summary.exit == stop.reason  # otherwise the run was complete before the signal
     say(f"{summary}; coop-lockstep --resume --run-dir {path} goes on" if stopped else f"{summary}; {path}")
     if run.diverged:
         raise RunError(run.diverged)
     if stopped:
         stop.leave()
+
+
+def _progress(line: str) -> None:
+    say(line, end="\r" if sys.stdout.isatty() else "\n")
+
+
+def _replaying(stop: Stop) -> Callable[[int, int], None]:
+    """Follows the actions that a resumed run plays again: a line every few seconds, and an end on a signal."""
+    due = time.monotonic() + REPLAY_PROGRESS_EVERY
+
+    def replaying(played: int, actions: int) -> None:
+        nonlocal due
+        if stop.is_set():
+            say("interrupted before the run went on; its files are as they were")
+            stop.leave()
+        if time.monotonic() >= due:
+            due = time.monotonic() + REPLAY_PROGRESS_EVERY
+            _progress(f"plays the run's actions again: {played:,}/{actions:,}")
+
+    return replaying

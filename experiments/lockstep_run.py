@@ -14,7 +14,7 @@ from common.process.locks import RunLock
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from experiments.episodes import Evaluator
-from experiments.lockstep import Lockstep
+from experiments.lockstep import Lockstep, Replaying
 from learner.records.epochs import newest_epoch
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
@@ -28,8 +28,19 @@ class LockstepRun:
     epoch: from which it goes on; None if it starts.
     """
 
-    def __init__(self, config: RunConfig, path: Path, program: str, *, resume: bool, wandb: bool = False) -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        path: Path,
+        program: str,
+        *,
+        resume: bool,
+        wandb: bool = False,
+        replaying: Replaying = lambda played, actions: None,
+    ) -> None:
         """Prepare the run; program: named to other processes that want the directory. wandb: see `RunDirectory`.
+
+        replaying: see `Lockstep.restore`; what it raises leaves the run as it was.
 
         Raises:
             UsageError: the config does not fit the environment, or the directory's epoch a lockstep run.
@@ -48,7 +59,7 @@ class LockstepRun:
             raise
         try:
             self.epoch = newest_epoch(path) if resume else None
-            self._sizes = None if self.epoch is None else self._run.restore(self.epoch)
+            self._sizes = None if self.epoch is None else self._run.restore(self.epoch, replaying)
         except BaseException:
             self.close()
             raise

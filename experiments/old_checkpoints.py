@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ def is_old(epoch: Path) -> bool:
 
 
 def load(
-    epoch: Path, state: dict[str, Any], table: Table, replay_actions: Callable[[Iterable[int]], None]
+    epoch: Path, state: dict[str, Any], table: Table, replay_actions: Callable[[list[int]], None]
 ) -> dict[str, Any]:
     """Fill a new table, and convert the state to today's learner.pt; the old format has no wall time."""
     arrays = {path.stem: np.load(path) for path in (epoch / "replay").glob("*.npy")}

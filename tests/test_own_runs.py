@@ -12,7 +12,8 @@ from typing import Any
 import gymnasium
 import my_envs
 import pytest
-from commands import run_command
+from commands import Command, run_command
+from test_topology import wait_for
 
 from common.errors import RunError
 from common.process.processes import free_endpoint
@@ -56,6 +57,40 @@ def test_a_module_elsewhere_is_trained(folder: Path, env_id: str, network: str, 
     if command == ["coop-lockstep"]:
         played = run(folder, "coop-eval", "run", "--episodes", "2")
         assert re.search(r"^run +100 +1 acts +0 +2 ", played.stdout, re.MULTILINE), played.stderr
+
+
+SLOW = """
+import time
+from pathlib import Path
+import gymnasium
+from gymnasium.envs.classic_control import CartPoleEnv
+
+class Slow(CartPoleEnv):
+    def step(self, action):
+        time.sleep(0.02 * Path("slow").exists())
+        return super().step(action)
+
+gymnasium.register("Slow-v0", entry_point=Slow, max_episode_steps=200)
+"""
+
+
+def test_playing_the_actions_again_shows_progress_and_can_be_interrupted(tmp_path: Path) -> None:
+    (tmp_path / "slow_envs.py").write_text(SLOW)
+    flags = ["--env.id", "slow_envs:Slow-v0", *SHORT, "--total-steps", "600", "--run-dir", "run"]
+    done = run(tmp_path, "coop-lockstep", *flags)
+    assert done.returncode == 0, done.stdout + done.stderr
+    paths = [path for path in (tmp_path / "run").rglob("*") if path.is_file() and path.suffix != ".lock"]
+    files = [path.read_bytes() for path in paths]
+    (tmp_path / "slow").touch()
+    command = Command("coop-lockstep", *flags, "--total-steps", "1000", "--resume", cwd=tmp_path)  # 12 s for 600 actions
+    wait_for("progress", lambda: command.output()[0])
+    command.interrupt()
+    done = command.end(60)
+    assert done.returncode == 130, done.stderr
+    shown, said = done.stdout.splitlines()
+    assert re.fullmatch(r"plays the run's actions again: \d+/600", shown)
+    assert said == "interrupted before the run went on; its files are as they were"
+    assert files == [path.read_bytes() for path in paths]
 
 
 class Changed(my_envs.Room):
