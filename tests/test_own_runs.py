@@ -82,7 +82,7 @@ def test_playing_the_actions_again_shows_progress_and_can_be_interrupted(tmp_pat
     paths = [path for path in (tmp_path / "run").rglob("*") if path.is_file() and path.suffix != ".lock"]
     files = [path.read_bytes() for path in paths]
     (tmp_path / "slow").touch()
-    command = Command("coop-lockstep", *flags, "--total-steps", "1000", "--resume", cwd=tmp_path)  # 12 s for 600 actions
+    command = Command("coop-lockstep", *flags, "--total-steps", "1000", "--resume", cwd=tmp_path)  # takes 12 s
     wait_for("progress", lambda: command.output()[0])
     command.interrupt()
     done = command.end(60)
