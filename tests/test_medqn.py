@@ -10,6 +10,8 @@ from test_agent import SPEC, batches
 
 from common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
 from common.settings.medqn import MedqnSettings
+from common.settings.sources import base_config
+from common.settings.tables import preset_names
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
 from learner.methods.medqn import Consolidation
@@ -147,3 +149,10 @@ def test_without_an_input_there_are_no_bounds() -> None:
     assert {name: (bound.shape, bound.dtype) for name, bound in state.items()} == {
         "low": ((0,), torch.float32), "high": ((0,), torch.float32)
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("preset", preset_names())
+def test_presets_of_pictures_consolidate_on_real_states(preset: str) -> None:
+    own = base_config(["--preset", preset, "--method", "medqn"]).own
+    assert isinstance(own, MedqnSettings)
+    assert own.states == ("uniform" if preset.startswith("cartpole") else "real")
