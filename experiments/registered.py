@@ -125,7 +125,7 @@ def main() -> None:
     parser.add_argument("file", type=Path, help="packed study")
     args = parser.parse_args()
     table = RULES[args.rule](areas(load_study(args.file)))
-    print(table.to_string(index=False, float_format="{:.2f}".format))
+    print(table.to_string(index=False, float_format="{:.6g}".format))
     if args.rule == "outcome":
         primary = table[(table["difference"] == PRIMARY) & (table["size"] == "small - large")]
         print(verdict(*primary[["points", "low", "high"]].iloc[0]))
