@@ -117,14 +117,21 @@ def test_a_number_that_is_not_in_the_page_is_found() -> None:
     assert text not in PAGES["README.md"]
 
 
+def games_of(run: str) -> pd.DataFrame:
+    return pd.DataFrame(open_source(RESULTS / "pong.parquet").columns(run, "episodes.csv", ("env_step", "return")))
+
+
 def test_what_the_page_of_pong_says() -> None:
     page = " ".join((RESULTS / "pong" / "README.md").read_text().split())
-    columns = open_source(RESULTS / "pong.parquet").columns("coop", "episodes.csv", ("env_step", "return"))
-    games = pd.DataFrame(columns)
+    games, falling = (games_of(run) for run in ("coop", "coop-falling"))
     last, late = games["return"][-100:], games["return"][games["env_step"] > 400_000]
     best = games["return"].rolling(100).mean().idxmax()
     first = games["env_step"][games["return"] > 0].iloc[0]
+    assert not (falling["return"] > 0).any()
+    stopped = falling["return"][-100:]
     for text in (
+        f"a return of {stopped.mean():.1f} ({stopped.std(ddof=0):.1f}) over the last 100 games and no game won, "
+        f"where the run above had won {(games['return'][games['env_step'] <= 374_834] > 0).sum()}",
         f"a return of {last.mean():.1f} ({last.std(ddof=0):.1f}) over the last 100 games, {sum(last > 0)} of them won",
         f"was {games['return'].rolling(100).mean().max():.1f}, at {games['env_step'][best]:,} steps",
         f"Its first win came at {first:,} steps",
