@@ -72,6 +72,8 @@ def test_the_primary_outcome() -> None:
     assert points["g-coop - dqn"].tolist() == pytest.approx([10, -10, 20])
     assert points["two networks - one"].tolist() == pytest.approx([25, -15, 40])
     assert table["low"].tolist() == pytest.approx(points.tolist())  # the same for all seeds
+    beside = outcome(study_runs(small, {**large, "stream-q": 1.0}))  # without a buffer, it has its preset's capacity
+    pd.testing.assert_frame_equal(beside.set_index(["difference", "size"]), table)
     without = outcome(study_runs(small, large, edql=False)).set_index(["difference", "size"])["points"]
     assert without["two networks - one"].tolist() == pytest.approx([10, -10, 20])
 
