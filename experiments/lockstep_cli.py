@@ -32,9 +32,7 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     replaying = _replaying(stop)
-    opened = LockstepRun(
-        config, path, "coop-lockstep", resume=options.resume, wandb=options.wandb, replaying=replaying
-    )
+    opened = LockstepRun(config, path, "coop-lockstep", resume=options.resume, wandb=options.wandb, replaying=replaying)
     with closing(opened) as run:
         if options.resume:
             print(beginning(path) if run.epoch is None else f"goes on from epoch {run.epoch.name}", flush=True)
