@@ -145,6 +145,20 @@ def test_a_target_is_measured_by_the_best_of_the_others(bench: Any) -> None:
     assert results.reached(target("work", "work/s", "ours", ("one", "third"), 2.0), figures) is None
 
 
+def test_a_target_without_others_is_a_figure(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    results, target = bench("results"), bench("areas").Target
+    figures = {"machines": [], **_figures(base={"seconds": [2.5, 2.0, 2.9]})}
+    targets = [target("work", "seconds", "base", (), bound, at_most=True) for bound in (2.6, 2.4)]
+    assert results.reached(targets[0], figures) == ("", [2.5, 2.0, 2.9])
+    assert results.reached(target("work", "seconds", "ours", (), 2.0), figures) is None
+    monkeypatch.setattr(results, "TARGETS", targets)
+    lines = [line for line in results.page(figures).splitlines() if line.startswith("| work: base")]
+    assert lines == [
+        "| work: base, seconds |  | 2.50 (2.00 to 2.90) | at most 2.60 | met |",
+        "| work: base, seconds |  | 2.50 (2.00 to 2.90) | at most 2.40 | short |",
+    ]
+
+
 def test_the_cost_of_growing_work(bench: Any) -> None:
     subjects = {"10": {"us a unit": [2.0], "MiB": [5.0]}, "1,000": {"us a unit": [20.0], "MiB": [50.0]}}
     assert list(bench("results").exponents(subjects)) == ["time grows as size^1.50", "memory grows as size^0.50"]

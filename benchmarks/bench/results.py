@@ -112,10 +112,12 @@ def _short(value: float) -> str:
 
 
 def reached(target: Target, figures: Figures) -> tuple[str, list[float]] | None:
-    """The subject that the target is measured by, and the ratio of each round; None if they were not measured."""
+    """The subject that the target is measured by, if any, and the figure of each round; None if they were not measured."""
     subjects = figures["comparisons"].get(target.comparison, {}).get("subjects", {})
-    if target.over not in subjects or not set(target.under) <= set(subjects):
+    if not {target.over, *target.under} <= set(subjects):
         return None
+    if not target.under:
+        return "", subjects[target.over][target.measure]
     best = (min if target.at_most else max)(target.under, key=lambda name: median(subjects[name][target.measure]))
     return best, ratios(subjects[target.over][target.measure], subjects[best][target.measure])
 
@@ -140,7 +142,7 @@ def _lines(figures: Figures) -> Iterator[str]:
         yield f"{number}. " + "; ".join(facts) + "."
     yield ""
     yield "## Targets\n"
-    yield "| what | over | ratio | target | |"
+    yield "| what | over | figure | target | |"
     yield "| --- | --- | --- | --- | --- |"
     for target in TARGETS:
         if found := reached(target, figures):

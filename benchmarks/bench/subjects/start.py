@@ -1,12 +1,11 @@
 """What users wait for: start.py torch|edl|local|report. A turn is one process, from its start.
 
-torch, edl: the imports of PyTorch and of `learner.edl`. local: `coop-local` until its first row of metrics, after 200
-updates. report: `coop-report` of the 336 runs of a packed study.
+torch, edl: the imports of PyTorch and of `learner.edl`. local: `coop-local` to its first update, which counts as made when
+the epoch saved after it is complete. report: `coop-report` of the 336 runs of a packed study.
 """
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from turns import attend
 ROOT = Path(__file__).parents[3]
 PACKED = ROOT / "results" / "cartpole" / "small-buffers.parquet"
 BIN = Path(sys.executable).parent
-LOCAL = ("--preset", "cartpole", "--method", "coop", "--actors", "1")
+LOCAL = ("--preset", "cartpole", "--method", "coop", "--actors", "1", "--total-updates", "1")
 
 
 def imported(module: str) -> None:
@@ -26,16 +25,13 @@ def imported(module: str) -> None:
 
 
 def local(folder: str) -> float:
-    """Seconds to the first row."""
-    rows, begun = Path(folder) / "run" / "metrics.jsonl", time.monotonic()
-    process = subprocess.Popen(
-        [BIN / "coop-local", *LOCAL, "--run-dir", Path(folder) / "run"], stdout=subprocess.DEVNULL
-    )
-    while not (rows.exists() and rows.stat().st_size):
+    """Seconds to the first update."""
+    run, begun = Path(folder) / "run", time.monotonic()
+    process = subprocess.Popen([BIN / "coop-local", *LOCAL, "--run-dir", run], stdout=subprocess.DEVNULL)
+    while not list(run.glob("checkpoints/*/DONE")):
         assert process.poll() is None
         time.sleep(0.01)
     spent = time.monotonic() - begun
-    process.send_signal(signal.SIGINT)
     process.wait()
     return spent
 
