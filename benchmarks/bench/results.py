@@ -112,7 +112,7 @@ def _short(value: float) -> str:
 
 
 def reached(target: Target, figures: Figures) -> tuple[str, list[float]] | None:
-    """The subject that the target is measured by, if any, and the figure of each round; None if they were not measured."""
+    """The subject that the target is measured by, if any, and the figures by round; None if they were not measured."""
     subjects = figures["comparisons"].get(target.comparison, {}).get("subjects", {})
     if not {target.over, *target.under} <= set(subjects):
         return None
