@@ -106,6 +106,7 @@ def _end_to_end() -> Iterator[Comparison]:
         subjects = {
             "Stable-Baselines3": Subject("learn", ("sb3", task)),
             "TorchRL": Subject("learn", ("torchrl", task)),
+            "dqn lockstep": Subject("learn", ("lockstep", task, "dqn")),
             "coop lockstep": Subject("learn", ("lockstep", task)),
             "coop distributed": Subject("learn", ("distributed", task), cores=0),
         }

@@ -1,4 +1,4 @@
-"""Whole runs to a mean return over 100 episodes, each turn with the next seed: learn.py WHO TASK.
+"""Whole runs to a mean return over 100 episodes, each turn with the next seed: learn.py WHO TASK [METHOD].
 
 A turn is a new process, from its start to its end. A run that does not get there within the steps of its task counts
 with what it took, and is not solved.
@@ -17,24 +17,27 @@ from typing import Any
 
 from turns import attend
 
-# By task: our preset, the mean return, and the steps at most.
-TASKS = {"cartpole": ("cartpole", 195.0, 50_000), "minatar-breakout": ("minatar-breakout", 5.0, 150_000)}
+# By task: the mean return, and the steps at most. Our preset has its name.
+TASKS = {"cartpole": (195.0, 50_000), "minatar-breakout": (5.0, 150_000)}
+# Updates a step, the same for everybody: those of Stable-Baselines3's zoo, and of our preset.
+RATIOS = {"cartpole": "0.5", "minatar-breakout": "1"}
 OURS = {"lockstep": ("coop-lockstep",), "distributed": ("coop-local", "--actors", "1")}
 
 
-def run(who: str, preset: str, seed: int, folder: Path, *more: str) -> dict[str, Any]:
+def run(who: str, preset: str, seed: int, folder: Path, *more: str, method: str = "coop") -> dict[str, Any]:
     """The summary of one run of ours."""
     name, *flags = OURS[who]
-    flags += ["--preset", preset, "--method", "coop", "--seed", str(seed), "--run-dir", str(folder / "run"), *more]
+    flags += ["--preset", preset, "--method", method, "--seed", str(seed), "--run-dir", str(folder / "run"), *more]
     subprocess.run([str(Path(sys.executable).with_name(name)), *flags], check=True, stdout=subprocess.DEVNULL)
     summary: dict[str, Any] = json.loads((folder / "run" / "summary.json").read_text())
     return summary
 
 
-def ours(who: str, task: str, seed: int, folder: Path) -> tuple[int, bool]:
+def ours(who: str, task: str, method: str, seed: int, folder: Path) -> tuple[int, bool]:
     """Steps, and whether it got there."""
-    preset, mean, most = TASKS[task]
-    summary = run(who, preset, seed, folder, "--target-return", str(mean), "--total-steps", str(most))
+    mean, most = TASKS[task]
+    flags = ["--replay.ratio", RATIOS[task], "--target-return", str(mean), "--total-steps", str(most)]
+    summary = run(who, task, seed, folder, *flags, method=method)
     return summary["env_steps"], summary["return_mean_100"] >= mean
 
 
@@ -46,13 +49,13 @@ def rival(who: str, task: str, seed: int) -> tuple[int, bool]:
     return steps, solved
 
 
-def main(who: str, task: str) -> None:
+def main(who: str, task: str, method: str = "coop") -> None:
     seeds = count()
 
     def turn(_: float) -> dict[str, float]:
         seed, begun = next(seeds), time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
-            steps, solved = ours(who, task, seed, Path(folder)) if who in OURS else rival(who, task, seed)
+            steps, solved = ours(who, task, method, seed, Path(folder)) if who in OURS else rival(who, task, seed)
         return {"seconds": time.monotonic() - begun, "steps": steps, "solved": solved}
 
     attend(turn)

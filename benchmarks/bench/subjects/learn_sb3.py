@@ -90,7 +90,7 @@ class Goal(BaseCallback):
 
 
 def main(task: str, seed: int) -> None:
-    _, mean, most = TASKS[task]
+    mean, most = TASKS[task]
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     settings = SETTINGS[task]

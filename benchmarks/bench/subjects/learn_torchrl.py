@@ -40,7 +40,7 @@ class Single(nn.Module):
 
 
 def main(task: str, seed: int) -> None:
-    _, mean, most = TASKS[task]
+    mean, most = TASKS[task]
     settings = SETTINGS[task]
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
