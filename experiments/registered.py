@@ -1,6 +1,6 @@
 """The rules of the registered MinAtar study (results/minatar/plan.md), applied to packed studies.
 
-`python -m experiments.registered pilot|rates|outcome FILE` prints the table that a rule reads and what it decides.
+`python -m experiments.registered pilot|rates|scores|outcome FILE` prints a table that the plan reads and what it decides.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PAIRS = (("coop", "edql"), ("g-coop", "dqn"))  # two networks, one network
 
 
 def areas(study: Study) -> pd.DataFrame:
-    """A row for each run: method, game, capacity, learning rate, seed and area.
+    """A row for each run: method, game, capacity (0 without a replay buffer), learning rate, seed and area.
 
     Raises ValueError if a run diverged or is missing, since the plan says otherwise than the report how it counts.
     """
@@ -34,7 +34,7 @@ def areas(study: Study) -> pd.DataFrame:
         {
             "method": run.config.method,
             "game": run.config.env.id.removeprefix("MinAtar/").removesuffix("-v1"),
-            "capacity": value_of(run.config, "replay.capacity"),
+            "capacity": value_of(run.config, "replay.capacity") if run.config.method in study.buffered else 0,
             "rate": value_of(run.config, "learner.learning_rate"),
             "seed": run.config.seed,
             "area": area(run),
@@ -75,8 +75,20 @@ def rates(runs: pd.DataFrame) -> pd.DataFrame:
 def points(runs: pd.DataFrame) -> pd.DataFrame:
     """Study: the runs with `score`, their area in percent of dqn's mean area at LARGE in the same game, and `size`."""
     large = runs[(runs["method"] == "dqn") & (runs["capacity"] == LARGE)].groupby("game")["area"].mean()
-    size = np.where(runs["capacity"] == LARGE, "large", "small")
+    size = runs["capacity"].map({0: "none", LARGE: "large"}).fillna("small")
     return runs.assign(score=100 * runs["area"] / runs["game"].map(large), size=size)
+
+
+def scores(runs: pd.DataFrame) -> pd.DataFrame:
+    """Study: of each method and size the mean area in each game, and the mean score over games with its deviation.
+
+    The standard deviation is that over seeds, of their means over games.
+    """
+    found = points(runs)
+    by_seed = found.groupby(["method", "size", "seed"], sort=False)["score"].mean()
+    groups = by_seed.groupby(["method", "size"], sort=False)
+    means = found.groupby(["method", "size", "game"], sort=False)["area"].mean().unstack()
+    return means.assign(score=groups.mean(), sd=groups.std()).reset_index()
 
 
 def outcome(runs: pd.DataFrame) -> pd.DataFrame:
@@ -115,7 +127,7 @@ def _estimate(values: np.ndarray) -> tuple[float, float, float]:
     return float(values.mean()), float(low), float(high)
 
 
-RULES = {"pilot": losses, "rates": rates, "outcome": outcome}
+RULES = {"pilot": losses, "rates": rates, "scores": scores, "outcome": outcome}
 
 
 def main() -> None:

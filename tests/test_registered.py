@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import pandas as pd
 import pytest
 
-from experiments.registered import LARGE, losses, outcome, rates, verdict
+from experiments.registered import LARGE, losses, outcome, rates, scores, verdict
 
 
 def runs(areas: Mapping[tuple[str, str, int, float, int], float]) -> pd.DataFrame:
@@ -72,10 +72,25 @@ def test_the_primary_outcome() -> None:
     assert points["g-coop - dqn"].tolist() == pytest.approx([10, -10, 20])
     assert points["two networks - one"].tolist() == pytest.approx([25, -15, 40])
     assert table["low"].tolist() == pytest.approx(points.tolist())  # the same for all seeds
-    beside = outcome(study_runs(small, {**large, "stream-q": 1.0}))  # without a buffer, it has its preset's capacity
+    beside = outcome(pd.concat([study_runs(small, large), without_buffer(1.0)]))
     pd.testing.assert_frame_equal(beside.set_index(["difference", "size"]), table)
     without = outcome(study_runs(small, large, edql=False)).set_index(["difference", "size"])["points"]
     assert without["two networks - one"].tolist() == pytest.approx([10, -10, 20])
+
+
+def without_buffer(area: float) -> pd.DataFrame:
+    return runs({("stream-q", game, 0, 1.0, seed): area for game in "AB" for seed in range(3)})
+
+
+def test_scores_are_percent_of_dqn_with_the_large_buffer() -> None:
+    table = study_runs({"dqn": 3.0}, {"dqn": 5.0}, edql=False)
+    table.loc[(table["seed"] == 2) & (table["capacity"] == 300) & (table["game"] == "A"), "area"] = 6.0
+    found = scores(pd.concat([table, without_buffer(2.5)])).set_index(["method", "size"])
+    assert found["A"].tolist() == pytest.approx([4.0, 5.0, 2.5])  # (3 + 3 + 6) / 3
+    assert found["B"].tolist() == pytest.approx([30.0, 50.0, 2.5])
+    assert found["score"].tolist() == pytest.approx([70.0, 100.0, 27.5])  # by seed: 60, 60, 90; (50 + 5) / 2
+    assert found["sd"].tolist() == pytest.approx([300**0.5, 0, 0])
+    assert found.index.tolist() == [("dqn", "small"), ("dqn", "large"), ("stream-q", "none")]
 
 
 def test_the_interval_resamples_whole_seeds() -> None:
