@@ -1,6 +1,6 @@
 """The rules of the registered MinAtar study (results/minatar/plan.md), applied to packed studies.
 
-`python -m experiments.registered pilot|rates|scores|outcome FILE` prints a table that the plan reads and what it decides.
+`python -m experiments.registered pilot|rates|scores|outcome FILE` prints a table of the plan and what it decides.
 """
 
 from __future__ import annotations
