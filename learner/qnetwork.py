@@ -29,8 +29,8 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 class QNetwork:
     """One network with the passes of an update.
 
-    The parameters are float32. With network.dtype "bfloat16", target values and the passes of the gradient methods run
-    on a copy in bfloat16; error-driven feedback needs the accuracy of float32.
+    The parameters are float32. With network.dtype "bfloat16" all passes run on a copy in bfloat16; the algebra of
+    error-driven feedback, on A x A matrices, stays in float32 or better.
 
     Args:
         network: the parameters, also published and saved. half: a copy in bfloat16, or None.
@@ -51,7 +51,7 @@ class QNetwork:
         spec: EnvSpec,
         rng: np.random.Generator,
     ) -> None:
-        polar_dtype = torch.bfloat16 if config.edl.polar_dtype == "bfloat16" else None
+        polar_dtype = torch.bfloat16 if half is None and config.edl.polar_dtype == "bfloat16" else None
         in_numpy = polar_dtype is None and not config.learner.compile
         self.network = network
         self._half = half
@@ -62,40 +62,42 @@ class QNetwork:
             raise UsageError(f"network.kind = {config.network.kind!r}: {error}") from error
         if isinstance(self._trained.chain, Graph):
             _check_plain(config)
-        self._target = self._trained if half is None else Trainable(half, in_numpy, None)
-        self._source = self._target if config.feedback == "none" else self._trained
-        rule = FeedbackRule(self._source.chain, config.feedback, config.seed, polar_dtype, rng)
+        self._passes = self._trained if half is None else Trainable(half, in_numpy, None)
+        rule = FeedbackRule(self._passes.chain, config.feedback, config.seed, polar_dtype, rng)
         ready = torch.compile if config.learner.compile else _as_it_is
-        self._forward = ready(self._source.chain.forward)
-        self._values = ready(self._target.values)
+        self._forward = ready(self._passes.chain.forward)
+        self._values = ready(self._passes.values)
         self._backward = ready(rule.backward)
         self.theta: Any
         self.gradient: Any
         self.theta, self.gradient = self._trained.theta, self._trained.gradient
 
     def inputs(self, batch: Batch, spec: EnvSpec) -> AnyArray:
-        """The input of both networks for a batch: [2 batch, *input], obs first, then next_obs."""
+        """The input of both networks for a batch: [2 batch, *input], obs before next_obs, pictures channels last."""
         index = np.concatenate((batch.obs_index, batch.next_index)).reshape(-1)
-        if self._trained.in_numpy:
+        if self._passes.in_numpy:
             return preprocess(batch.frames.take(index, axis=0).reshape(-1, *spec.obs_shape), spec)
         device = self.network.flat.device
         # Copies, because arrays from the wire are read-only and PyTorch warns about views of those.
         frames, places = torch.tensor(batch.frames, device=device), torch.tensor(index, device=device)
-        return preprocess(frames.index_select(0, places).view(-1, *spec.obs_shape), spec)
+        obs = frames.index_select(0, places).view(-1, *spec.obs_shape)
+        if obs.dim() == 4:
+            obs = obs.contiguous(memory_format=torch.channels_last)
+        return preprocess(obs, spec, self._passes.gradient.dtype)
 
     def forward(self, inputs: AnyArray) -> Tape[Any]:
         """Run a forward pass and record its activations for `backward`."""
-        return self._forward(self._source.cast(inputs))
+        return self._forward(self._passes.cast(inputs))
 
     def values(self, inputs: AnyArray) -> NDArray[np.float32]:
         """Q-values for the targets, float32 [batch, actions] on the CPU."""
-        return on_host(self._values(self._target.cast(inputs)))
+        return on_host(self._values(self._passes.cast(inputs)))
 
     def backward(self, tape: Tape[Any], output_error: NDArray[np.float32], s: float) -> None:
         """Compute `gradient` from an output error, float32 [batch, actions], through the method's feedback."""
-        self._backward(tape, self._source.cast(output_error), s, self._source.gradients)
-        if self._source is not self._trained:
-            assign(self.gradient, self._source.gradient)
+        self._backward(tape, self._passes.cast(output_error), s, self._passes.gradients)
+        if self._passes is not self._trained:
+            assign(self.gradient, self._passes.gradient)
 
     def add_gradient(self, tape: Tape[Any], output_error: NDArray[np.float32]) -> None:
         """Add the gradient of another cost to `gradient`; s is 0 in it. Arguments as `backward`'s."""

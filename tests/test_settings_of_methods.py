@@ -81,6 +81,7 @@ def test_tables_of_methods_are_checked(text: str, words: str) -> None:
         (["--edl.rate", "0", "--edl.noise", "normal"], ["edl.noise"]),
         (["--edl.decay", "1", "--edl.decay-every", "5"], ["edl.decay-every"]),
         (["--edl.feedback", "weight-gradient", "--edl.polar_dtype", "float32"], ["edl.polar-dtype"]),
+        (["--network.dtype", "bfloat16", "--edl.polar-dtype", "bfloat16"], ["edl.polar-dtype"]),
         (["--preset", "catch", "--network.hidden", "3", "4"], ["network.hidden"]),
         (["--method", "dqn", "--learner.target-update-every", "5"], []),
         (

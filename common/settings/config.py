@@ -46,7 +46,7 @@ class NetworkSettings:
     hidden: Annotated[tuple[Positive, ...], Field(max_length=MAX_LAYERS)] = (128, 128, 128)
     """Widths of the mlp's hidden layers."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16 applies to acting, targets and all passes of the gradient methods; parameters stay in float32."""
+    """bfloat16 applies to acting, targets and all passes of an update; parameters stay in float32."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class EdlSettings:
     feedback: Literal["transform", "weight-gradient", "random"] = "transform"
     """U, S and V: of each layer's Jacobian (transform), of its weight gradient, or a fixed random B instead."""
     polar_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Precision of the s U V^T part of the transform feedback; T^T e is always float32."""
+    """Precision of the s U V^T part of the transform feedback; T^T e has that of network.dtype."""
 
 
 @dataclass(frozen=True)

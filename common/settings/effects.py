@@ -27,6 +27,11 @@ _CONDITIONS = (
         lambda c: c.edl.feedback == "transform",
         "edl.feedback = {c.edl.feedback!r} has no such part",
     ),
+    Condition(
+        ("edl.polar_dtype",),
+        lambda c: c.network.dtype == "float32",
+        "network.dtype = {c.network.dtype!r} has it in that precision too",
+    ),
     Condition(("network.hidden",), lambda c: c.network.kind == "mlp", "{c.network.kind} has layers of its own"),
     Condition(
         ("learner.swap_every",),

@@ -56,8 +56,8 @@ def namespace(array: ArrayT) -> Namespace[ArrayT]:
 
 def convert_like(values: AnyArray, array: ArrayT) -> ArrayT:
     """Convert `values`, of either library, to the library, dtype and device of `array`, without a needless copy."""
-    if isinstance(values, Tensor) and values.dtype == torch.bfloat16:  # numpy lacks bfloat16
-        values = values.float()
+    if isinstance(values, Tensor) and values.dtype == torch.bfloat16 and not isinstance(array, Tensor):
+        values = values.float()  # numpy lacks bfloat16
     return namespace(array).asarray(values, dtype=array.dtype, device=array.device)
 
 
@@ -69,6 +69,11 @@ def widened(array: ArrayT) -> ArrayT:
 def in_dtype(array: ArrayT, dtype: torch.dtype | None) -> ArrayT:
     """A tensor in `dtype`, without a needless copy; the array itself if it is numpy's or dtype is None."""
     return array.to(dtype) if isinstance(array, Tensor) and dtype is not None else array
+
+
+def at_least_float32(array: ArrayT) -> ArrayT:
+    """`array` in float32 if it is in bfloat16, without a needless copy."""
+    return array.float() if isinstance(array, Tensor) and array.dtype == torch.bfloat16 else array
 
 
 def assign(array: ArrayT, values: AnyArray) -> None:

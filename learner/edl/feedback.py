@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from common.process.memory import keep_freed_memory
-from learner.edl.arrays import ArrayT, convert_like
+from learner.edl.arrays import ArrayT, at_least_float32, convert_like
 from learner.edl.layers import make_passes
 from learner.edl.passes import Passes, Tape
 from learner.edl.polar import polar, polar_of_product
@@ -115,9 +115,10 @@ class FeedbackRule(Generic[ArrayT]):
 
 def _polar_of_gradient(gradient: ArrayT, delta: ArrayT, h: ArrayT, rng: np.random.Generator) -> ArrayT:
     """U V^T of a weight gradient [m, ...]; for a Linear layer it is delta^T h, rank-deficient in a small batch."""
-    matrix = torch.as_tensor(gradient).flatten(1)
+    matrix = at_least_float32(torch.as_tensor(gradient)).flatten(1)
     if h.ndim == 2 and len(delta) < min(matrix.shape):
-        factor = polar_of_product(torch.as_tensor(delta), torch.as_tensor(h), rng)
+        left, right = (at_least_float32(torch.as_tensor(rows)) for rows in (delta, h))
+        factor = polar_of_product(left, right, rng)
     else:
         factor = polar(matrix, rng)
     return convert_like(factor.view(gradient.shape), gradient)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cache
-from typing import Generic
+from typing import Any, Generic
 
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import ArrayT, Namespace, convert_like, in_dtype, namespace, widened
+from learner.edl.arrays import ArrayT, Namespace, at_least_float32, convert_like, in_dtype, namespace, widened
 from learner.edl.passes import Passes, Tape
 from learner.edl.polar import polar_by_svd, whitened
 
@@ -29,23 +29,29 @@ class Transforms(Generic[ArrayT]):
 
     _chain: Passes[ArrayT]
     _basis: ArrayT
+    _dtype: Any
     _batch: int
     _actions: int
     _ts: list[ArrayT]
 
     def __init__(self, chain: Passes[ArrayT], tape: Tape[ArrayT], dtype: torch.dtype | None = None) -> None:
-        """dtype: of the computation of T(i), the network's if None; the algebra on them uses at least float32."""
+        """dtype: of the computation of T(i), the network's if None; the algebra on them uses at least float32.
+
+        What goes back to the layers has the network's dtype.
+        """
         self._chain = chain
         self._batch, self._actions = tape.output.shape
-        self._basis = _basis(chain.output_weight, tape.output)
-        walk = chain.walk(tape, in_dtype(self._basis[None], dtype), dtype)
+        self._dtype = tape.output.dtype
+        self._basis = _basis(chain.output_weight, at_least_float32(tape.output))
+        walk = chain.walk(tape, in_dtype(self._basis[None], dtype or self._dtype), dtype)
         self._linear_end = next(walk)[0] if chain.output_weight is not None else None
         # The layers held, last first: step, shape of its output, and T as [batch or 1, A, n].
         self._layers: list[tuple[int, tuple[int, ...]]] = []
         self._ts = []
         for index, t in walk:
             self._layers.append((index, t.shape[2:]))
-            self._ts.append(_flat(t) if dtype is None else convert_like(_flat(t), tape.output))
+            flat = _flat(t)
+            self._ts.append(flat if flat.dtype == self._basis.dtype else convert_like(flat, self._basis))
         self._ranges = [chain.range_of(index) for index, _ in self._layers]
 
     def apply_feedback(self, error: ArrayT, s: float, polar_only: bool = False) -> Iterator[tuple[int, ArrayT]]:
@@ -57,7 +63,7 @@ class Transforms(Generic[ArrayT]):
             yield self._linear_end, error * (s if polar_only else 1 + s)
         if not self._ts:
             return
-        e = error @ self._basis.T
+        e = at_least_float32(error) @ self._basis.T
         white, doubtful = whitened(self._grams(), e)
         weights = s * white if polar_only else e + s * white
         for i, (index, shape) in enumerate(self._layers):
@@ -65,7 +71,7 @@ class Transforms(Generic[ArrayT]):
             if doubtful is not None and doubtful[i].any():
                 where = doubtful[i]
                 sigma[where] += s * (e[where][:, None] @ self._by_svd(i, where))[:, 0]
-            yield index, _shaped(sigma, shape)
+            yield index, in_dtype(_shaped(sigma, shape), self._dtype)
 
     def matrices(self, s: float) -> list[tuple[int, ArrayT]]:
         """(step, B(i) = T(i) + s U V^T), last first: [batch, A, n_i], images with channels first."""

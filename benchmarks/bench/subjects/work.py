@@ -51,7 +51,6 @@ def update_config(
     tables = load_tables(KINDS[kind][0], None)
     tables.pop("methods", None)
     tables["network"] |= {"dtype": dtype}
-    tables["edl"] |= {"polar_dtype": dtype}
     adam = {"optimizer": "adam", "learning_rate": 1e-4, "eps": 1e-8, "loss": "huber", "double": False}
     tables["learner"] |= adam | {"batch_size": batch_size, "swap_every": 10_000, "device": device}
     tables["replay"] |= replay
