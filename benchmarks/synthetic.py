@@ -32,13 +32,12 @@ from common.messaging.messages.status import ActorStatus
 from common.messaging.messages.weights import Current, Role
 from common.messaging.session import open_session
 from common.messaging.transport import NoAnswer, Pending, new_incarnation
-from common.messaging.wire import Message
 
 STEPS, STREAMS = 32, 8  # of a segment; emulators of an actor
 WINDOW = 2 * STREAMS  # segments in flight, as many as an actor has by default
 REPEAT_AFTER = 0.2  # seconds
 PATIENCE = 120.0  # seconds for an actor to join, and for the last acknowledgements
-REFUSED = Message("retry", "", {}, {})
+REFUSED = wire.decode(bytes(wire.encode("retry", "", {})))
 TEMPLATES = list(islice(segments(ATARI, STEPS, STREAMS), 2 * STREAMS))  # the first segment of each stream, and the next
 
 

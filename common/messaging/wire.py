@@ -10,10 +10,10 @@ import math
 import struct
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
+from functools import lru_cache
 from reprlib import repr as shown
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
-import msgpack
 import msgspec
 import numpy as np
 
@@ -37,17 +37,60 @@ DTYPES = {
 _NAMES = {np.dtype(name): name for name in DTYPES}
 
 _PREFIX = struct.Struct("<II")
+_TABLES = 256  # kept, of arrays: one for each number of frames that batches and segments have
 _pack = msgspec.msgpack.Encoder().encode
+
+
+class _Header(msgspec.Struct, forbid_unknown_fields=True):
+    protocol: Any
+    kind: Any
+    run: Any
+    fields: Any
+    arrays: msgspec.Raw
+
+
+_unpack_header = msgspec.msgpack.Decoder(_Header).decode
+_unpack = msgspec.msgpack.Decoder().decode
+# Text that is not UTF-8, a key that can't be hashed, too deep a nesting, a date out of range.
+_NOT_MSGPACK = (msgspec.DecodeError, ValueError, TypeError, RecursionError, OverflowError)
+
+
+class Place(NamedTuple):
+    """Where one array lies: `offset` and `end` count bytes from the end of the header."""
+
+    name: str
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    offset: int
+    end: int
+
+    @property
+    def nbytes(self) -> int:
+        """Of the array."""
+        return self.end - self.offset
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayTable:
+    """The arrays of messages that differ in their contents only; equal tables are one object, as long as it is kept.
+
+    packed: as it stands in the header. size: bytes behind the header.
+    """
+
+    places: tuple[Place, ...]
+    packed: msgspec.Raw
+    size: int
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One decoded message; `arrays` are read-only views of `payload`, the bytes received."""
+    """One decoded message; `arrays` are read-only views of `payload`, the bytes received; `table` describes them."""
 
     kind: str
     run: str
     fields: Mapping[str, Any]
     arrays: Mapping[str, Array]
+    table: ArrayTable
     payload: bytes = b""
 
 
@@ -82,30 +125,38 @@ def encode(
     into: an earlier message whose memory is reused, because it is in the processor's caches.
     """
     arrays = arrays or {}
-    table: list[tuple[str, str, tuple[int, ...], int]] = []
-    size = 0
-    for name, array in arrays.items():
-        offset = _aligned(size)
-        table.append((name, _NAMES[array.dtype], array.shape, offset))
-        size = offset + array.nbytes
-    header = _pack({"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": table})
+    table = _table_of(tuple((name, array.dtype, array.shape) for name, array in arrays.items()))
+    header = _pack({"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": table.packed})
     head = _PREFIX.pack(MAGIC, len(header)) + header
     start = _aligned(len(head))
-    payload = _sized(into, start + size)
+    payload = _sized(into, start + table.size)
     payload[:start] = head.ljust(start, b"\0")
     whole = memoryview(payload)
     end = start
-    for (_, dtype, shape, offset), array in zip(table, arrays.values(), strict=True):
-        begin = start + offset
+    for place, array in zip(table.places, arrays.values(), strict=True):
+        begin = start + place.offset
         whole[end:begin] = bytes(begin - end)
-        end = begin + array.nbytes
-        if not array.nbytes:
+        end = start + place.end
+        if begin == end:
             continue
         if isinstance(array, np.ndarray):
-            whole[begin:end] = np.ascontiguousarray(array, DTYPES[dtype]).data.cast("B")
+            whole[begin:end] = np.ascontiguousarray(array, place.dtype).data.cast("B")
         else:
-            array.copy_to(np.ndarray(shape, DTYPES[dtype], payload, begin))
+            array.copy_to(np.ndarray(place.shape, place.dtype, payload, begin))
     return payload
+
+
+@lru_cache(_TABLES)
+def _table_of(arrays: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]) -> ArrayTable:
+    """Lay out arrays (name, dtype, shape) one after another."""
+    places: list[Place] = []
+    end = 0
+    for name, dtype, shape in arrays:
+        offset = _aligned(end)
+        end = offset + math.prod(shape) * dtype.itemsize
+        places.append(Place(name, DTYPES[_NAMES[dtype]], shape, offset, end))
+    packed = _pack([(place.name, _NAMES[place.dtype], place.shape, place.offset) for place in places])
+    return ArrayTable(tuple(places), msgspec.Raw(packed), end)
 
 
 def _sized(memory: bytearray | None, size: int) -> bytearray:
@@ -125,20 +176,23 @@ def decode(payload: bytes, protocols: frozenset[int] | None = None) -> Message:
         BadMessage: the bytes are not a whole, well-formed message of this protocol; names the field.
     """
     header, start = _header(payload, protocols or {PROTOCOL})
-    arrays: dict[str, Array] = {}
-    for entry in header["arrays"]:
-        name, array = _view(payload, start, entry)
-        if name in arrays:
-            raise BadMessage(f"arrays.{name}", "appears twice")
-        arrays[name] = array
-    return Message(header["kind"], header["run"], header["fields"], arrays, payload)
+    table = _read_table(bytes(header.arrays))
+    if table.size and start + table.size > len(payload):
+        name, dtype, shape, offset, _ = next(each for each in table.places if each.nbytes and each.end == table.size)
+        where = f"{dtype.name}{list(shape)} at {offset}"
+        raise BadMessage(f"arrays.{name}", f"{where} reaches beyond the payload's {len(payload)} bytes")
+    arrays = {
+        name: np.ndarray(shape, dtype, payload, start + offset) if end > offset else np.empty(shape, dtype)
+        for name, dtype, shape, offset, end in table.places
+    }
+    return Message(header.kind, header.run, header.fields, arrays, table, payload)
 
 
 def _aligned(offset: int) -> int:
     return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
-def _header(payload: bytes, protocols: Set[int]) -> tuple[dict[str, Any], int]:
+def _header(payload: bytes, protocols: Set[int]) -> tuple[_Header, int]:
     if not _PREFIX.size <= len(payload) <= MAX_PAYLOAD:
         raise BadMessage("payload", f"{len(payload)} bytes; allowed: {_PREFIX.size} to {MAX_PAYLOAD}")
     magic, length = _PREFIX.unpack_from(payload)
@@ -147,24 +201,41 @@ def _header(payload: bytes, protocols: Set[int]) -> tuple[dict[str, Any], int]:
     if length > min(MAX_HEADER, len(payload) - _PREFIX.size):
         raise BadMessage("header length", f"{length} bytes in a payload of {len(payload)}; at most {MAX_HEADER}")
     try:
-        header = msgpack.unpackb(payload[_PREFIX.size : _PREFIX.size + length], raw=False, strict_map_key=True)
-    except (ValueError, msgpack.UnpackException, RecursionError) as error:
+        header = _unpack_header(payload[_PREFIX.size : _PREFIX.size + length])
+    except msgspec.ValidationError as error:
+        raise BadMessage("header", "must hold exactly protocol, kind, run, fields, arrays") from error
+    except _NOT_MSGPACK as error:
         raise BadMessage("header", f"not msgpack ({type(error).__name__})") from error
-    if not isinstance(header, dict) or header.keys() != {"protocol", "kind", "run", "fields", "arrays"}:
-        raise BadMessage("header", "must hold exactly protocol, kind, run, fields, arrays")
-    if type(header["protocol"]) is not int or header["protocol"] not in protocols:
-        raise BadMessage("protocol", f"version {shown(header['protocol'])}; this process speaks {PROTOCOL}")
-    for name, kind in (("kind", str), ("run", str), ("fields", dict), ("arrays", list)):
-        if not isinstance(header[name], kind):
+    if type(header.protocol) is not int or header.protocol not in protocols:
+        raise BadMessage("protocol", f"version {shown(header.protocol)}; this process speaks {PROTOCOL}")
+    for name, kind in (("kind", str), ("run", str), ("fields", dict)):
+        if not isinstance(getattr(header, name), kind):
             raise BadMessage(name, f"must be a {kind.__name__}")
-    if not all(isinstance(name, str) for name in header["fields"]):
+    if not all(isinstance(name, str) for name in header.fields):
         raise BadMessage("fields", "names must be strings")
-    if len(header["arrays"]) > MAX_ARRAYS:
-        raise BadMessage("arrays", f"{len(header['arrays'])} of them; at most {MAX_ARRAYS}")
     return header, _aligned(_PREFIX.size + length)
 
 
-def _view(payload: bytes, start: int, entry: Any) -> tuple[str, Array]:  # noqa: ANN401 (whatever the peer sent)
+@lru_cache(_TABLES)
+def _read_table(packed: bytes) -> ArrayTable:
+    """Check a table of arrays; raises BadMessage."""
+    try:
+        entries = _unpack(packed)
+    except _NOT_MSGPACK as error:
+        raise BadMessage("arrays", f"not msgpack ({type(error).__name__})") from error
+    if not isinstance(entries, list):
+        raise BadMessage("arrays", "must be a list")
+    if len(entries) > MAX_ARRAYS:
+        raise BadMessage("arrays", f"{len(entries)} of them; at most {MAX_ARRAYS}")
+    places = tuple(map(_place, entries))
+    names = [place.name for place in places]
+    for name in names:
+        if names.count(name) > 1:
+            raise BadMessage(f"arrays.{name}", "appears twice")
+    return ArrayTable(places, msgspec.Raw(packed), max((each.end for each in places if each.nbytes), default=0))
+
+
+def _place(entry: Any) -> Place:  # noqa: ANN401 (whatever the peer sent)
     if not isinstance(entry, list) or len(entry) != 4:
         raise BadMessage("arrays", "each entry is [name, dtype, shape, offset]")
     name, dtype, shape, offset = entry
@@ -180,13 +251,7 @@ def _view(payload: bytes, start: int, entry: Any) -> tuple[str, Array]:  # noqa:
     if not _is_length(offset) or offset % ALIGNMENT:
         raise BadMessage(f"arrays.{name}", f"offset {shown(offset)}; a multiple of {ALIGNMENT}")
     kind = DTYPES[dtype]
-    if size and start + offset + size * kind.itemsize > len(payload):
-        raise BadMessage(
-            f"arrays.{name}", f"{dtype}{shape} at {offset} reaches beyond the payload's {len(payload)} bytes"
-        )
-    if not size:
-        return name, np.empty(shape, kind)
-    return name, np.ndarray(shape, kind, payload, start + offset)
+    return Place(name, kind, tuple(shape), offset, offset + size * kind.itemsize)
 
 
 def _is_length(value: Any) -> bool:  # noqa: ANN401 (whatever the peer sent)

@@ -12,14 +12,49 @@ import msgspec
 
 from common.errors import BadMessage
 from common.messaging import wire
-from common.messaging.wire import Message
+from common.messaging.wire import ArrayTable, Message
 
 T = TypeVar("T", bound=msgspec.Struct)
-Layout = Mapping[str, tuple[str, tuple[int | str, ...]]]
-"""Name of an array -> (dtype, shape); a word in a shape stands for any length, equal throughout the message."""
-
-NO_ARRAYS: Layout = {}
+_LENGTHS = 256  # kept for each layout, by table of arrays
 _PLACE = re.compile(r"^(?P<problem>.*?)(?: - at .*`\$(?P<path>[^`]*)`)?$", re.DOTALL)  # in msgspec's error texts
+
+
+class Layout:
+    """The arrays of a kind of message.
+
+    arrays: by name (dtype, shape); a word in a shape stands for any length, equal throughout the message.
+    optional: names of arrays that may be missing.
+    """
+
+    def __init__(
+        self, arrays: Mapping[str, tuple[str, tuple[int | str, ...]]], optional: Set[str] = frozenset()
+    ) -> None:
+        self.arrays = arrays
+        self._optional = optional
+        self.lengths = functools.lru_cache(_LENGTHS)(self._lengths)
+
+    def _lengths(self, table: ArrayTable) -> Mapping[str, int]:
+        """The lengths that the words stand for; raises BadMessage for the first array that does not fit."""
+        places = {place.name: place for place in table.places}
+        if places.keys() | self._optional != self.arrays.keys():
+            raise BadMessage("arrays", _difference(places.keys(), self.arrays.keys()))
+        lengths: dict[str, int] = {}
+        for name, (dtype, shape) in self.arrays.items():
+            place = places.get(name)
+            if place is None:
+                continue
+            if place.dtype != wire.DTYPES[dtype]:
+                raise BadMessage(f"arrays.{name}", f"dtype {place.dtype.name} instead of {dtype}")
+            expected = tuple(
+                lengths.setdefault(length, have) if isinstance(length, str) else length
+                for length, have in zip(shape, place.shape, strict=False)
+            )
+            if place.shape != expected or len(shape) != len(place.shape):
+                raise BadMessage(f"arrays.{name}", f"shape {list(place.shape)} instead of {list(shape)}")
+        return lengths
+
+
+NO_ARRAYS = Layout({})
 
 
 class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -35,7 +70,7 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def decode(cls, message: Message) -> Self:
         """Read it; raises BadMessage."""
         check_kind(message, cls.kind)
-        check_arrays(message, NO_ARRAYS)
+        NO_ARRAYS.lengths(message.table)
         return to_struct(message, cls)
 
 
@@ -45,38 +80,15 @@ def check_kind(message: Message, kind: str) -> None:
         raise BadMessage("kind", f"{shown(message.kind)} instead of {kind!r}")
 
 
-def check_arrays(message: Message, layout: Layout, optional: Set[str] = frozenset()) -> dict[str, int]:
-    """Return the lengths that the layout's words stand for; raise BadMessage for the first array that does not fit.
-
-    optional: names of arrays that may be missing.
-    """
-    if message.arrays.keys() | optional != layout.keys():
-        raise BadMessage("arrays", _difference(message.arrays.keys(), layout.keys()))
-    lengths: dict[str, int] = {}
-    for name, (dtype, shape) in layout.items():
-        array = message.arrays.get(name)
-        if array is None:
-            continue
-        if array.dtype != wire.DTYPES[dtype]:
-            raise BadMessage(f"arrays.{name}", f"dtype {array.dtype.name} instead of {dtype}")
-        expected = tuple(
-            lengths.setdefault(length, have) if isinstance(length, str) else length
-            for length, have in zip(shape, array.shape, strict=False)
-        )
-        if array.shape != expected or len(shape) != array.ndim:
-            raise BadMessage(f"arrays.{name}", f"shape {list(array.shape)} instead of {list(shape)}")
-    return lengths
-
-
 def to_struct(message: Message, kind: type[T], layout: Layout = NO_ARRAYS) -> T:
     """Convert a message's fields, and its arrays checked against `layout`, into a struct; raises BadMessage."""
     fields, expected = message.fields, _names(kind)
-    if layout:
-        expected = expected - layout.keys()
+    if layout.arrays:
+        expected = expected - layout.arrays.keys()
     if fields.keys() != expected:
         raise BadMessage("fields", _difference(fields.keys(), expected))
     try:
-        return msgspec.convert({**fields, **message.arrays} if layout else fields, kind, strict=True)
+        return msgspec.convert({**fields, **message.arrays} if layout.arrays else fields, kind, strict=True)
     except msgspec.ValidationError as error:
         raise bad_field(error, fields) from error
 

@@ -10,12 +10,13 @@ from common.bounded import Count, Counter, Incarnation, Share, Updates
 from common.bounds import MAX_EVALUATED, MAX_RETURN, MAX_VIDEO
 from common.errors import BadMessage
 from common.messaging import wire
-from common.messaging.messages.body import Body, Layout, check_arrays, check_kind, to_struct
+from common.messaging.messages.body import Body, Layout, check_kind, to_struct
 from common.messaging.messages.weights import Network
 from common.messaging.wire import Message
 from common.types import Array
 
 GIF = b"GIF8"  # the first bytes of every one
+_GIF = Layout({"gif": ("uint8", ("bytes",))})
 
 
 class EvaluationRow(Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,10 +64,9 @@ class Video(Struct, frozen=True):
     @classmethod
     def decode(cls, message: Message) -> Self:
         """Read it; raises BadMessage."""
-        layout: Layout = {"gif": ("uint8", ("bytes",))}
         check_kind(message, cls.kind)
-        if check_arrays(message, layout)["bytes"] > MAX_VIDEO:
+        if _GIF.lengths(message.table)["bytes"] > MAX_VIDEO:
             raise BadMessage("arrays.gif", f"more than {MAX_VIDEO:,} bytes")
         if message.arrays["gif"][:4].tobytes() != GIF:
             raise BadMessage("arrays.gif", "not a GIF")
-        return to_struct(message, cls, layout)
+        return to_struct(message, cls, _GIF)

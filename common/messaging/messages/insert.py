@@ -9,7 +9,7 @@ import numpy as np
 from common.bounds import MAX_MAGNITUDE, MAX_N_STEP, MAX_SEGMENT_STEPS, MAX_UPDATES
 from common.errors import BadMessage
 from common.messaging import wire
-from common.messaging.messages.body import Layout, check_arrays, check_kind, to_struct
+from common.messaging.messages.body import Layout, check_kind, to_struct
 from common.messaging.wire import Message
 from common.types import Array, EnvSpec, Segment
 
@@ -25,8 +25,8 @@ def encode_segment(run: str, segment: Segment) -> bytearray:
     return wire.encode(KIND, run, fields, {name: getattr(segment, name) for name in _ARRAYS})
 
 
-def transitions(spec: EnvSpec, rows: str) -> Layout:
-    """The arrays that segments and batches share, one row per transition."""
+def transitions(spec: EnvSpec, rows: str) -> dict[str, tuple[str, tuple[int | str, ...]]]:
+    """The arrays that segments and batches share, one row per transition, as a `Layout` has them."""
     return {
         "frames": (spec.frame_dtype, ("frames", *spec.frame_shape)),
         "obs_index": ("int32", (rows, spec.stack)),
@@ -68,12 +68,12 @@ class SegmentReader:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        self._layout = transitions(spec, "steps")
+        self._layout = Layout(transitions(spec, "steps"), OPTIONAL)
 
     def __call__(self, message: Message) -> Segment:
         """Read one; raises BadMessage for anything that the table could not store."""
         check_kind(message, KIND)
-        lengths = check_arrays(message, self._layout, OPTIONAL)
+        lengths = self._layout.lengths(message.table)
         steps, frames = lengths["steps"], lengths["frames"]
         if not 1 <= steps <= MAX_SEGMENT_STEPS:
             raise BadMessage("arrays.actions", f"{steps} steps; allowed: 1 to {MAX_SEGMENT_STEPS}")

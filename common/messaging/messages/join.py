@@ -90,7 +90,7 @@ class Joined(Body, frozen=True):
         except UsageError as error:
             raise BadMessage("fields.config", str(error)) from error
         fields = {**message.fields, "config": config}
-        return super().decode(Message(message.kind, message.run, fields, message.arrays))
+        return super().decode(Message(message.kind, message.run, fields, message.arrays, message.table))
 
 
 class Leave(Body, frozen=True):

@@ -11,7 +11,7 @@ from common.bounded import Count, Counter, Incarnation, Updates
 from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_PRIORITIES, MAX_STREAMS, MAX_UPDATES
 from common.errors import BadMessage
 from common.messaging import wire
-from common.messaging.messages.body import Body, check_arrays, check_kind, to_struct
+from common.messaging.messages.body import Body, Layout, check_kind, to_struct
 from common.messaging.messages.insert import OPTIONAL, check_range, check_transitions, transitions
 from common.messaging.wire import Message, Source
 from common.types import Array, Batch, EnvSpec, EpisodeEnd
@@ -91,19 +91,20 @@ class BatchReader:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        self._layout = {
+        arrays = {
             **transitions(spec, "batch"),
             "weights": ("float32", ("batch",)),
             "ids": ("int64", ("batch",)),
             "age": ("int64", ("batch",)),
             "reuse": ("int32", ("batch",)),
         }
+        self._layout = Layout(arrays, OPTIONAL)
 
     def __call__(self, message: Message) -> tuple[Batch, Drawn]:
         """Read one; raises BadMessage."""
         check_kind(message, KIND)
         arrays = message.arrays
-        if not check_arrays(message, self._layout, OPTIONAL)["batch"]:
+        if not self._layout.lengths(message.table)["batch"]:
             raise BadMessage("arrays.actions", "an empty batch")
         check_transitions(self._spec, arrays)
         check_range("arrays.weights", arrays["weights"], 0.0, MAX_FLOAT32)

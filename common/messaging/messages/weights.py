@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, ClassVar, Self
 
 from msgspec import Meta, Struct
 
 from common.bounded import Counter, Updates
 from common.messaging import wire
-from common.messaging.messages.body import Body, Layout, check_arrays, check_kind, to_struct
+from common.messaging.messages.body import Body, Layout, check_kind, to_struct
 from common.messaging.wire import Message
 from common.types import Array
 
@@ -35,10 +36,15 @@ class Weights(Struct, frozen=True):
     @classmethod
     def decode(cls, message: Message, parameters: int) -> Self:
         """Read a network of `parameters` parameters; raises BadMessage."""
-        layout: Layout = {"flat": ("float32", (parameters,))}
+        layout = _layout(parameters)
         check_kind(message, "weights")
-        check_arrays(message, layout)
+        layout.lengths(message.table)
         return to_struct(message, cls, layout)
+
+
+@cache
+def _layout(parameters: int) -> Layout:
+    return Layout({"flat": ("float32", (parameters,))})
 
 
 class Role(Body, frozen=True):
