@@ -123,15 +123,19 @@ def games_of(run: str) -> pd.DataFrame:
 
 def test_what_the_page_of_pong_says() -> None:
     page = " ".join((RESULTS / "pong" / "README.md").read_text().split())
-    games, falling = (games_of(run) for run in ("coop", "coop-falling"))
+    games, falling, half = (games_of(run) for run in ("coop", "coop-falling", "coop-bfloat16"))
     last, late = games["return"][-100:], games["return"][games["env_step"] > 400_000]
     best = games["return"].rolling(100).mean().idxmax()
     first = games["env_step"][games["return"] > 0].iloc[0]
     assert not (falling["return"] > 0).any()
-    stopped = falling["return"][-100:]
+    stopped, third = falling["return"][-100:], half["return"][-100:]
+    parts = half["return"].groupby((half["env_step"] - 1) // 50_000).mean()
     for text in (
         f"a return of {stopped.mean():.1f} ({stopped.std(ddof=0):.1f}) over the last 100 games and no game won, "
         f"where the run above had won {(games['return'][games['env_step'] <= 374_834] > 0).sum()}",
+        f"a return of {third.mean():.1f} ({third.std(ddof=0):.1f}) over the last 100 games, "
+        f"no game won and its best game at {half['return'].max():.0f}",
+        f"its mean over 50,000 steps fell from {parts[3]:.1f} to {parts[6]:.1f}",
         f"a return of {last.mean():.1f} ({last.std(ddof=0):.1f}) over the last 100 games, {sum(last > 0)} of them won",
         f"was {games['return'].rolling(100).mean().max():.1f}, at {games['env_step'][best]:,} steps",
         f"Its first win came at {first:,} steps",
