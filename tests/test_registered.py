@@ -1,11 +1,16 @@
 """The rules of the registered study, against numbers worked out by hand."""
 
 from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from experiments.registered import LARGE, losses, outcome, rates, scores, verdict
+from experiments.registered import LARGE, areas, losses, outcome, rates, scores, table_of, verdict
+from experiments.report.study import load_study
+
+RESULTS = Path(__file__).parent.parent / "results"
 
 
 def runs(areas: Mapping[tuple[str, str, int, float, int], float]) -> pd.DataFrame:
@@ -108,6 +113,20 @@ def test_the_interval_resamples_whole_seeds() -> None:
     table.loc[small & (table["game"] == "B"), "area"] += table["seed"].map({0: 30.0, 1: -30.0})
     once_more = outcome(table).set_index(["difference", "size"]).loc[("g-coop - dqn", "small")]
     assert tuple(once_more[["low", "points", "high"]]) == pytest.approx((20, 60, 100))
+
+
+def test_an_unfinished_method_is_left_out_unless_it_is_needed() -> None:
+    study = load_study(RESULTS / "cartpole" / "methods.parquet")
+    whole = areas(study)
+    lacking = replace(study, missing={"coop-seed=9": "not begun"})
+    with pytest.raises(ValueError, match="coop-seed=9"):
+        areas(lacking)
+    with pytest.raises(ValueError, match="not finished: coop-seed=9"):
+        areas(lacking, ["dqn", "coop"])
+    without = areas(lacking, ["dqn", "g-coop"])
+    pd.testing.assert_frame_equal(without, whole[whole["method"] != "coop"].reset_index(drop=True))
+    with pytest.raises(ValueError, match="coop-seed=9"):
+        table_of("scores", lacking)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from experiments import registered
 from experiments.film import Film
-from experiments.registered import RULES, areas
 from experiments.report import comparisons, results
 from experiments.report.baseline import baseline_table, find_baseline
 from experiments.report.sources import open_source
@@ -53,8 +53,8 @@ def study_of(name: str) -> Study:
 
 @cache
 def table_of(study: str, name: str) -> pd.DataFrame:
-    if name in RULES:
-        return RULES[name](areas(study_of(study)))
+    if name in registered.RULES:
+        return registered.table_of(name, study_of(study))
     kind, _, baseline = name.partition(" ")
     if kind == "baseline":
         table = baseline_table(study_of(study), find_baseline(study_of(study), baseline))
