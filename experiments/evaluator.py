@@ -59,11 +59,14 @@ class Schedule:
         self._seconds, self._steps = seconds, steps
         self._next_time = 0.0
         self._next_step: float = steps or math.inf
-        self._last: Progress | None = None
+        self._last: int | None = None  # updates of the networks whose time came last
 
     def due(self, progress: Progress, now: float) -> bool:
-        """Whether it is time for the networks of `progress`, updates and environment steps; none have two times."""
-        if progress == self._last:
+        """Whether it is time for the networks of `progress`; those of equally many updates are the same.
+
+        A run may go on for a few steps after its last update: none have two times.
+        """
+        if progress[0] == self._last:
             return False
         return now >= self._next_time if self._seconds is not None else progress[1] >= self._next_step
 
@@ -74,7 +77,7 @@ class Schedule:
 
     def begun(self, progress: Progress, now: float) -> None:
         """Note that the time of the networks of `progress` has come."""
-        self._last = progress
+        self._last = progress[0]
         if self._seconds is not None:
             self._next_time = now + self._seconds
         else:
