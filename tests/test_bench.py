@@ -2,6 +2,7 @@
 
 import copy
 import importlib
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SUBJECT = """
+import os
 import sys
 from turns import attend
 
@@ -19,7 +21,7 @@ taken = []
 
 def turn(seconds):
     with open(sys.argv[2], "a") as file:
-        print(sys.argv[1], seconds, file=file)
+        print(sys.argv[1], seconds, *os.environ["ROUNDS"].split(), *os.sched_getaffinity(0), file=file)
     taken.append(seconds)
     return {"work/s": 10.0 * len(taken)}
 
@@ -56,18 +58,32 @@ def test_subjects_take_turns(comparison: Any, tmp_path: Path) -> None:
     notes = tmp_path / "notes"
     subjects = {name: comparison.Subject("own", (name, str(notes))) for name in ("a", "b")}
     found = comparison.compare(comparison.Comparison("x", "a and b", subjects, "a", seconds=0.5), 3, tmp_path)
-    turns = notes.read_text().split()
-    assert turns[::2] == ["a", "b", "a", "b", "b", "a", "a", "b"], (
-        "a short one of each; then everybody is first in turn"
-    )
-    assert turns[1::2] == ["0.25"] * 2 + ["0.5"] * 6
+    names, seconds, first, step, core = zip(*map(str.split, notes.read_text().splitlines()), strict=True)
+    assert "".join(names) == "ababbaab", "a short one of each; then everybody is first in turn"
+    assert seconds == ("0.25",) * 2 + ("0.5",) * 6
+    assert set(zip(first, step, core, strict=True)) == {("0", "1", "0")}
     assert found == {name: {"work/s": [20.0, 30.0, 40.0]} for name in ("a", "b")}, "the short turn does not count"
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+def test_whole_tasks_run_abreast(comparison: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    subjects = {name: comparison.Subject("own", (name, str(tmp_path / name)), cores=1) for name in ("a", "b")}
+    subjects["all"] = comparison.Subject("own", ("all", str(tmp_path / "all")), cores=0)
+    whole = comparison.Comparison("x", "whole", subjects, "a", seconds=0.0, abreast=True)
+    found = comparison.compare(whole, 3, tmp_path)
+    assert found["a"] == found["b"] == {"work/s": [10.0, 10.0, 20.0]}, "two processes: rounds 0 and 2, and round 1"
+    assert found["all"] == {"work/s": [10.0, 20.0, 30.0]}
+    for name in "ab":
+        lines = sorted((tmp_path / name).read_text().splitlines())
+        assert lines == [f"{name} 0.0 0 2 0"] * 2 + [f"{name} 0.0 1 2 1"]
+    assert (tmp_path / "all").read_text().splitlines()[0].startswith("all 0.0 0 1 0 1")
 
 
 def test_a_subject_that_ends_is_named(comparison: Any, tmp_path: Path) -> None:
     subjects = {"a": comparison.Subject("own", ("broken",))}
     with pytest.raises(
-        comparison.SubjectError, match=r"^a ended \(exit status 1\): it lacks a library; see .*-a\.log$"
+        comparison.SubjectError, match=r"^a ended \(exit status 1\): it lacks a library; see .*-a-0\.log$"
     ):
         comparison.compare(comparison.Comparison("x", "one", subjects, "a"), 1, tmp_path)
 

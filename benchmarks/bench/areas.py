@@ -110,7 +110,7 @@ def _end_to_end() -> Iterator[Comparison]:
             "coop lockstep": Subject("learn", ("lockstep", task)),
             "coop distributed": Subject("learn", ("distributed", task), cores=0),
         }
-        yield Comparison("learning", f"learning {task}", subjects, "Stable-Baselines3", rounds, seconds=0.0)
+        yield Comparison("learning", f"learning {task}", subjects, "Stable-Baselines3", rounds, 0.0, abreast=True)
 
 
 def _overheads() -> Iterator[Comparison]:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,6 +54,8 @@ class Comparison:
         reference: the subject whose figures count as 1.
         rounds: turns of each.
         seconds: that a turn lasts at least; 0 where a turn is a whole task.
+        abreast: as many rounds run at once as there are cores, each on its own; those of subjects that use several
+            cores follow one after another.
     """
 
     area: str
@@ -61,16 +64,26 @@ class Comparison:
     reference: str
     rounds: int = 5
     seconds: float = 2.0
+    abreast: bool = False
+
+
+@dataclass(frozen=True)
+class Lane:
+    """The rounds `first`, `first` + `step` and so on, on core number `first`."""
+
+    first: int = 0
+    step: int = 1
 
 
 class Running:
-    """A subject's process."""
+    """A subject's process; ROUNDS in its environment holds the numbers of its lane."""
 
-    def __init__(self, name: str, subject: Subject, log: Path) -> None:
+    def __init__(self, name: str, subject: Subject, lane: Lane, log: Path) -> None:
         self.name = name
+        self.alone = subject.cores == 1
         python = ROOT / ".bench" / subject.venv / "bin" / "python"
         path = f"{SUBJECTS.parent}:{SUBJECTS.parents[1]}"
-        pin = ["taskset", "-c", f"0-{subject.cores - 1}"] if subject.cores else []
+        pin = ["taskset", "-c", f"{lane.first}-{lane.first + subject.cores - 1}"] if subject.cores else []
         self._log = log
         with log.open("w") as file:
             self._process = subprocess.Popen(
@@ -79,7 +92,13 @@ class Running:
                 stdout=subprocess.PIPE,
                 stderr=file,
                 text=True,
-                env={**os.environ, **ONE_THREAD, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"},
+                env={
+                    **os.environ,
+                    **ONE_THREAD,
+                    "PYTHONPATH": path,
+                    "PYTHONWARNINGS": "ignore",
+                    "ROUNDS": f"{lane.first} {lane.step}",
+                },
             )
         self._answer()
 
@@ -119,13 +138,20 @@ class Running:
 
 
 @contextmanager
-def started(comparison: Comparison, logs: Path) -> Iterator[list[Running]]:
-    """All subjects of a comparison, ready for their first turn."""
+def started(comparison: Comparison, lane: Lane, logs: Path) -> Iterator[list[Running]]:
+    """The subjects of a comparison that take turns in a lane, ready for their first one.
+
+    The first lane has those that use several cores, too; they take the turns of all lanes.
+    """
     with ExitStack() as stack:
-        yield [
-            stack.enter_context(Running(name, subject, logs / f"{comparison.title}-{name}.log".replace(" ", "_")))
-            for name, subject in comparison.subjects.items()
-        ]
+        found = []
+        for name, subject in comparison.subjects.items():
+            log = logs / f"{comparison.title}-{name}-{lane.first}.log".replace(" ", "_")
+            if subject.cores == 1:
+                found.append(stack.enter_context(Running(name, subject, lane, log)))
+            elif not lane.first:
+                found.append(stack.enter_context(Running(name, subject, Lane(), log)))
+        yield found
 
 
 def compare(comparison: Comparison, rounds: int, logs: Path) -> dict[str, Rounds]:
@@ -137,13 +163,26 @@ def compare(comparison: Comparison, rounds: int, logs: Path) -> dict[str, Rounds
         SubjectError: one of them ended.
     """
     figures: dict[str, Rounds] = {name: {} for name in comparison.subjects}
-    with started(comparison, logs) as subjects:
+    abreast = min(rounds, os.cpu_count() or 1) if comparison.abreast else 1
+    with ExitStack() as stack:
+        lanes = [stack.enter_context(started(comparison, Lane(first, abreast), logs)) for first in range(abreast)]
+        shared = [subject for subject in lanes[0] if not subject.alone] if abreast > 1 else []
+
+        def turns(number: int) -> list[tuple[str, dict[str, float]]]:
+            subjects = [subject for subject in lanes[number % abreast] if subject not in shared]
+            order = subjects[:: -1 if number // abreast % 2 else 1]
+            return [(subject.name, subject.turn(comparison.seconds)) for subject in order]
+
         if comparison.seconds:
-            for subject in subjects:
+            for subject in lanes[0]:
                 subject.turn(comparison.seconds / 2)
-        for number in range(rounds):
-            for subject in subjects[:: -1 if number % 2 else 1]:
-                for measure, value in subject.turn(comparison.seconds).items():
-                    figures[subject.name].setdefault(measure, []).append(value)
-            print(".", end="", file=sys.stderr, flush=True)
+        for first in range(0, rounds, abreast):
+            numbers = range(first, min(first + abreast, rounds))
+            with ThreadPoolExecutor(abreast) as pool:
+                taken = [turn for each in pool.map(turns, numbers) for turn in each]
+            taken += [(subject.name, subject.turn(comparison.seconds)) for subject in shared for _ in numbers]
+            for name, measures in taken:
+                for measure, value in measures.items():
+                    figures[name].setdefault(measure, []).append(value)
+            print("." * len(numbers), end="", file=sys.stderr, flush=True)
     return figures

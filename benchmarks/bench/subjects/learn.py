@@ -1,4 +1,4 @@
-"""Whole runs to a mean return over 100 episodes, each turn with the next seed: learn.py WHO TASK [METHOD].
+"""Whole runs to a mean return over 100 episodes, each round with its own seed: learn.py WHO TASK [METHOD].
 
 A turn is a new process, from its start to its end. A run that does not get there within the steps of its task counts
 with what it took, and is not solved.
@@ -7,6 +7,7 @@ with what it took, and is not solved.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -50,7 +51,7 @@ def rival(who: str, task: str, seed: int) -> tuple[int, bool]:
 
 
 def main(who: str, task: str, method: str = "coop") -> None:
-    seeds = count()
+    seeds = count(*map(int, os.environ["ROUNDS"].split()))
 
     def turn(_: float) -> dict[str, float]:
         seed, begun = next(seeds), time.monotonic()
