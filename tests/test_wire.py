@@ -47,6 +47,15 @@ def test_arrays_are_aligned_and_viewed_in_place() -> None:
     assert 0 < start < len(payload)
 
 
+def test_messages_of_equal_shapes_share_a_table_and_nothing_else() -> None:
+    one, other = (bytes(wire.encode("k", "r", {"n": n}, {"a": np.full(3, n), "b": np.zeros(0)})) for n in (1, 2))
+    first, second = wire.decode(one), wire.decode(other)
+    assert first.table is second.table
+    assert (first.arrays["a"].tolist(), second.arrays["a"].tolist()) == ([1, 1, 1], [2, 2, 2])
+    with pytest.raises(BadMessage, match=r"arrays.a: int64\[3\] at 0 reaches beyond the payload's"):
+        wire.decode(other[: len(other) - wire.ALIGNMENT])
+
+
 def test_arrays_need_not_be_contiguous() -> None:
     array = np.arange(24, dtype=np.int32).reshape(4, 6)
     for part in (array.T, array[::2, 1:3], array[0, 0]):
