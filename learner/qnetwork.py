@@ -29,8 +29,8 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 class QNetwork:
     """One network with the passes of an update.
 
-    The parameters are float32. With network.dtype "bfloat16" all passes run on a copy in bfloat16; the algebra of
-    error-driven feedback, on A x A matrices, stays in float32 or better.
+    The parameters are float32. With network.dtype "bfloat16" all passes run on a copy in bfloat16; the algebra that
+    error-driven feedback does on the T(i) stays in float32 or better.
 
     Args:
         network: the parameters, also published and saved. half: a copy in bfloat16, or None.

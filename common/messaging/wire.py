@@ -74,11 +74,10 @@ class Place(NamedTuple):
 class ArrayTable:
     """The arrays of messages that differ in their contents only; equal tables are one object, as long as it is kept.
 
-    packed: as it stands in the header. size: bytes behind the header.
+    size: bytes behind the header.
     """
 
     places: tuple[Place, ...]
-    packed: msgspec.Raw
     size: int
 
 
@@ -125,8 +124,8 @@ def encode(
     into: an earlier message whose memory is reused, because it is in the processor's caches.
     """
     arrays = arrays or {}
-    table = _table_of(tuple((name, array.dtype, array.shape) for name, array in arrays.items()))
-    header = _pack({"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": table.packed})
+    table, packed = _table_of(tuple((name, array.dtype, array.shape) for name, array in arrays.items()))
+    header = _pack({"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": packed})
     head = _PREFIX.pack(MAGIC, len(header)) + header
     start = _aligned(len(head))
     payload = _sized(into, start + table.size)
@@ -147,8 +146,8 @@ def encode(
 
 
 @lru_cache(_TABLES)
-def _table_of(arrays: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]) -> ArrayTable:
-    """Lay out arrays (name, dtype, shape) one after another."""
+def _table_of(arrays: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]) -> tuple[ArrayTable, msgspec.Raw]:
+    """Lay out arrays (name, dtype, shape) one after another: their table, and how a header says it."""
     places: list[Place] = []
     end = 0
     for name, dtype, shape in arrays:
@@ -156,7 +155,7 @@ def _table_of(arrays: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]) ->
         end = offset + math.prod(shape) * dtype.itemsize
         places.append(Place(name, DTYPES[_NAMES[dtype]], shape, offset, end))
     packed = _pack([(place.name, _NAMES[place.dtype], place.shape, place.offset) for place in places])
-    return ArrayTable(tuple(places), msgspec.Raw(packed), end)
+    return ArrayTable(tuple(places), end), msgspec.Raw(packed)
 
 
 def _sized(memory: bytearray | None, size: int) -> bytearray:
@@ -232,7 +231,7 @@ def _read_table(packed: bytes) -> ArrayTable:
     for name in names:
         if names.count(name) > 1:
             raise BadMessage(f"arrays.{name}", "appears twice")
-    return ArrayTable(places, msgspec.Raw(packed), max((each.end for each in places if each.nbytes), default=0))
+    return ArrayTable(places, max((each.end for each in places if each.nbytes), default=0))
 
 
 def _place(entry: Any) -> Place:  # noqa: ANN401 (whatever the peer sent)
