@@ -115,7 +115,7 @@ class FeedbackRule(Generic[ArrayT]):
 
 def _polar_of_gradient(gradient: ArrayT, delta: ArrayT, h: ArrayT, rng: np.random.Generator) -> ArrayT:
     """U V^T of a weight gradient [m, ...]; for a Linear layer it is delta^T h, rank-deficient in a small batch."""
-    matrix = at_least_float32(torch.as_tensor(gradient)).flatten(1)
+    matrix = torch.as_tensor(gradient).flatten(1)
     if h.ndim == 2 and len(delta) < min(matrix.shape):
         left, right = (at_least_float32(torch.as_tensor(rows)) for rows in (delta, h))
         factor = polar_of_product(left, right, rng)
