@@ -15,6 +15,7 @@ from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from experiments.episodes import Evaluator
 from experiments.lockstep import Lockstep, Replaying
+from learner.initial_networks import load_initial_networks
 from learner.records.epochs import newest_epoch
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
@@ -59,7 +60,11 @@ class LockstepRun:
             raise
         try:
             self.epoch = newest_epoch(path) if resume else None
-            self._sizes = None if self.epoch is None else self._run.restore(self.epoch, replaying)
+            if self.epoch is None:
+                load_initial_networks(self._run.agent)
+                self._sizes = None
+            else:
+                self._sizes = self._run.restore(self.epoch, replaying)
         except BaseException:
             self.close()
             raise

@@ -19,6 +19,7 @@ from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
+from learner.initial_networks import load_initial_networks
 from learner.records.epochs import complete_epochs, load_learner, newest_epoch
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
@@ -92,6 +93,7 @@ def _beginning(config: RunConfig, run_dir: Path, folder: Path, run_id: int) -> t
     agent, core = Agent(config, spec), ReplayCore(config, spec)
     files = journal_files(folder)
     if files[0] == 1:
+        load_initial_networks(agent)
         return agent, core, 1
     for number in complete_epochs(run_dir):
         first, _ = ReplayEpochs(run_dir, run_id).restore(core, number)

@@ -22,6 +22,7 @@ from common.types import EnvSpec
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
 from learner.cli import LearnerOptions
+from learner.initial_networks import load_initial_networks
 from learner.join_service import JoinService
 from learner.records.epochs import intact_epochs, load_learner, rewind
 from learner.records.run_directory import RunDirectory, claim_run_directory
@@ -52,6 +53,8 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         _check_origin(path / "checkpoints" / str(held[-1]))
     trainer = Trainer(Agent(config, spec), time.monotonic())
     agent = trainer.agent
+    if not held:
+        load_initial_networks(agent)
     epochs = SharedEpochs(held, str(path), restart=options.restart)
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory, send_queue=SHORT_QUEUE)
@@ -72,6 +75,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
             trainer.load_state(state, time.monotonic())
             console.event(f"goes on from epoch {number}")
         elif held:
+            load_initial_networks(agent)
             console.event("begins anew: no epoch is held by both")
         settings, episodes_received = config.learner, 0 if state is None else state["told"]
         samples = SampleClient(

@@ -96,6 +96,8 @@ class LearnerSettings:
     """Added to the optimizer's denominator; not for sgd."""
     weight_decay: Annotated[tuple[NonNegative, ...], Field(max_length=MAX_LAYERS + 1)] = ()
     """lambda(i) of each layer, starting at the input; one value applies to all layers; empty means 0."""
+    initial_networks: str = ""
+    """Folder of a run, with whose newest networks this run begins; empty: random weights."""
     device: str = "cpu"
     """PyTorch device of the networks, for example cpu or cuda."""
     compile: bool = False

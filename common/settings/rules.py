@@ -43,6 +43,13 @@ def _problems(config: RunConfig) -> Iterator[str]:
         for name in ("kwargs", "resize", "grayscale"):
             if (value := getattr(config.env, name)) != getattr(plain, name):
                 yield f"env.{name} = {value!r}: not for {config.env.id!r}; ALE's games show 84x84 grayscale pictures"
+    if learner.initial_networks and config.streaming:
+        yield f"learner.initial_networks = {learner.initial_networks!r}: not for method {config.method!r}"
+    yield from _replay_problems(config)
+
+
+def _replay_problems(config: RunConfig) -> Iterator[str]:
+    replay, learner = config.replay, config.learner
     if not replay.replacement and not SAMPLERS.get(replay.sampling).without_replacement:
         able = ", ".join(repr(name) for name in SAMPLERS.names() if SAMPLERS.get(name).without_replacement)
         yield f"replay.sampling = {replay.sampling!r}: allowed: {able} with replay.replacement = False"

@@ -1,0 +1,27 @@
+"""The networks with which a run begins, if they are those of another run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from common.errors import UsageError
+from learner.protocol import Agent
+from learner.records.epochs import load_learner, newest_epoch
+
+
+def load_initial_networks(agent: Agent) -> None:
+    """Give a new run's agent the networks of the run `learner.initial_networks`; leave it as it is if that is empty.
+
+    Raises:
+        UsageError: the folder holds no complete checkpoint, or networks of another size.
+    """
+    folder = agent.config.learner.initial_networks
+    if not folder:
+        return
+    setting, epoch = f"learner.initial_networks = {folder!r}", newest_epoch(Path(folder))
+    if epoch is None:
+        raise UsageError(f"{setting}: holds no complete checkpoint of a run")
+    networks, size = load_learner(epoch)["agent"]["networks"], agent.networks[0].size
+    if networks[0].numel() != size:
+        raise UsageError(f"{setting}: its networks have {networks[0].numel():,} parameters; this run's have {size:,}")
+    agent.load_state({**agent.state(), "networks": networks})
