@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from common.errors import RunError
 from common.settings.tables import resolve
 from experiments.report.answer import answer
 from experiments.report.comparisons import common_breaking_table, interaction_table, learning_table, sizes_table
+from experiments.report.figures import figures
 from experiments.report.learning import area, course, end_of_running_mean, over_seeds, reward_threshold
 from experiments.report.page import page
 from experiments.report.results import runs_table, settings_table, tables
@@ -87,6 +89,18 @@ def write_runs(tmp_path: Path) -> Path:
         tmp_path / "dqn-500-9", "dqn", 9, 500, "diverged: TD errors are not finite at update 2", "0,9,9,nan,nan,nan\n"
     )
     return tmp_path
+
+
+def test_panels_share_an_axis_where_returns_have_one_scale(folder: Path) -> None:
+    one = load_study(folder)
+    for path in list(folder.iterdir()):
+        other = folder / f"other-{path.name}"
+        shutil.copytree(path, other)
+        with (other / "config.toml").open("a") as config:
+            config.write('env.id = "Acrobot-v1"\n')
+    for study, shared in ((one, True), (load_study(folder), False)):
+        drawn = {figure.name: figure for figure in figures(study)[0]}
+        assert (drawn["buffers"].same_y, drawn["returns_steps"].same_y, "iqm" in drawn) == (shared, shared, shared)
 
 
 def write(path: Path, method: str, seed: int, capacity: int, outcome: str, lines: str) -> None:

@@ -117,6 +117,16 @@ def test_a_number_that_is_not_in_the_page_is_found() -> None:
     assert text not in PAGES["README.md"]
 
 
+def test_what_the_pages_say_of_runs_without_a_buffer() -> None:
+    small = "method in ('dqn', 'edql', 'g-coop', 'coop') and `replay.capacity` == 300"
+    runs = table_of("minatar/study", "runs")
+    breakout = runs[runs["env.id"] == "MinAtar/Breakout-v1"]
+    assert breakout.query(small)["mean"].max() < breakout.query("method == 'stream-q'")["mean"].min()
+    areas = registered.areas(study_of("minatar/study")).rename(columns={"capacity": "replay.capacity"})
+    invaders = areas[areas["game"] == "SpaceInvaders"]
+    assert invaders.query(small)["area"].min() > invaders.query("method == 'stream-q'")["area"].max()
+
+
 def games_of(run: str) -> pd.DataFrame:
     return pd.DataFrame(open_source(RESULTS / "pong.parquet").columns(run, "episodes.csv", ("env_step", "return")))
 

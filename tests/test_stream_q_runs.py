@@ -18,7 +18,7 @@ from experiments.export import export
 from experiments.report.comparisons import paired_table, sizes_table
 from experiments.report.figures import buffers, figures
 from experiments.report.plots import draw
-from experiments.report.results import aggregate_table, settings_table, tables
+from experiments.report.results import aggregate_table, breaking_table, settings_table, tables
 from experiments.report.study import Study, load_study
 from experiments.sweep.grid import load_grid
 
@@ -154,6 +154,7 @@ def test_in_tables_it_has_size_0_and_is_compared_with_every_size(study: Study) -
     ]
     assert [row[1:3] for row in sizes_table(study).rows if row[0] == "all"] == [["dqn", 100.5]]
     assert [row[:2] for row in aggregate_table(study).rows] == [["dqn", 125.5]]
+    assert [row[:3] for row in breaking_table(study).rows] == [["fifo", "dqn", 2000], ["reservoir", "dqn", 2000]]
     assert len(tables(study)) > 5
 
 

@@ -11,8 +11,8 @@ from learner.records.epochs import load_learner, newest_epoch
 
 TINY = np.finfo(np.float32).tiny
 # At this rate the ReLUs of a hidden layer are soon off for every state, and its moments fall by half at each update.
-FLAGS = "--learner.optimizer adam --learner.learning-rate 1 --learner.beta1 0.5 --learner.beta2 0.5".split()
-SHORT = "--total-steps 600 --replay.learning-starts 100".split()
+FLAGS = ("--learner.learning-rate", "1", "--learner.beta1", "0.5", "--learner.beta2", "0.5")
+SHORT = ("--learner.optimizer", "adam", "--total-steps", "600", "--replay.learning-starts", "100")
 
 
 @pytest.mark.parametrize("command", [("coop-lockstep",), ("coop-local", "--actors", "1", "--replay.journal")])

@@ -87,13 +87,13 @@ def diagnostics_table(study: Study) -> ResultTable:
 
 
 def breaking_table(study: Study) -> ResultTable:
-    """The breaking point of each method for each setting of the other axes."""
+    """The breaking point of each method with a replay buffer for each setting of the other axes."""
     place = study.index(CAPACITY)
     assert place is not None
     largest = max(setting[place] for setting in study.settings)
     rows = []
     for others in other_settings(study, CAPACITY):
-        for method in study.methods:
+        for method in study.buffered:
             capacities, scores = along(study, CAPACITY, method, others)
             rows.append([*plain(others), method, *_breaking(capacities, scores, largest)])
     names = [axis for axis in study.axes if axis != CAPACITY]
