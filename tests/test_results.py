@@ -142,7 +142,7 @@ def test_what_the_page_of_pong_says() -> None:
     parts = half["return"].groupby((half["env_step"] - 1) // 50_000).mean()
     for text in (
         f"a return of {stopped.mean():.1f} ({stopped.std(ddof=0):.1f}) over the last 100 games and no game won, "
-        f"where the run above had won {(games['return'][games['env_step'] <= 374_834] > 0).sum()}",
+        f"where the first run had won {(games['return'][games['env_step'] <= 374_834] > 0).sum()}",
         f"a return of {third.mean():.1f} ({third.std(ddof=0):.1f}) over the last 100 games, "
         f"no game won and its best game at {half['return'].max():.0f}",
         f"its mean over 50,000 steps fell from {parts[3]:.1f} to {parts[6]:.1f}",
@@ -157,8 +157,33 @@ def test_what_the_page_of_pong_says() -> None:
         assert f"| {len(part)} | {won} | {part['return'].mean():.1f} |" in page
 
 
-def test_the_networks_of_pong_win() -> None:
-    run = SavedRun(RESULTS / "pong" / "coop")
+def test_what_the_page_of_pong_says_of_the_continued_run() -> None:
+    page = " ".join((RESULTS / "pong" / "README.md").read_text().split())
+    games, halving = games_of("coop-continued"), games_of("coop-continued-halving")["return"]
+    returns, low = games["return"], games[games["return"] < 10]
+    summary = SavedRun(RESULTS / "pong" / "coop-continued").summary
+    assert summary is not None
+    assert (len(games), len(low), summary["exit"]) == (100, 4, "complete: target_return reached")
+    assert summary["return_mean_100"] == pytest.approx(returns.mean())
+    assert returns.mean() >= 18
+    last = returns[low.index[-1] + 1 :]
+    for text in (
+        f"{returns.mean():.1f} ({returns.std(ddof=0):.1f}), {(returns > 0).sum()} of the 100 games won, "
+        f"after {summary['env_steps']:,} more steps, {summary['updates']:,} updates and "
+        f"{summary['wall_seconds']:,.0f} s",
+        f"Four of them end below 10, the last of these at {low['env_step'].iloc[-1]:,} steps; "
+        f"the {len(last)} games after it average {last.mean():.1f}",
+        f"stood at {returns[:33].mean():.1f} over its first 33 games, was stopped at 94,224 steps with a mean of "
+        f"{halving.mean():.1f} ({halving.std(ddof=0):.1f}) over its {len(halving)} games, "
+        f"{(halving > 0).sum()} of them won",
+        f"Until the same step the run above has a mean of {returns[games['env_step'] <= 94_224].mean():.1f}",
+    ):
+        assert text in page
+
+
+@pytest.mark.parametrize("name", ["coop", "coop-continued"])
+def test_the_networks_of_pong_win(name: str) -> None:
+    run = SavedRun(RESULTS / "pong" / name)
     film = Film(run.policy("mean"), run.config.env, seed=0)
     for _ in film:
         pass
