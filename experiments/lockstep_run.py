@@ -11,7 +11,7 @@ from common.errors import RunError
 from common.process.console import say
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
-from common.process.threads import subnormals_as_zero, use_threads
+from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from experiments.episodes import Evaluator
 from experiments.lockstep import Lockstep, Replaying
@@ -69,7 +69,6 @@ class LockstepRun:
             self.close()
             raise
 
-    @subnormals_as_zero()
     def play(self, stop: Stop, progress: Callable[[str], None] = lambda line: None) -> Summary:
         """Play until the run is over or stopped; progress: called with a line every few seconds.
 

@@ -15,7 +15,7 @@ from common.errors import RunError, UsageError
 from common.messaging.messages.sample import DrawRequest
 from common.process.run_ids import read_run_id
 from common.process.summaries import read_summary
-from common.process.threads import subnormals_as_zero, use_threads
+from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
@@ -47,7 +47,6 @@ class Outcome:
     digest: str
 
 
-@subnormals_as_zero()
 def reexecute(run_dir: Path) -> Outcome:
     """Replay the journal of `run_dir` from its beginning, with every update of the learner.
 

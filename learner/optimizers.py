@@ -43,10 +43,8 @@ class Optimizer(ABC, Generic[ArrayT]):
     def step(self, rate: float) -> None:
         """Apply one update with learning rate `rate`."""
         self.steps += 1
-        if not isinstance(self.theta, Tensor):
-            self._step(rate)
-            return
         # Running means of parameters without gradient become denormals, with which an update takes 30 times as long.
+        # PyTorch sets the processor's mode, which is numpy's too.
         torch.set_flush_denormal(True)
         try:
             self._step(rate)

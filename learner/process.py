@@ -15,7 +15,7 @@ from common.process.console import Console, say
 from common.process.health import answering
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
-from common.process.threads import subnormals_as_zero, use_threads
+from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from common.settings.options import beginning
 from common.types import EnvSpec
@@ -32,7 +32,6 @@ from learner.shared_epochs import SharedEpochs
 from learner.trainer import Trainer
 
 
-@subnormals_as_zero()
 def learn(options: LearnerOptions, config: RunConfig, spec: EnvSpec) -> None:
     """Train a run, whose config has been checked, in the run directory that the options name."""
     use_threads(config.learner.threads)
