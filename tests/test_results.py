@@ -179,6 +179,11 @@ def test_what_the_page_of_pong_says_of_the_continued_run() -> None:
         f"Until the same step the run above has a mean of {returns[games['env_step'] <= 94_224].mean():.1f}",
     ):
         assert text in page
+    text = (
+        f"one run comes to a mean of {games_of('coop')['return'][-100:].mean():.1f} over 100 games, and a run that "
+        f"goes on from its networks with a fifth of the learning rate to {returns.mean():.1f}"
+    )
+    assert text in PAGES["README.md"]
 
 
 @pytest.mark.parametrize("name", ["coop", "coop-continued"])
