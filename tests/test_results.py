@@ -127,6 +127,19 @@ def test_what_the_pages_say_of_runs_without_a_buffer() -> None:
     assert invaders.query(small)["area"].min() > invaders.query("method == 'stream-q'")["area"].max()
 
 
+def test_what_the_page_says_of_low_ends_in_longer_runs() -> None:
+    runs = table_of("preset-buffers", "runs")
+    found = [
+        f"{(part['mean'] < 180).sum()} of {len(part)}"
+        for large in (True, False)
+        for names in (("g-coop", "coop"), ("dqn", "edql"))
+        for part in [runs[((runs["replay.capacity"] >= 1500) == large) & runs["method"].isin(names)]]
+    ]
+    text = "or more, {} with two networks ends below 180, and {} with one; with fewer, {} and {}.".format(*found)
+    assert text in PAGES["cartpole/README.md"]
+    assert runs[runs["method"] == "stream-q"]["mean"].min() >= 199.9
+
+
 def games_of(run: str) -> pd.DataFrame:
     return pd.DataFrame(open_source(RESULTS / "pong.parquet").columns(run, "episodes.csv", ("env_step", "return")))
 
