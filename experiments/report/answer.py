@@ -20,7 +20,7 @@ def answer(study: Study, tables: Sequence[ResultTable]) -> list[str]:
     told = [_subject(study)]
     if "baseline" in by_name:
         told += _baseline(by_name["baseline"])
-    if len(study.environments) == 1:
+    if study.one_scale:
         if len(study.methods) > 1:
             told += [*_methods(study, by_name["aggregate"]), _pairs(by_name["improvement"])]
         if "breaking_points" in by_name:

@@ -31,7 +31,7 @@ LATER = "These measures were chosen after the data of the studies of CartPole ha
 def comparison_tables(study: Study) -> list[ResultTable]:
     """All tables of this module for which there are runs."""
     made = [learning_table(study)]
-    if len(study.environments) > 1:
+    if not study.one_scale:
         return made
     if len(study.methods) > 1:
         made.append(paired_table(study))

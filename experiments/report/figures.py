@@ -63,7 +63,7 @@ def figures(study: Study) -> tuple[list[Figure], list[str]]:
     else:
         ends = [buffers(study), *ends, diagnostics(study)]
     made = [*ends, returns_by_steps(study), returns_by_episodes(study)]
-    if not _alike(study):
+    if not study.one_scale:
         lacking.append(f"Aggregates over settings: returns of {', '.join(study.environments)} have different scales.")
     else:
         made += aggregates(study)
@@ -141,7 +141,8 @@ def buffers(study: Study) -> Figure:
     text = "Mean over runs of the return of the last 100 episodes; error bars: one standard deviation over runs."
     if len(study.buffered) < len(study.methods):
         text += " Dashed: without a replay buffer, so that its runs are those of size 0 everywhere."
-    return Figure("buffers", "Mean return against buffer size", text, counts(study.runs), panels, same_y=_alike(study))
+    title, used = "Mean return against buffer size", counts(study.runs)
+    return Figure("buffers", title, text, used, panels, same_y=study.one_scale)
 
 
 def diagnostics(study: Study) -> Figure:
@@ -223,7 +224,7 @@ def _curves(
                 used += runs
         if lines:
             panels.append(Panel(label(study, setting), x, y, lines, log_y=log_y))
-    return Figure(name, title, BANDS.strip() + _where(study, settings), counts(used), panels, same_y=_alike(study))
+    return Figure(name, title, BANDS.strip() + _where(study, settings), counts(used), panels, same_y=study.one_scale)
 
 
 def _line(text: str, at: Floats, curves: Floats) -> Line:
@@ -261,11 +262,6 @@ def _without(study: Study, axis: str, others: Setting) -> str:
 
 def _has_gaps(run: Run) -> bool:
     return run.config.two_networks and len(run.metrics["q_gap"]) > 0
-
-
-def _alike(study: Study) -> bool:
-    """Whether all returns have one scale."""
-    return len(study.environments) == 1
 
 
 def _has_lines(figure: Figure) -> bool:

@@ -20,7 +20,7 @@ OVER_RUNS = {"mean": ["sd over runs"], "IQM": ["IQM low", "IQM high"]}
 def tables(study: Study) -> list[ResultTable]:
     """All tables for which there are runs, the ones that sum up first."""
     made = []
-    if len(study.environments) == 1:
+    if study.one_scale:
         made.append(aggregate_table(study))
         if len(study.methods) > 1:
             made.append(improvement_table(study))

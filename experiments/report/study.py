@@ -92,6 +92,11 @@ class Study:
         return sorted({run.config.env.id for run in self.runs})
 
     @property
+    def one_scale(self) -> bool:
+        """Whether all returns have one scale: those of one environment do."""
+        return len(self.environments) == 1
+
+    @property
     def warnings(self) -> list[str]:
         """A line for each finished run whose mean |Q| exceeded its bound at times."""
         return [
