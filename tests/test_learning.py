@@ -22,7 +22,7 @@ from learner.records.epochs import load_learner, newest_epoch
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 
 CONFIG = """
-total_steps = 1200
+total_steps = 2000
 [env]
 id = "coop/Corridor-v0"
 [network]
@@ -41,7 +41,7 @@ decay = 0.5
 decay_every = 500
 [replay]
 capacity = 500
-start = 64
+learning_starts = 64
 tolerance = 16
 [actor]
 epsilon_start = 1.0
@@ -49,7 +49,7 @@ epsilon_final = 0.5
 epsilon_steps = 1000
 segment_steps = 4
 """
-BOUND = 0.01  # of |Q - Q*|; Q* lies between 0.26 and 1
+BOUND = 0.001  # of |Q - Q*|; Q* lies between 0.26 and 1, and 96 runs over processes ended within 0.00005
 
 
 @pytest.fixture
