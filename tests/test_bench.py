@@ -3,7 +3,10 @@
 import copy
 import importlib
 import os
+import signal
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +15,31 @@ import pytest
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SUBJECT = """
 import os
+import subprocess
 import sys
-from turns import attend
+import time
+from turns import attend, attend_rounds
 
 if sys.argv[1] == "broken":
     sys.exit("it lacks a library")
 taken = []
 
 def turn(seconds):
+    if sys.argv[1] == "long":
+        child = subprocess.Popen(["sleep", "600"])
+        print(child.pid, file=open(sys.argv[2], "w"), flush=True)
+        child.wait()
     with open(sys.argv[2], "a") as file:
-        print(sys.argv[1], seconds, *os.environ["ROUNDS"].split(), *os.sched_getaffinity(0), file=file)
+        print(sys.argv[1], seconds, *os.sched_getaffinity(0), file=file)
     taken.append(seconds)
+    deadline = time.monotonic() + 20
+    while sys.argv[1] == "waits" and len(open(sys.argv[2]).readlines()) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)  # for the same subject on the other core
     return {"work/s": 10.0 * len(taken)}
 
 print("noise")
+if sys.argv[1].startswith("round"):
+    attend_rounds(lambda number: {"work/s": 10.0 * number, "cores": len(os.sched_getaffinity(0))})
 attend(turn)
 """
 
@@ -58,26 +72,27 @@ def test_subjects_take_turns(comparison: Any, tmp_path: Path) -> None:
     notes = tmp_path / "notes"
     subjects = {name: comparison.Subject("own", (name, str(notes))) for name in ("a", "b")}
     found = comparison.compare(comparison.Comparison("x", "a and b", subjects, "a", seconds=0.5), 3, tmp_path)
-    names, seconds, first, step, core = zip(*map(str.split, notes.read_text().splitlines()), strict=True)
+    names, seconds, core = zip(*map(str.split, notes.read_text().splitlines()), strict=True)
     assert "".join(names) == "ababbaab", "a short one of each; then everybody is first in turn"
     assert seconds == ("0.25",) * 2 + ("0.5",) * 6
-    assert set(zip(first, step, core, strict=True)) == {("0", "1", "0")}
+    assert set(core) == {"0"}
     assert found == {name: {"work/s": [20.0, 30.0, 40.0]} for name in ("a", "b")}, "the short turn does not count"
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 def test_whole_tasks_run_abreast(comparison: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    subjects = {name: comparison.Subject("own", (name, str(tmp_path / name)), cores=1) for name in ("a", "b")}
-    subjects["all"] = comparison.Subject("own", ("all", str(tmp_path / "all")), cores=0)
+    subjects = {
+        "a": comparison.Subject("own", ("round", "a")),
+        "b": comparison.Subject("own", ("waits", str(tmp_path / "b"))),
+        "all": comparison.Subject("own", ("round", "all"), cores=0),
+    }
     whole = comparison.Comparison("x", "whole", subjects, "a", seconds=0.0, abreast=True)
     found = comparison.compare(whole, 3, tmp_path)
-    assert found["a"] == found["b"] == {"work/s": [10.0, 10.0, 20.0]}, "two processes: rounds 0 and 2, and round 1"
-    assert found["all"] == {"work/s": [10.0, 20.0, 30.0]}
-    for name in "ab":
-        lines = sorted((tmp_path / name).read_text().splitlines())
-        assert lines == [f"{name} 0.0 0 2 0"] * 2 + [f"{name} 0.0 1 2 1"]
-    assert (tmp_path / "all").read_text().splitlines()[0].startswith("all 0.0 0 1 0 1")
+    assert found["a"] == {"work/s": [0.0, 10.0, 20.0], "cores": [1, 1, 1]}, "by round, whichever core took it"
+    assert found["all"] == {"work/s": [0.0, 10.0, 20.0], "cores": [2, 2, 2]}
+    assert len(list(tmp_path.glob("*-all-*.log"))) == 1, "one process of it"
+    assert {line.split()[2] for line in (tmp_path / "b").read_text().splitlines()} == {"0", "1"}
 
 
 def test_a_subject_that_ends_is_named(comparison: Any, tmp_path: Path) -> None:
@@ -86,6 +101,37 @@ def test_a_subject_that_ends_is_named(comparison: Any, tmp_path: Path) -> None:
         comparison.SubjectError, match=r"^a ended \(exit status 1\): it lacks a library; see .*-a-0\.log$"
     ):
         comparison.compare(comparison.Comparison("x", "one", subjects, "a"), 1, tmp_path)
+
+
+@pytest.mark.parametrize("abreast", [False, True])
+def test_an_interrupt_ends_long_turns(comparison: Any, abreast: bool, tmp_path: Path) -> None:
+    note = tmp_path / "child"
+
+    def interrupt() -> None:
+        while not (note.exists() and note.read_text()):
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGUSR1)
+
+    before = signal.signal(signal.SIGUSR1, signal.default_int_handler)
+    subjects = {"a": comparison.Subject("own", ("long", str(note)), cores=0 if abreast else 1)}
+    whole = comparison.Comparison("x", "whole", subjects, "a", seconds=0.0, abreast=abreast)
+    try:
+        threading.Thread(target=interrupt, daemon=True).start()
+        with pytest.raises(KeyboardInterrupt):
+            comparison.compare(whole, 2, tmp_path)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    pid, deadline = int(note.read_text()), time.monotonic() + 10
+    while _runs(pid) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not _runs(pid)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def _figures(**subjects: dict[str, list[float]]) -> dict[str, Any]:

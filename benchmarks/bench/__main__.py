@@ -8,6 +8,7 @@ has fallen out of its earlier range, and then ends with exit status 1.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -50,4 +51,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        main()
+    except KeyboardInterrupt:
+        print("\nmake bench: stopped; what was measured before stays", file=sys.stderr)
+        sys.exit(130)

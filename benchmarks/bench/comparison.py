@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Self
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +57,7 @@ class Comparison:
         reference: the subject whose figures count as 1.
         rounds: turns of each.
         seconds: that a turn lasts at least; 0 where a turn is a whole task.
-        abreast: as many rounds run at once as there are cores, each on its own; those of subjects that use several
+        abreast: as many turns are taken at once as there are cores, each on its own; those of subjects that use several
             cores follow one after another.
     """
 
@@ -67,23 +70,14 @@ class Comparison:
     abreast: bool = False
 
 
-@dataclass(frozen=True)
-class Lane:
-    """The rounds `first`, `first` + `step` and so on, on core number `first`."""
-
-    first: int = 0
-    step: int = 1
-
-
 class Running:
-    """A subject's process; ROUNDS in its environment holds the numbers of its lane."""
+    """A subject's process and its children's, one group, on `subject.cores` cores from number `core`."""
 
-    def __init__(self, name: str, subject: Subject, lane: Lane, log: Path) -> None:
+    def __init__(self, name: str, subject: Subject, core: int, log: Path) -> None:
         self.name = name
-        self.alone = subject.cores == 1
         python = ROOT / ".bench" / subject.venv / "bin" / "python"
         path = f"{SUBJECTS.parent}:{SUBJECTS.parents[1]}"
-        pin = ["taskset", "-c", f"{lane.first}-{lane.first + subject.cores - 1}"] if subject.cores else []
+        pin = ["taskset", "-c", f"{core}-{core + subject.cores - 1}"] if subject.cores else []
         self._log = log
         with log.open("w") as file:
             self._process = subprocess.Popen(
@@ -92,21 +86,16 @@ class Running:
                 stdout=subprocess.PIPE,
                 stderr=file,
                 text=True,
-                env={
-                    **os.environ,
-                    **ONE_THREAD,
-                    "PYTHONPATH": path,
-                    "PYTHONWARNINGS": "ignore",
-                    "ROUNDS": f"{lane.first} {lane.step}",
-                },
+                process_group=0,
+                env={**os.environ, **ONE_THREAD, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"},
             )
         self._answer()
 
-    def turn(self, seconds: float) -> dict[str, float]:
-        """One turn's measures."""
+    def turn(self, seconds: float, number: int) -> dict[str, float]:
+        """The measures of its turn in a round."""
         assert self._process.stdin is not None
         try:
-            self._process.stdin.write(f"{seconds}\n")
+            self._process.stdin.write(f"{seconds} {number}\n")
             self._process.stdin.flush()
         except BrokenPipeError:
             raise self._ended() from None
@@ -115,12 +104,19 @@ class Running:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error:  # it may be in the middle of a long turn, or stopped
+            self._send(signal.SIGTERM, signal.SIGCONT)
         try:
             self._process.communicate(timeout=GRACE)
         except subprocess.TimeoutExpired:
-            self._process.kill()
+            self._send(signal.SIGKILL)
             self._process.communicate()
+
+    def _send(self, *signals: signal.Signals) -> None:
+        for each in signals:
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, each)
 
     def _answer(self) -> dict[str, float]:
         assert self._process.stdout is not None
@@ -138,20 +134,16 @@ class Running:
 
 
 @contextmanager
-def started(comparison: Comparison, lane: Lane, logs: Path) -> Iterator[list[Running]]:
-    """The subjects of a comparison that take turns in a lane, ready for their first one.
-
-    The first lane has those that use several cores, too; they take the turns of all lanes.
-    """
+def started(comparison: Comparison, core: int, logs: Path) -> Iterator[dict[str, Running]]:
+    """The subjects of a comparison that use the core, ready for their first turn; core 0 has those of several cores."""
     with ExitStack() as stack:
-        found = []
-        for name, subject in comparison.subjects.items():
-            log = logs / f"{comparison.title}-{name}-{lane.first}.log".replace(" ", "_")
-            if subject.cores == 1:
-                found.append(stack.enter_context(Running(name, subject, lane, log)))
-            elif not lane.first:
-                found.append(stack.enter_context(Running(name, subject, Lane(), log)))
-        yield found
+        yield {
+            name: stack.enter_context(
+                Running(name, subject, core, logs / f"{comparison.title}-{name}-{core}.log".replace(" ", "_"))
+            )
+            for name, subject in comparison.subjects.items()
+            if subject.cores == 1 or not core
+        }
 
 
 def compare(comparison: Comparison, rounds: int, logs: Path) -> dict[str, Rounds]:
@@ -162,27 +154,37 @@ def compare(comparison: Comparison, rounds: int, logs: Path) -> dict[str, Rounds
     Raises:
         SubjectError: one of them ended.
     """
-    figures: dict[str, Rounds] = {name: {} for name in comparison.subjects}
-    abreast = min(rounds, os.cpu_count() or 1) if comparison.abreast else 1
-    with ExitStack() as stack:
-        lanes = [stack.enter_context(started(comparison, Lane(first, abreast), logs)) for first in range(abreast)]
-        shared = [subject for subject in lanes[0] if not subject.alone] if abreast > 1 else []
+    names = list(comparison.subjects)
+    turns = [(number, name) for number in range(rounds) for name in (names[::-1] if number % 2 else names)]
+    cores = min(rounds, os.cpu_count() or 1) if comparison.abreast else 1
+    abreast = [turn for turn in turns if cores > 1 and comparison.subjects[turn[1]].cores == 1]
+    alone = [turn for turn in turns if turn not in abreast]
+    taken: dict[tuple[int, str], dict[str, float]] = {}
+    # The subjects leave first, so that a turn does not outlive an interrupt.
+    with ThreadPoolExecutor(cores) as pool, ExitStack() as stack:
+        lanes = [stack.enter_context(started(comparison, core, logs)) for core in range(cores)]
+        free: SimpleQueue[dict[str, Running]] = SimpleQueue()
+        for lane in lanes:
+            free.put(lane)
 
-        def turns(number: int) -> list[tuple[str, dict[str, float]]]:
-            subjects = [subject for subject in lanes[number % abreast] if subject not in shared]
-            order = subjects[:: -1 if number // abreast % 2 else 1]
-            return [(subject.name, subject.turn(comparison.seconds)) for subject in order]
+        def take(turn: tuple[int, str]) -> dict[str, float]:
+            lane = free.get()
+            try:
+                return lane[turn[1]].turn(comparison.seconds, turn[0])
+            finally:
+                free.put(lane)
 
         if comparison.seconds:
-            for subject in lanes[0]:
-                subject.turn(comparison.seconds / 2)
-        for first in range(0, rounds, abreast):
-            numbers = range(first, min(first + abreast, rounds))
-            with ThreadPoolExecutor(abreast) as pool:
-                taken = [turn for each in pool.map(turns, numbers) for turn in each]
-            taken += [(subject.name, subject.turn(comparison.seconds)) for subject in shared for _ in numbers]
-            for name, measures in taken:
-                for measure, value in measures.items():
-                    figures[name].setdefault(measure, []).append(value)
-            print("." * len(numbers), end="", file=sys.stderr, flush=True)
-    return figures
+            for subject in lanes[0].values():
+                subject.turn(comparison.seconds / 2, 0)
+        measured = chain(
+            pool.map(take, abreast), (lanes[0][name].turn(comparison.seconds, number) for number, name in alone)
+        )
+        for turn, measures in zip(abreast + alone, measured, strict=True):
+            taken[turn] = measures
+            if len(taken) % len(names) == 0:
+                print(".", end="", file=sys.stderr, flush=True)
+    return {
+        name: {measure: [taken[number, name][measure] for number in range(rounds)] for measure in taken[0, name]}
+        for name in names
+    }

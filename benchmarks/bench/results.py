@@ -132,7 +132,7 @@ def _lines(figures: Figures) -> Iterator[str]:
     yield (
         "`make bench` writes this page from `results.json`. Subjects take turns in one run; a cell is the median over "
         "the rounds (lowest to highest), and a ratio is that of the same round. Subjects of one process "
-        "have one thread and share one core, but whole runs to a return have a core for each round; their rates count "
+        "have one thread and share one core, but whole runs to a return have a core each; their rates count "
         "seconds of processor time, those of several processes the clock's.\n"
     )
     for number, here in enumerate(figures["machines"], start=1):

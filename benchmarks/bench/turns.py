@@ -1,7 +1,7 @@
 """What every subject of `make bench` does: it waits for its turn, measures, answers.
 
 A subject is a process with the libraries of its own virtual environment; this module needs none. Orders come as lines
-of standard input, each a number of seconds; answers are lines of JSON on standard output, {measure: value}.
+of standard input, seconds and the number of the round; answers are lines of JSON on standard output, {measure: value}.
 """
 
 from __future__ import annotations
@@ -18,11 +18,21 @@ Measures = Mapping[str, float]
 
 def attend(turn: Callable[[float], Measures]) -> None:
     """Answer each order with `turn(seconds)`, until standard input ends."""
+    _attend(lambda seconds, _: turn(seconds))
+
+
+def attend_rounds(turn: Callable[[int], Measures]) -> None:
+    """Answer each order with `turn(round)`, a whole task that depends on the round."""
+    _attend(lambda _, number: turn(number))
+
+
+def _attend(turn: Callable[[float, int], Measures]) -> None:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print is no answer
     print(json.dumps({}), file=answers, flush=True)  # ready
     for order in sys.stdin:
-        print(json.dumps(dict(turn(float(order)))), file=answers, flush=True)
+        seconds, number = order.split()
+        print(json.dumps(dict(turn(float(seconds), int(number)))), file=answers, flush=True)
 
 
 def rate(action: Callable[[], object], seconds: float, amount: float = 1.0) -> float:

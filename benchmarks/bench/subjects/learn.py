@@ -1,4 +1,4 @@
-"""Whole runs to a mean return over 100 episodes, each round with its own seed: learn.py WHO TASK [METHOD].
+"""Whole runs to a mean return over 100 episodes, each round's number its seed: learn.py WHO TASK [METHOD].
 
 A turn is a new process, from its start to its end. A run that does not get there within the steps of its task counts
 with what it took, and is not solved.
@@ -7,16 +7,14 @@ with what it took, and is not solved.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
 import time
-from itertools import count
 from pathlib import Path
 from typing import Any
 
-from turns import attend
+from turns import attend_rounds
 
 # By task: the mean return, and the steps at most. Our preset has its name.
 TASKS = {"cartpole": (195.0, 50_000), "minatar-breakout": (5.0, 150_000)}
@@ -51,15 +49,13 @@ def rival(who: str, task: str, seed: int) -> tuple[int, bool]:
 
 
 def main(who: str, task: str, method: str = "coop") -> None:
-    seeds = count(*map(int, os.environ["ROUNDS"].split()))
-
-    def turn(_: float) -> dict[str, float]:
-        seed, begun = next(seeds), time.monotonic()
+    def turn(seed: int) -> dict[str, float]:
+        begun = time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
             steps, solved = ours(who, task, method, seed, Path(folder)) if who in OURS else rival(who, task, seed)
         return {"seconds": time.monotonic() - begun, "steps": steps, "solved": solved}
 
-    attend(turn)
+    attend_rounds(turn)
 
 
 if __name__ == "__main__":
