@@ -58,7 +58,7 @@ mutants: $(READY)
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/mutants.py
 
 # coop beside what people would use instead, whose packages get environments of their own. AREAS="table service" is a part of it;
-# AGAINST=benchmarks/results.json writes nothing, but names what has fallen since.
+# AGAINST=benchmarks/results.json writes nothing, but names what has moved since.
 bench:
 	@PYTHON=$(PYTHON) benchmarks/rivals.sh
 	@PYTHONPATH=benchmarks .bench/bench/bin/python -m bench $(AREAS) $(if $(AGAINST),--against $(AGAINST))

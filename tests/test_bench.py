@@ -2,6 +2,7 @@
 
 import copy
 import importlib
+import json
 import os
 import signal
 import sys
@@ -143,34 +144,53 @@ OURS = {"work/s": [20.0, 44.0, 18.0], "seconds": [0.5, 1.1, 0.4], "solved": [1.0
 
 
 @pytest.mark.parametrize(
-    ("changes", "named"),
+    ("changes", "way", "line"),
     [
-        ({}, []),
-        ({"work/s": [18.0, 36.0, 17.0]}, []),
+        ({"work/s": [18.0, 36.0, 17.0]}, 0, "work/s: 1.80 (1.70 to 1.80) times the reference, was 2.00 (1.80 to 2.20)"),
         (
             {"work/s": [17.0, 35.0, 17.9]},
-            ["work, ours, work/s: 1.75 (1.70 to 1.79) times the reference, was 2.00 (1.80 to 2.20)"],
+            -1,
+            "work/s: 1.75 (1.70 to 1.79) times the reference, was 2.00 (1.80 to 2.20)",
         ),
-        ({"work/s": [90.0, 90.0, 90.0]}, []),
-        ({"seconds": [0.1, 0.1, 0.1]}, []),
-        (
-            {"seconds": [0.6, 1.3, 0.7]},
-            ["work, ours, seconds: 0.65 (0.60 to 0.70) times the reference, was 0.50 (0.40 to 0.55)"],
-        ),
-        ({"solved": [0.0, 0.0, 0.0]}, []),  # the reference has 0 in a round: no ratio
+        ({"work/s": [90.0, 90.0, 90.0]}, 1, "work/s: 9.00 (4.50 to 9.00) times the reference, was 2.00 (1.80 to 2.20)"),
+        ({"work/s": [22.0, 90.0, 90.0]}, 0, "work/s: 4.50 (2.20 to 9.00) times the reference, was 2.00 (1.80 to 2.20)"),
+        ({"seconds": [0.1, 0.1, 0.1]}, 1, "seconds: 0.10 (0.05 to 0.10) times the reference, was 0.50 (0.40 to 0.55)"),
+        ({"seconds": [0.6, 1.3, 0.7]}, -1, "seconds: 0.65 (0.60 to 0.70) times the reference, was 0.50 (0.40 to 0.55)"),
     ],
 )
-def test_the_guard_names_what_left_its_range_for_the_worse(
-    bench: Any, changes: dict[str, list[float]], named: list[str]
-) -> None:
-    fallen = bench("results").fallen
-    assert list(fallen(_figures(base=BASE, ours={**OURS, **changes}), _figures(base=BASE, ours=OURS))) == named
+def test_the_guard_names_what_left_its_range(bench: Any, changes: dict[str, list[float]], way: int, line: str) -> None:
+    found = list(bench("results").moved(_figures(base=BASE, ours={**OURS, **changes}), _figures(base=BASE, ours=OURS)))
+    assert (way, f"work, ours, {line}") in found
+    assert [each for each, _ in found if each] == [way] * bool(way), "and nothing else"
+    assert len(found) == 2, "the reference solved nothing in a round: no ratio"
 
 
 def test_the_guard_passes_over_what_was_not_measured(bench: Any) -> None:
-    fallen, old = bench("results").fallen, _figures(base=BASE, ours=OURS)
-    assert not list(fallen({"comparisons": {}}, old))
-    assert not list(fallen(_figures(base=BASE), old))
+    moved, old = bench("results").moved, _figures(base=BASE, ours=OURS)
+    assert not list(moved({"comparisons": {}}, old))
+    assert not list(moved(_figures(base=BASE), old))
+
+
+def test_the_guard_counts_and_fails_by_what_fell(
+    bench: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command, module = bench("__main__"), bench("comparison")
+    subjects = {name: module.Subject("own") for name in ("base", "ours")}
+    monkeypatch.setattr(command, "COMPARISONS", [module.Comparison(command.AREAS[0], "work", subjects, "base")])
+    monkeypatch.setattr(command, "add", lambda figures, _, measured: figures.update(_figures(**measured)))
+    monkeypatch.setattr(sys, "argv", ["bench", "--against", str(tmp_path / "old.json")])
+    (tmp_path / "old.json").write_text(json.dumps(_figures(base=BASE, ours=OURS)))
+    for changes, said, status in (
+        ({"seconds": [0.1] * 3}, ["risen: work, ours, seconds", "of 2 ratios 1 agree", "1 rose, 0 fell"], 0),
+        ({"work/s": [1.0] * 3}, ["fallen: work, ours, work/s", "of 2 ratios 1 agree", "0 rose, 1 fell"], 1),
+    ):
+        measured = {"base": BASE, "ours": {**OURS, **changes}}
+        monkeypatch.setattr(command, "compare", lambda *_, measured=measured: measured)
+        with pytest.raises(SystemExit) as ended:
+            command.main()
+        words = capsys.readouterr().out
+        assert all(each in words for each in said)
+        assert ended.value.code == status
 
 
 def test_figures_say_on_which_machine_they_were_measured(bench: Any) -> None:

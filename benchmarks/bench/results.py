@@ -194,8 +194,11 @@ def exponents(subjects: dict[str, Rounds]) -> Iterator[str]:
         yield f"{'time' if measure == UNIT_COST else 'memory'} grows as size^{slope:.2f}"
 
 
-def fallen(new: Figures, old: Figures) -> Iterator[str]:
-    """The ratios to the reference that are worse than before by more than both ranges, one line each."""
+def moved(new: Figures, old: Figures) -> Iterator[tuple[int, str]]:
+    """For each ratio to the reference that both have, a line, and how it moved.
+
+    -1: worse than before by more than both ranges, 1: better by more than both, 0: the ranges overlap.
+    """
     for title, was in old["comparisons"].items():
         now = new["comparisons"].get(title)
         for subject, rounds in was["subjects"].items():
@@ -205,7 +208,7 @@ def fallen(new: Figures, old: Figures) -> Iterator[str]:
                     continue
                 before = ratios(values, reference(was)[measure])
                 after = ratios(measured, reference(now)[measure])
+                rise = (min(after) > max(before)) - (max(after) < min(before))
                 more_is_better = "/s" in measure or measure == "solved"
-                worse = max(after) < min(before) if more_is_better else min(after) > max(before)
-                if worse:
-                    yield f"{title}, {subject}, {measure}: {spread(after)} times the reference, was {spread(before)}"
+                line = f"{title}, {subject}, {measure}: {spread(after)} times the reference, was {spread(before)}"
+                yield rise if more_is_better else -rise, line
