@@ -2,7 +2,7 @@
 
 table: transitions of 4 floats held; a unit is one inserted and one drawn. emulators: of CartPole, acted for at once; a
 unit is a step. length: steps of a lockstep run; a unit is a step. runs: in a report; a unit is a run. actions: of the
-nature network; a unit is an update of coop.
+nature network; a unit is an update of coop, divided by them.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def runs(size: int) -> Cost:
 def actions(size: int) -> Cost:
     spec = msgspec.structs.replace(ATARI, num_actions=size)
     agent, batch = Agent(update_config("nature", "coop", BATCH, "float32"), spec), random_batch(spec, BATCH)
-    return lambda seconds: 1 / rate(partial(agent.update, batch), seconds)
+    return lambda seconds: 1 / rate(partial(agent.update, batch), seconds, size)
 
 
 def main(part: str, size: int) -> None:

@@ -7,6 +7,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from itertools import chain
 from multiprocessing.connection import Connection
 
 from turns import attend
@@ -21,22 +22,29 @@ Insert = tuple[Callable[[], object], Callable[[], object]]
 
 
 def insert_on_demand(end: Connection, insert: Insert) -> None:
-    """Answer each (seconds, rate) with the transitions a second that were inserted, acknowledgements included."""
+    """Answer each (seconds, rate, one at a time) with the transitions a second that were inserted and acknowledged.
+
+    One at a time, a segment waits for the acknowledgement of the last one; the answer has the seconds of each, too.
+    """
     submit, drain = insert
     submit()
     drain()
     end.send("ready")
     while (work := end.recv()) is not None:
-        seconds, rate = work
-        done, begun = 0, time.monotonic()
+        seconds, rate, singly = work
+        done, waits, begun = 0, [], time.monotonic()
         while (now := time.monotonic() - begun) < seconds:
             if done > rate * now:
                 time.sleep(STEPS / rate)
-            else:
-                submit()
-                done += STEPS
+                continue
+            asked = time.perf_counter()
+            submit()
+            if singly:
+                drain()
+                waits.append(time.perf_counter() - asked)
+            done += STEPS
         drain()
-        end.send(done / (time.monotonic() - begun))
+        end.send((done / (time.monotonic() - begun), waits))
 
 
 class Inserters:
@@ -54,16 +62,23 @@ class Inserters:
             assert ours.recv() == "ready"
             self._ends.append(ours)
 
-    def insert(self, seconds: float, rate: float = math.inf, meanwhile: Callable[[], object] = lambda: None) -> float:
-        """Transitions/s of all."""
+    def insert(
+        self,
+        seconds: float,
+        rate: float = math.inf,
+        meanwhile: Callable[[], object] = lambda: None,
+        singly: bool = False,
+    ) -> tuple[float, list[float]]:
+        """Transitions/s of all; if one at a time, the seconds until each segment was acknowledged."""
         for end in self._ends:
-            end.send((seconds, rate / INSERTERS))
+            end.send((seconds, rate / INSERTERS, singly))
         meanwhile()
-        return sum(end.recv() for end in self._ends)
+        rates, waits = zip(*(end.recv() for end in self._ends), strict=True)
+        return sum(rates), list(chain(*waits))
 
 
 def attend_service(inserters: Inserters, draw: Callable[[], object]) -> None:
-    """Take turns: inserts alone, draws alone, then draws beside inserts at `INSERT_RATE`."""
+    """Take turns: inserts alone, draws alone, then draws beside inserts at `INSERT_RATE`, as they come and singly."""
 
     def draws(seconds: float, name: str) -> dict[str, float]:
         waits, begun = [], time.perf_counter()
@@ -71,17 +86,19 @@ def attend_service(inserters: Inserters, draw: Callable[[], object]) -> None:
         while last - begun < seconds:
             draw()
             waits.append(-last + (last := time.perf_counter()))
-        waits.sort()
-        return {
-            f"batches/s {name}": len(waits) / (last - begun),
-            f"p99 of a batch {name}, ms": 1e3 * waits[int(0.99 * len(waits))],
-        }
+        return {f"batches/s {name}": len(waits) / (last - begun), f"p99 of a batch {name}, ms": _p99(waits)}
 
     def turn(seconds: float) -> Mapping[str, float]:
-        found = {"inserted/s alone": inserters.insert(seconds)}
-        found |= draws(seconds, "alone")
+        alone, _ = inserters.insert(seconds)
+        found = {"inserted/s alone": alone} | draws(seconds, "alone")
         both: dict[str, float] = {}
-        inserted = inserters.insert(seconds, INSERT_RATE, lambda: both.update(draws(seconds, "beside inserts")))
-        return found | both | {"inserted/s beside draws": inserted}
+        beside, _ = inserters.insert(seconds, INSERT_RATE, lambda: both.update(draws(seconds, "beside inserts")))
+        _, waits = inserters.insert(seconds, INSERT_RATE, lambda: draws(seconds, ""), singly=True)
+        return found | both | {"inserted/s beside draws": beside, "p99 of an insert beside draws, ms": _p99(waits)}
 
     attend(turn)
+
+
+def _p99(seconds: list[float]) -> float:
+    """In milliseconds."""
+    return 1e3 * sorted(seconds)[int(0.99 * len(seconds))]
