@@ -18,7 +18,7 @@ from work import KINDS
 
 from common.networks.network import build_network
 
-# The settings of its zoo, which has none for MinAtar: there our preset's, for the same network.
+# The settings of its zoo, which has none for MinAtar: there its updates a step of Atari games, the rest is as in ours.
 SETTINGS = {
     "cartpole": {
         "learning_rate": 2.3e-3,
@@ -34,13 +34,13 @@ SETTINGS = {
         "policy_kwargs": {"net_arch": [256, 256]},
     },
     "minatar-breakout": {
-        "learning_rate": 5e-4,
+        "learning_rate": 1e-3,
         "batch_size": 32,
         "buffer_size": 100_000,
         "learning_starts": 5000,
         "gamma": 0.99,
         "target_update_interval": 1000,
-        "train_freq": 1,
+        "train_freq": 4,
         "gradient_steps": 1,
         "exploration_fraction": 20_000 / 150_000,
         "exploration_final_eps": 0.05,

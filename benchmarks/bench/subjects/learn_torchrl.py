@@ -65,7 +65,11 @@ def main(task: str, seed: int) -> None:
     )
     loss = DQNLoss(actor, loss_function="smooth_l1", delay_value=True, double_dqn=False)
     loss.make_value_estimator(gamma=settings["gamma"])
-    targets = HardUpdate(loss, value_network_update_interval=max(1, settings["target_update_interval"]))
+    frames, each = max(8, settings["train_freq"]), settings["gradient_steps"]
+    updates = frames * each // settings["train_freq"]
+    # Between its trainings Stable-Baselines3 copies targets by steps; here the period counts updates.
+    period = max(each, settings["target_update_interval"] * each // settings["train_freq"])
+    targets = HardUpdate(loss, value_network_update_interval=period)
     optimizer = torch.optim.Adam(loss.parameters(), lr=settings["learning_rate"])
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(settings["buffer_size"]), batch_size=settings["batch_size"]
@@ -73,10 +77,9 @@ def main(task: str, seed: int) -> None:
     collector = Collector(
         env,
         TensorDictSequential(actor, explore),
-        frames_per_batch=settings["train_freq"] if settings["train_freq"] > 1 else 8,
+        frames_per_batch=frames,
         total_frames=most,
     )
-    updates = settings["gradient_steps"] if settings["train_freq"] > 1 else 8
     returns: deque[float] = deque(maxlen=100)
     steps, solved = 0, False
     for data in collector:
