@@ -13,7 +13,7 @@ from commands import run_command
 from actors.policy import Policy
 from common.errors import UsageError
 from common.networks.network import FlatNetwork, build_network
-from common.settings.config import NetworkSettings, RunConfig
+from common.settings.config import NETWORK_KINDS, NetworkSettings, RunConfig
 from common.settings.sources import base_config
 from common.settings.tables import validated
 from common.types import EnvSpec
@@ -75,6 +75,8 @@ def test_what_is_no_network_is_refused_in_one_line(name: str, text: str) -> None
 def test_an_unknown_kind_is_refused_with_those_that_exist() -> None:
     with pytest.raises(UsageError, match=r"network.kind = 'nature3': allowed: mlp, .*minatar, or module:function$"):
         validated(RunConfig(network=NetworkSettings(kind="nature3")))
+    with pytest.raises(UsageError, match=f"'nature3' is not one of {', '.join(NETWORK_KINDS)}$"):
+        build_network("nature3", EnvSpec("Pictures", (84, 84), "uint8", 4, 4), (), 0)
 
 
 def _lockstep(method: str, name: str) -> Lockstep:

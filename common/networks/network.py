@@ -21,7 +21,6 @@ from common.networks.dense import Dense
 from common.networks.inputs import preprocess
 from common.networks.layout import ArrayT, Layout, digest, mlp_layout, views
 from common.networks.normalised import NormalisedNetwork
-from common.settings.config import NETWORK_KINDS
 from common.types import EnvSpec
 
 # (out channels, kernel, stride) of each convolution, then the width of the hidden linear layer.
@@ -50,7 +49,7 @@ def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) ->
             return _conv(kind, spec)
         if ":" in kind:
             return custom_network(kind, spec, sample_inputs(spec, 4))
-    raise UsageError(f"network kind: {kind!r} is not one of {', '.join(NETWORK_KINDS)}")
+    raise UsageError(f"network kind: {kind!r} is not one of {', '.join(('mlp', *_CONV_NETWORKS))}")
 
 
 def _mlp(spec: EnvSpec, hidden: Sequence[int]) -> nn.Sequential:
