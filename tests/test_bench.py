@@ -152,6 +152,16 @@ OURS = {"work/s": [20.0, 44.0, 18.0], "seconds": [0.5, 1.1, 0.4], "solved": [1.0
             -1,
             "work/s: 1.75 (1.70 to 1.79) times the reference, was 2.00 (1.80 to 2.20)",
         ),
+        (
+            {"work/s": [17.9, 35.8, 17.8]},
+            0,
+            "work/s: 1.79 (1.78 to 1.79) times the reference, was 2.00 (1.80 to 2.20)",
+        ),
+        (
+            {"seconds": [0.552, 1.2, 0.6]},
+            0,
+            "seconds: 0.60 (0.55 to 0.60) times the reference, was 0.50 (0.40 to 0.55)",
+        ),
         ({"work/s": [90.0, 90.0, 90.0]}, 1, "work/s: 9.00 (4.50 to 9.00) times the reference, was 2.00 (1.80 to 2.20)"),
         ({"work/s": [22.0, 90.0, 90.0]}, 0, "work/s: 4.50 (2.20 to 9.00) times the reference, was 2.00 (1.80 to 2.20)"),
         ({"seconds": [0.1, 0.1, 0.1]}, 1, "seconds: 0.10 (0.05 to 0.10) times the reference, was 0.50 (0.40 to 0.55)"),
