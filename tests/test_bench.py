@@ -191,8 +191,8 @@ def test_the_guard_counts_and_fails_by_what_fell(
     monkeypatch.setattr(sys, "argv", ["bench", "--against", str(tmp_path / "old.json")])
     (tmp_path / "old.json").write_text(json.dumps(_figures(base=BASE, ours=OURS)))
     for changes, said, status in (
-        ({"seconds": [0.1] * 3}, ["risen: work, ours, seconds", "of 2 ratios 1 agree", "1 rose, 0 fell"], 0),
-        ({"work/s": [1.0] * 3}, ["fallen: work, ours, work/s", "of 2 ratios 1 agree", "0 rose, 1 fell"], 1),
+        ({"seconds": [0.1] * 3}, ["better: work, ours, seconds", "of 2 ratios 1 agree", "1 are better, 0 worse"], 0),
+        ({"work/s": [1.0] * 3}, ["worse: work, ours, work/s", "of 2 ratios 1 agree", "0 are better, 1 worse"], 1),
     ):
         measured = {"base": BASE, "ours": {**OURS, **changes}}
         monkeypatch.setattr(command, "compare", lambda *_, measured=measured: measured)

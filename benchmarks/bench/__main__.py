@@ -2,7 +2,7 @@
 
 Measures the areas in turn and writes benchmarks/results.json, benchmarks/RESULTS.md and a plot of each area as it goes.
 `--against FILE` compares with earlier figures, usually the committed ones, instead of writing: it names each ratio that
-has left its earlier range, and ends with exit status 1 if one of them fell.
+has left its earlier range, and ends with exit status 1 if one of them is worse.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ def main() -> None:
             draw(figures, comparison.area)
     if old:
         changes = list(moved(figures, old))
-        for which, name in ((1, "risen"), (-1, "fallen")):
+        for which, name in ((1, "better"), (-1, "worse")):
             for line in (line for way, line in changes if way == which):
                 print(f"{name}: {line}")
         ways = Counter(way for way, _ in changes)
-        print(f"of {len(changes)} ratios {ways[0]} agree within their ranges, {ways[1]} rose, {ways[-1]} fell")
+        print(f"of {len(changes)} ratios {ways[0]} agree within their ranges, {ways[1]} are better, {ways[-1]} worse")
         sys.exit(ways[-1] > 0)
 
 
@@ -60,5 +60,5 @@ if __name__ == "__main__":
     try:
         main()
     except KeyboardInterrupt:
-        print("\nmake bench: stopped; what was measured before stays", file=sys.stderr)
+        print("\nmake bench: stopped", file=sys.stderr)
         sys.exit(130)
