@@ -104,6 +104,15 @@ def test_a_subject_that_ends_is_named(comparison: Any, tmp_path: Path) -> None:
         comparison.compare(comparison.Comparison("x", "one", subjects, "a"), 1, tmp_path)
 
 
+def test_a_subject_that_hangs_is_ended(comparison: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparison, "LIMIT", 2.0)
+    note = tmp_path / "child"
+    subjects = {"a": comparison.Subject("own", ("long", str(note)))}
+    with pytest.raises(comparison.SubjectError, match=r"^a took more than 2 s; see .*-a-0\.log$"):
+        comparison.compare(comparison.Comparison("x", "one", subjects, "a"), 1, tmp_path)
+    assert not _runs(int(note.read_text()))
+
+
 @pytest.mark.parametrize("abreast", [False, True])
 def test_an_interrupt_ends_long_turns(comparison: Any, abreast: bool, tmp_path: Path) -> None:
     note = tmp_path / "child"

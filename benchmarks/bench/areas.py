@@ -92,13 +92,17 @@ def _acting() -> Iterator[Comparison]:
 
 
 def _steps() -> Iterator[Comparison]:
-    for preset, methods in (
-        ("cartpole-paper", (*GRADIENT, *FEEDBACK)),
-        ("minatar-breakout", (*GRADIENT, *FEEDBACK, "medqn")),
+    cartpole, minatar = "cartpole-paper", "minatar-breakout"
+    for title, preset, period, methods in (
+        (cartpole, cartpole, "1", (*GRADIENT, *FEEDBACK)),
+        (minatar, minatar, "1", (*GRADIENT, *FEEDBACK, "medqn")),
+        (f"{minatar}, an update every four", minatar, "4", ("dqn", "coop")),
     ):
-        subjects = {"Stable-Baselines3": Subject("steps_sb3", (preset,))}
-        subjects |= {method: Subject("steps_coop", (preset, method)) for method in methods}
-        yield Comparison("steps", f"lockstep steps of {preset}", subjects, "Stable-Baselines3", 9, 1.0)
+        subjects = {"Stable-Baselines3": Subject("steps_sb3", (preset, period))}
+        subjects |= {method: Subject("steps_coop", (preset, method, period)) for method in methods}
+        if period != "1":  # as in the whole runs of `learning`
+            subjects["bare loop of coop"] = Subject("steps_bare", (preset, "coop", period))
+        yield Comparison("steps", f"lockstep steps of {title}", subjects, "Stable-Baselines3", 9, 1.0)
 
 
 def _end_to_end() -> Iterator[Comparison]:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
@@ -20,13 +21,14 @@ ROOT = Path(__file__).parents[2]
 SUBJECTS = Path(__file__).parent / "subjects"
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 GRACE = 60.0  # seconds for a subject to end after its last turn
+LIMIT = 3600.0  # seconds that a turn may take; the longest takes minutes, and a subject that hangs would take for ever
 
 # By round, the value of each measure.
 Rounds = dict[str, list[float]]
 
 
 class SubjectError(Exception):
-    """A subject ended before its turns did."""
+    """A subject ended before its turns did, or didn't answer."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +122,23 @@ class Running:
 
     def _answer(self) -> dict[str, float]:
         assert self._process.stdout is not None
-        for line in self._process.stdout:
-            if line.startswith("{"):  # a library may print something as it is imported
-                answer: dict[str, float] = json.loads(line)
-                return answer
+        late = threading.Event()
+
+        def end() -> None:
+            late.set()
+            self._send(signal.SIGKILL)
+
+        limit = threading.Timer(LIMIT, end)
+        limit.start()
+        try:
+            for line in self._process.stdout:
+                if line.startswith("{"):  # a library may print something as it is imported
+                    answer: dict[str, float] = json.loads(line)
+                    return answer
+        finally:
+            limit.cancel()
+        if late.is_set():
+            raise SubjectError(f"{self.name} took more than {LIMIT:,.0f} s; see {self._log}")
         raise self._ended()
 
     def _ended(self) -> SubjectError:

@@ -1,18 +1,25 @@
-"""A broadcast of the nature network's weights over TCP until all sessions have it: broadcast.py SESSIONS."""
+"""A broadcast of the nature network's weights over TCP until all sessions have it: broadcast.py SESSIONS.
+
+Broadcasts never block: one that comes before a session's subscription, or while its queue is full, does not reach it.
+Then it is repeated.
+"""
 
 from __future__ import annotations
 
 import multiprocessing
 import sys
 import threading
+from collections import defaultdict
 from contextlib import ExitStack
+from functools import partial
+from itertools import count
 from multiprocessing.connection import Connection
 
 import numpy as np
+import zenoh
 from turns import attend, clocked
 from work import ATARI, update_config
 
-from common.messaging.keys import weights_key
 from common.messaging.messages.weights import Weights
 from common.messaging.session import open_session
 from common.messaging.transport import Node, new_incarnation
@@ -21,44 +28,49 @@ from common.process.processes import free_endpoint
 from learner.agent import Agent
 
 RUN = "bench"
+BROADCASTS = f"{RUN}/broadcasts"  # the start of their keys
+PATIENCE = 1.0  # seconds before a broadcast is repeated
 
 
-def subscribers(endpoint: str, count: int, end: Connection) -> None:
-    """Say when all have received something."""
-    received, lock = 0, threading.Lock()
+def subscribers(endpoint: str, sessions: int, end: Connection) -> None:
+    """Send the key of each broadcast that all sessions have received."""
+    heard: defaultdict[str, set[int]] = defaultdict(set)
+    lock = threading.Lock()
 
-    def receive(_: object) -> None:
-        nonlocal received
+    def receive(session: int, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
         with lock:
-            received += 1
-            if received == count:
-                received = 0
-                end.send("all")
+            if session not in heard[key]:
+                heard[key].add(session)
+                if len(heard[key]) == sessions:
+                    end.send(key)
 
     with ExitStack() as stack:
-        for _ in range(count):
+        for number in range(sessions):
             session = stack.enter_context(open_session((), (endpoint,)))
-            node = stack.enter_context(Node(session, RUN, "actor", new_incarnation()))
-            session.declare_subscriber(weights_key(node, 1), receive)
-        end.send("ready")
+            stack.enter_context(Node(session, RUN, "actor", new_incarnation()))
+            session.declare_subscriber(f"{BROADCASTS}/*", partial(receive, number))
         end.recv()
 
 
-def main(count: int) -> None:
+def main(sessions: int) -> None:
     keep_freed_memory()
     endpoint = free_endpoint()
     flat = Agent(update_config("nature", "dqn", 32, "float32"), ATARI).networks[0].snapshot()
     spawn = multiprocessing.get_context("spawn")
     with Node(open_session((endpoint,)), RUN, "learner", new_incarnation()) as node:
         ours, theirs = spawn.Pipe()
-        process = spawn.Process(target=subscribers, args=(endpoint, count, theirs), daemon=True)
+        process = spawn.Process(target=subscribers, args=(endpoint, sessions, theirs), daemon=True)
         process.start()
-        assert ours.recv() == "ready"
+        numbers = count(1)
         payload = Weights(1, 1, np.asarray(flat)).encode(RUN)
 
         def publish() -> None:
-            node.publish(weights_key(node, 1), payload)
-            assert ours.recv() == "all"
+            key = f"{BROADCASTS}/{next(numbers)}"
+            node.publish(key, payload)
+            while not ours.poll(PATIENCE):
+                node.publish(key, payload)
+            assert ours.recv() == key
 
         attend(lambda seconds: {"ms": 1e3 * clocked(publish, seconds)})
         ours.send(None)

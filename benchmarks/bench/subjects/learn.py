@@ -18,11 +18,11 @@ from turns import attend_rounds
 
 # By task: the mean return, and the steps at most. Our preset has its name.
 TASKS = {"cartpole": (195.0, 50_000), "minatar-breakout": (5.0, 150_000)}
-# Updates a step, the same for everybody: those of Stable-Baselines3's zoo, whose Atari games stand in for MinAtar.
-RATIOS = {"cartpole": "0.5", "minatar-breakout": "0.25"}
+# Steps an update, the same for everybody: those of Stable-Baselines3's zoo, whose Atari games stand in for MinAtar.
+STEPS = {"cartpole": 2, "minatar-breakout": 4}
 # The same for everybody, in place of our preset's.
-PERIODS = {"minatar-breakout": "250"}  # updates between two targets: 1,000 steps
-RATES = {"minatar-breakout": "1e-3"}
+PERIODS = {"minatar-breakout": 250}  # updates between two targets
+RATES = {"minatar-breakout": 1e-3}
 OURS = {"lockstep": ("coop-lockstep",), "distributed": ("coop-local", "--actors", "1")}
 
 
@@ -38,10 +38,10 @@ def run(who: str, preset: str, seed: int, folder: Path, *more: str, method: str 
 def ours(who: str, task: str, method: str, seed: int, folder: Path) -> tuple[int, bool]:
     """Steps, and whether it got there."""
     mean, most = TASKS[task]
-    flags = ["--replay.ratio", RATIOS[task], "--target-return", str(mean), "--total-steps", str(most)]
+    flags = ["--replay.ratio", str(1 / STEPS[task]), "--target-return", str(mean), "--total-steps", str(most)]
     if task in PERIODS:
         period = "swap-every" if method == "coop" else "target-update-every"
-        flags += [f"--learner.{period}", PERIODS[task], "--learner.learning-rate", RATES[task]]
+        flags += [f"--learner.{period}", str(PERIODS[task]), "--learner.learning-rate", str(RATES[task])]
     summary = run(who, task, seed, folder, *flags, method=method)
     return summary["env_steps"], summary["return_mean_100"] >= mean
 

@@ -10,7 +10,7 @@ import gymnasium
 import minatar.gym
 import numpy as np
 import torch
-from learn import TASKS
+from learn import PERIODS, RATES, STEPS, TASKS
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -18,6 +18,7 @@ from work import KINDS
 
 from common.networks.network import build_network
 
+MINATAR = "minatar-breakout"
 # The settings of its zoo, which has none for MinAtar: there its updates a step of Atari games, the rest is as in ours.
 SETTINGS = {
     "cartpole": {
@@ -33,14 +34,14 @@ SETTINGS = {
         "exploration_final_eps": 0.04,
         "policy_kwargs": {"net_arch": [256, 256]},
     },
-    "minatar-breakout": {
-        "learning_rate": 1e-3,
+    MINATAR: {
+        "learning_rate": RATES[MINATAR],
         "batch_size": 32,
         "buffer_size": 100_000,
         "learning_starts": 5000,
         "gamma": 0.99,
-        "target_update_interval": 1000,
-        "train_freq": 4,
+        "target_update_interval": PERIODS[MINATAR] * STEPS[MINATAR],
+        "train_freq": STEPS[MINATAR],
         "gradient_steps": 1,
         "exploration_fraction": 20_000 / 150_000,
         "exploration_final_eps": 0.05,

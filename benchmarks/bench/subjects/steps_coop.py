@@ -1,4 +1,4 @@
-"""Lockstep steps, an update in each, with the run's files: steps_coop.py PRESET METHOD."""
+"""Lockstep steps, an update every PERIOD of them, with the run's files: steps_coop.py PRESET METHOD PERIOD."""
 
 import sys
 import tempfile
@@ -12,8 +12,8 @@ from experiments.lockstep import Lockstep
 from learner.records.run_directory import RunDirectory
 
 use_threads(1)
-preset, method = sys.argv[1:]
-config = step_config(preset, method)
+preset, method, period = sys.argv[1:]
+config = step_config(preset, method, int(period))
 run = Lockstep(config)
 with tempfile.TemporaryDirectory() as folder:
     directory = RunDirectory(Path(folder) / "run", config)

@@ -1,4 +1,4 @@
-"""Steps of Stable-Baselines3's DQN, an update in each, configured like our preset: steps_sb3.py PRESET."""
+"""Steps of Stable-Baselines3's DQN, an update every PERIOD, configured like our preset: steps_sb3.py PRESET PERIOD."""
 
 import sys
 
@@ -11,8 +11,8 @@ from turns import attend, rate
 from work import START, step_config
 
 STEPS = 100  # of a call
-preset = sys.argv[1]
-config = step_config(preset, "dqn")
+preset, period = sys.argv[1], int(sys.argv[2])
+config = step_config(preset, "dqn", period)
 learner, replay = config.learner, config.replay
 torch.set_num_threads(1)
 torch.set_flush_denormal(True)  # its optimizer would take three times as long over denormal numbers
@@ -28,7 +28,7 @@ model = DQN(
     buffer_size=replay.capacity,
     learning_starts=START,
     batch_size=learner.batch_size,
-    train_freq=1,
+    train_freq=period,
     gradient_steps=1,
     target_update_interval=learner.swap_every,
     exploration_final_eps=config.actor.epsilon_final,

@@ -65,10 +65,10 @@ def acting_config(run: str, envs: int, epsilon: float) -> RunConfig:
     return resolve({**tables, "run": run, "total_steps": 10**12})
 
 
-def step_config(preset: str, method: str) -> RunConfig:
-    """A preset of lockstep runs with Adam and single targets, which all subjects have."""
+def step_config(preset: str, method: str, period: int) -> RunConfig:
+    """A preset of lockstep runs with Adam, single targets and an update every `period` steps, as all subjects have."""
     tables = load_tables(preset, None)
     tables.pop("methods", None)
     tables["learner"] |= {"optimizer": "adam", "eps": 1e-8, "double": False}
-    tables["replay"] |= {"learning_starts": START}
+    tables["replay"] |= {"learning_starts": START, "ratio": 1 / period}
     return resolve({**tables, "run": "bench", "total_steps": 10**9}, method)
