@@ -61,8 +61,8 @@ class Lockstep:
         self._player.send(self.step, self.agent.updates)
         turn = self._player.recv()
         self._follow(turn)
-        self.memory.add(turn)
         self.step += 1
+        self.memory.add(turn, self.step)
         drawn = msgspec.structs.replace(self.trainer.drawn, inserted=self.step, **self.memory.counters())
         for batch in self.memory.batches(self.step):
             effects = self.trainer.train(batch, drawn, time.monotonic())
@@ -124,6 +124,7 @@ class Lockstep:
         replay_actions = partial(self._replay_actions, replaying=replaying)
         if isinstance(self.memory, TableMemory) and old_checkpoints.is_old(epoch):
             state = old_checkpoints.load(epoch, state, self.memory.table, replay_actions)
+            self.memory.forget_stored()
         elif "player" not in state:
             raise UsageError(f"{epoch}: saved by a distributed run; coop-local --resume continues it")
         else:
@@ -142,8 +143,8 @@ class Lockstep:
 
     def _replay_actions(self, actions: list[int], replaying: Replaying) -> None:
         """Play the actions of a run again; the memory is restored separately."""
-        for step, action in enumerate(actions):
-            replaying(step, len(actions))
+        for step, action in enumerate(actions, 1):
+            replaying(step - 1, len(actions))
             turn = self._player.replay(np.array([action], np.int32))
             self.memory.follow(turn, step)
             self._follow(turn)

@@ -16,7 +16,7 @@ from actors.segments import SegmentAssembler
 from common.registry import loaded
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS
-from common.types import Array, Batch, EnvSpec
+from common.types import Array, Batch, EnvSpec, Segment
 from learner.agent import Agent
 from learner.methods.stream_q import StreamAgent, Transition
 from learner.protocol import Agent as AnyAgent
@@ -30,11 +30,11 @@ class Memory(Protocol):
     def begin(self, obs: Array) -> None:
         """Store the run's first observation, <frame_dtype>[1, *obs_shape]."""
 
-    def add(self, turn: Turn) -> None:
-        """Store a step."""
+    def add(self, turn: Turn, step: int) -> None:
+        """Store a step; step: its number, from 1."""
 
     def follow(self, turn: Turn, step: int) -> None:
-        """Follow a step that is played again before `load`; step: its number, from 0."""
+        """Follow a step that is played again before `load`."""
 
     def batches(self, step: int) -> Iterator[Batch]:
         """Yield the batches to learn from after the first `step` steps of the run, the newest of which `add` stored."""
@@ -62,29 +62,48 @@ def make_memory(config: RunConfig, spec: EnvSpec) -> tuple[AnyAgent, Memory]:
 
 
 class TableMemory:
-    """A replay table, of which batches are drawn as the replay ratio says."""
+    """A replay table, of which batches are drawn as the replay ratio says.
+
+    Steps are stored some at a time, which costs less: a segment ends where a batch is due, so every batch may hold
+    every step before it.
+    """
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
         self._config = config
-        self._segments = SegmentAssembler(spec, 1, 0, 1, n_step=config.replay.n_step, gamma=config.learner.gamma)
+        self._segments = SegmentAssembler(
+            spec, 1, 0, config.actor.segment_steps, n_step=config.replay.n_step, gamma=config.learner.gamma
+        )
+        self._cut_steps = 0  # transitions of all segments so far
         self._core = ReplayCore(config, spec)
         self.table = self._core.table
         self.update_priorities = self.table.update_priorities
         self.begin = self._segments.begin
 
-    def add(self, turn: Turn) -> None:
+    def add(self, turn: Turn, step: int) -> None:
         """See `Memory`."""
-        for segment in self._segments.add(turn.actions, turn.steps, turn.version, turn.ended):
+        for segment in self._cut(turn, turn.version, step):
             self.table.insert(segment)
 
     def follow(self, turn: Turn, step: int) -> None:
         """See `Memory`: the table is restored from its snapshot."""
-        self._segments.add(turn.actions, turn.steps, self._updates_by(step), turn.ended)
+        self._cut(turn, self._updates_by(step - 1), step)
+
+    def _cut(self, turn: Turn, version: int, step: int) -> list[Segment]:
+        """Add a step; return the segments that it completes."""
+        segments = self._segments.add(turn.actions, turn.steps, version, turn.ended)
+        if self._due(step):
+            segments += self._segments.flush()
+        self._cut_steps += sum(segment.steps for segment in segments)
+        return segments
 
     def batches(self, step: int) -> Iterator[Batch]:
         """See `Memory`."""
-        for _ in range(self._updates_by(step) - self._updates_by(step - 1)):
+        for _ in range(self._due(step)):
             yield self.table.sample(self._config.learner.batch_size)
+
+    def _due(self, step: int) -> int:
+        """Number of updates between the first `step` steps and the next one."""
+        return self._updates_by(step) - self._updates_by(step - 1)
 
     def _updates_by(self, step: int) -> int:
         """Number of updates after the first `step` steps."""
@@ -108,6 +127,12 @@ class TableMemory:
     def load(self, folder: Path, run_id: int) -> None:
         """See `Memory`."""
         load_snapshot(self._core, folder, run_id)
+        self.forget_stored()
+
+    def forget_stored(self) -> None:
+        """Drop the steps that wait for a segment but are in the table: earlier versions stored each one at once."""
+        if self.table.inserted > self._cut_steps:
+            self._segments.flush()
 
 
 class NoMemory:
@@ -127,7 +152,7 @@ class NoMemory:
         self._obs = obs
         self._agent.begin(obs[0])
 
-    def add(self, turn: Turn) -> None:
+    def add(self, turn: Turn, step: int) -> None:
         """See `Memory`."""
         self._turn = turn
 

@@ -183,10 +183,11 @@ def test_an_epoch_of_the_old_format_goes_on_to_the_byte(tmp_path: Path) -> None:
     assert torch.equal(whole.agent.networks[0].flat, resumed.agent.networks[0].flat)
 
 
-def test_steps_that_wait_for_their_return_come_back_with_a_resumed_run(tmp_path: Path) -> None:
-    """With n-step returns the last n - 1 steps are not in the table yet when an epoch is saved."""
+@pytest.mark.parametrize("ratio", [1.0, 0.3])
+def test_steps_that_wait_come_back_with_a_resumed_run(ratio: float, tmp_path: Path) -> None:
+    """Steps are not in the table yet that wait for their n-step return, or for the next batch."""
     config = base_config(["--method", "dqn"])
-    config = replace(config, replay=replace(config.replay, n_step=5, learning_starts=40))
+    config = replace(config, replay=replace(config.replay, n_step=5, learning_starts=40, ratio=ratio))
     first, second = Lockstep(config), Lockstep(config)
     tables = []
     with RunDirectory(tmp_path, config) as directory:
@@ -203,6 +204,48 @@ def test_steps_that_wait_for_their_return_come_back_with_a_resumed_run(tmp_path:
     assert tables[0].keys() == tables[1].keys()
     for name, column in tables[0].items():
         assert column.tobytes() == tables[1][name].tobytes(), name
+
+
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_steps_are_stored_some_at_a_time_before_each_batch(n_step: int) -> None:
+    config = base_config(["--method", "dqn"])
+    run = Lockstep(replace(config, replay=replace(config.replay, n_step=n_step, learning_starts=41, ratio=0.25)))
+    stored: list[int] = []
+    run.memory.table.insert = lambda segment, insert=run.memory.table.insert: (
+        stored.append(segment.steps),
+        insert(segment),
+    )
+    for _ in range(200):
+        updates = run.agent.updates
+        for _ in run.play():
+            pass
+        if run.agent.updates > updates:
+            assert run.step - n_step < run.memory.table.inserted <= run.step, "all whose return is complete"
+    run.env.close()
+    assert run.agent.updates == 39
+    assert sum(stored) == run.memory.table.inserted
+    assert len(stored) < 60
+
+
+def test_an_epoch_that_has_every_step_goes_on_alike(tmp_path: Path) -> None:
+    """Earlier versions stored each step at once, so their epochs' tables have those that would still wait."""
+    config = base_config(["--method", "dqn"])
+    config = replace(config, replay=replace(config.replay, learning_starts=40, ratio=0.25))
+    whole, first, second = Lockstep(config), Lockstep(config), Lockstep(config)
+    with RunDirectory(tmp_path, config) as directory:
+        for _ in range(151):
+            _play(first, directory)
+        for segment in first.memory._segments.flush():
+            first.memory.table.insert(segment)
+        first.save(directory)
+    second.restore(tmp_path / "checkpoints" / str(first.agent.updates))
+    for run, steps in ((whole, 351), (second, 200)):
+        for _ in range(steps):
+            for _ in run.play():
+                pass
+        run.env.close()
+    assert second.memory.counters() == whole.memory.counters()
+    assert torch.equal(second.agent.networks[0].flat, whole.agent.networks[0].flat)
 
 
 def test_processes_do_not_go_on_with_a_lockstep_run(tmp_path: Path) -> None:
