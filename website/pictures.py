@@ -5,6 +5,7 @@ python -m website.pictures
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import matplotlib as mpl
@@ -70,7 +71,11 @@ PICTURES = {"run": run_picture, "small-buffers": buffers_picture}
 
 
 def draw(name: str, folder: Path) -> Path:
-    """Write a picture as SVG, whose bytes depend on the data and the version of matplotlib only."""
+    """Write a picture as SVG, whose bytes depend on the data and the version of matplotlib only.
+
+    matplotlib names clip paths and markers after all digits of their places, the last of which differ between
+    processors; here they are numbered.
+    """
     mpl.use("Agg")
     path = folder / f"{name}.svg"
     with mpl.rc_context(
@@ -86,6 +91,11 @@ def draw(name: str, folder: Path) -> Path:
         canvas = PICTURES[name]()
         canvas.savefig(path, metadata={"Date": None})
         plt.close(canvas)
+    names: dict[str, str] = {}
+    text = re.sub(
+        r"\b[mp][0-9a-f]{10}\b", lambda found: names.setdefault(found[0], f"part{len(names)}"), path.read_text()
+    )
+    path.write_text(text)
     return path
 
 
