@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
-import torch
-
 from bench.comparison import Comparison, Subject
+from bench.processor import instructions
 
 GRADIENT, FEEDBACK = ("dqn", "g-coop"), ("edql", "coop")
 
@@ -51,7 +50,7 @@ def _update_subjects(kind: str, batch: int, device: str) -> dict[str, Subject]:
         **{method: ours(method, "float32") for method in (*GRADIENT, *FEEDBACK)},
     }
     # Without AVX-512 products of bfloat16 take 20 to 50 times as long as float32's: half a minute for an update of 512.
-    quick = batch == 32 or device != "cpu" or "AVX512" in torch.backends.cpu.get_cpu_capability()
+    quick = batch == 32 or device != "cpu" or instructions() not in ("avx2", "others")
     if kind in ("nips2013", "nature") and quick:
         subjects |= {f"{method} bfloat16": ours(method, "bfloat16") for method in ("dqn", "coop")}
     return subjects

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from bench import processor
 from bench.areas import TARGETS, Target
 from bench.comparison import ROOT, Comparison, Rounds
 
@@ -76,11 +77,10 @@ def put(figures: Figures, comparison: Comparison, measured: dict[str, Rounds], h
 
 def machine() -> dict[str, str]:
     """Processor, cores, memory, system and Python."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
     pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
     return {
-        "processor": model,
+        "processor": processor.model(),
+        "instructions": processor.instructions(),
         "cores": str(os.cpu_count()),
         "memory": f"{pages:.0f} GiB",
         "system": platform.platform(terse=True),

@@ -1,0 +1,24 @@
+"""The processor of this machine, as Linux describes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+# What speeds up products, best first.
+INSTRUCTIONS = ("amx_bf16", "avx512_bf16", "avx512f", "avx2")
+
+
+def model() -> str:
+    """Its name."""
+    return _field("model name") or "unknown"
+
+
+def instructions() -> str:
+    """The best of `INSTRUCTIONS` that it has: processors of one name differ in them."""
+    flags = _field("flags").split()
+    return next((name for name in INSTRUCTIONS if name in flags), "others")
+
+
+def _field(name: str) -> str:
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
