@@ -7,6 +7,7 @@ import sysconfig
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import msgpack
 import numpy as np
@@ -210,21 +211,18 @@ def test_steps_that_wait_come_back_with_a_resumed_run(ratio: float, tmp_path: Pa
 def test_steps_are_stored_some_at_a_time_before_each_batch(n_step: int) -> None:
     config = base_config(["--method", "dqn"])
     run = Lockstep(replace(config, replay=replace(config.replay, n_step=n_step, learning_starts=41, ratio=0.25)))
-    stored: list[int] = []
-    run.memory.table.insert = lambda segment, insert=run.memory.table.insert: (
-        stored.append(segment.steps),
-        insert(segment),
-    )
-    for _ in range(200):
-        updates = run.agent.updates
-        for _ in run.play():
-            pass
-        if run.agent.updates > updates:
-            assert run.step - n_step < run.memory.table.inserted <= run.step, "all whose return is complete"
+    table = run.memory.table
+    with patch.object(table, "insert", wraps=table.insert) as insert:
+        for _ in range(200):
+            updates = run.agent.updates
+            for _ in run.play():
+                pass
+            if run.agent.updates > updates:
+                assert run.step - n_step < table.inserted <= run.step, "all whose return is complete"
     run.env.close()
     assert run.agent.updates == 39
-    assert sum(stored) == run.memory.table.inserted
-    assert len(stored) < 60
+    assert sum(call.args[0].steps for call in insert.call_args_list) == table.inserted
+    assert insert.call_count < 60
 
 
 def test_an_epoch_that_has_every_step_goes_on_alike(tmp_path: Path) -> None:

@@ -92,10 +92,9 @@ def draw(name: str, folder: Path) -> Path:
         canvas.savefig(path, metadata={"Date": None})
         plt.close(canvas)
     names: dict[str, str] = {}
-    text = re.sub(
-        r"\b[mp][0-9a-f]{10}\b", lambda found: names.setdefault(found[0], f"part{len(names)}"), path.read_text()
-    )
-    path.write_text(text)
+    text = path.read_text(encoding="utf-8")
+    text = re.sub(r"\b[mp][0-9a-f]{10}\b", lambda found: names.setdefault(found[0], f"part{len(names)}"), text)
+    path.write_text(text, encoding="utf-8")
     return path
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from bench.comparison import Comparison, Subject
-from bench.processor import instructions
+from bench.processor import fast_bfloat16
 
 GRADIENT, FEEDBACK = ("dqn", "g-coop"), ("edql", "coop")
 
@@ -49,8 +49,8 @@ def _update_subjects(kind: str, batch: int, device: str) -> dict[str, Subject]:
         "Stable-Baselines3": Subject("update_sb3", (kind, str(batch), device)),
         **{method: ours(method, "float32") for method in (*GRADIENT, *FEEDBACK)},
     }
-    # Without AVX-512 products of bfloat16 take 20 to 50 times as long as float32's: half a minute for an update of 512.
-    quick = batch == 32 or device != "cpu" or instructions() not in ("avx2", "others")
+    # Where they are slow, an update of 512 takes half a minute.
+    quick = batch == 32 or device != "cpu" or fast_bfloat16()
     if kind in ("nips2013", "nature") and quick:
         subjects |= {f"{method} bfloat16": ours(method, "bfloat16") for method in ("dqn", "coop")}
     return subjects
@@ -95,17 +95,19 @@ def _acting() -> Iterator[Comparison]:
 
 
 def _steps() -> Iterator[Comparison]:
-    cartpole, minatar = "cartpole-paper", "minatar-breakout"
-    for title, preset, period, methods in (
-        (cartpole, cartpole, "1", (*GRADIENT, *FEEDBACK)),
-        (minatar, minatar, "1", (*GRADIENT, *FEEDBACK, "medqn")),
-        (f"{minatar}, an update every four", minatar, "4", ("dqn", "coop")),
+    minatar, period = "minatar-breakout", "4"  # steps an update, as in the whole runs of `learning`
+    bare = {"bare loop of coop": Subject("steps_bare", (minatar, "coop", period))}
+    for title, subjects in (
+        ("cartpole-paper", _step_subjects("cartpole-paper", "1", *GRADIENT, *FEEDBACK)),
+        (minatar, _step_subjects(minatar, "1", *GRADIENT, *FEEDBACK, "medqn")),
+        (f"{minatar}, an update every four", _step_subjects(minatar, period, "dqn", "coop") | bare),
     ):
-        subjects = {"Stable-Baselines3": Subject("steps_sb3", (preset, period))}
-        subjects |= {method: Subject("steps_coop", (preset, method, period)) for method in methods}
-        if period != "1":  # as in the whole runs of `learning`
-            subjects["bare loop of coop"] = Subject("steps_bare", (preset, "coop", period))
         yield Comparison("steps", f"lockstep steps of {title}", subjects, "Stable-Baselines3", 9, 1.0)
+
+
+def _step_subjects(preset: str, period: str, *methods: str) -> dict[str, Subject]:
+    ours = {method: Subject("steps_coop", (preset, method, period)) for method in methods}
+    return {"Stable-Baselines3": Subject("steps_sb3", (preset, period))} | ours
 
 
 def _end_to_end() -> Iterator[Comparison]:

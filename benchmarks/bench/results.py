@@ -76,7 +76,7 @@ def put(figures: Figures, comparison: Comparison, measured: dict[str, Rounds], h
 
 
 def machine() -> dict[str, str]:
-    """Processor, cores, memory, system and Python."""
+    """Processor and its instructions, cores, memory, system and Python."""
     pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
     return {
         "processor": processor.model(),

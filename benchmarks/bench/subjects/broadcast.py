@@ -48,7 +48,6 @@ def subscribers(endpoint: str, sessions: int, end: Connection) -> None:
     with ExitStack() as stack:
         for number in range(sessions):
             session = stack.enter_context(open_session((), (endpoint,)))
-            stack.enter_context(Node(session, RUN, "actor", new_incarnation()))
             session.declare_subscriber(f"{BROADCASTS}/*", partial(receive, number))
         end.recv()
 
