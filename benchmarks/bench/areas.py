@@ -156,9 +156,8 @@ def _growth() -> Iterator[Comparison]:
     }.items():
         subjects = {f"{size:,}": Subject("grow", (part, str(size))) for size in sizes}
         once = part in ("length", "runs")  # a turn is a whole one
-        yield Comparison(
-            "growth", f"growth of {part}", subjects, f"{sizes[0]:,}", 3 if once else 7, 0.0 if once else 0.5
-        )
+        rounds, seconds = (3, 0.0) if once else (7, 0.5)
+        yield Comparison("growth", f"growth of {part}", subjects, f"{sizes[0]:,}", rounds, seconds, abreast=once)
 
 
 COMPARISONS = (

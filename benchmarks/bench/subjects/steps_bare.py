@@ -1,9 +1,12 @@
 """What a lockstep step can't do without: steps_bare.py PRESET METHOD PERIOD, for a network of one convolution.
 
-The emulator plays and the network answers; every PERIOD steps the matrix products of an update, and nothing else of it.
+The emulator plays and the network answers; every PERIOD steps the matrix products, whitening and optimizer's step of an
+update, and nothing else of it.
 """
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from unittest.mock import patch
 
 import numpy as np
@@ -12,11 +15,10 @@ from work import START, step_config
 
 from common.envs.make import make_vector_env
 from common.networks import convolution
-from common.networks.convolution import product
 from common.process.threads import use_threads
-from common.types import Array
 from experiments.lockstep import Lockstep
 from learner.edl import convolution as backward
+from learner.edl import transforms
 
 use_threads(1)
 preset, method, period = sys.argv[1], sys.argv[2], int(sys.argv[3])
@@ -24,16 +26,21 @@ config = step_config(preset, method, period)
 run = Lockstep(config)
 for _ in range(START + 100):
     list(run.play())
-products: list[tuple[Array, Array, Array | None]] = []
+calls: list[Callable[[], object]] = []
 
 
-def recorded(a: Array, b: Array, out: Array | None = None) -> Array:
-    products.append((a, b, out))
-    return product(a, b, out)
+def recorded(function: Callable[..., object], *args: object) -> object:
+    calls.append(partial(function, *args))
+    return function(*args)
 
 
-with patch.object(convolution, "product", recorded), patch.object(backward, "product", recorded):
+with (
+    patch.object(convolution, "product", partial(recorded, convolution.product)),
+    patch.object(backward, "product", partial(recorded, backward.product)),
+    patch.object(transforms, "whitened", partial(recorded, transforms.whitened)),
+):
     run.agent.update(run.memory.table.sample(config.learner.batch_size))
+calls.append(partial(run.agent.optimizers[run.agent.acting].step, config.learner.learning_rate))
 network, spec = run.agent.networks[0], run.agent.spec
 env = make_vector_env(config.env, 1, 0)
 seen = [env.reset()]
@@ -42,8 +49,8 @@ seen = [env.reset()]
 def steps() -> None:
     for _ in range(period):
         seen[0] = env.step(network.q_values(seen[0], spec).argmax(1).astype(np.int32)).obs
-    for a, b, out in products:
-        product(a, b, out)
+    for call in calls:
+        call()
 
 
 attend(lambda seconds: {"steps/s": rate(steps, seconds, period)})
