@@ -148,8 +148,8 @@ def _figures(**subjects: dict[str, list[float]]) -> dict[str, Any]:
     return {"comparisons": {"work": {"area": "x", "reference": "base", "subjects": subjects}}}
 
 
-BASE = {"work/s": [10.0, 20.0, 10.0], "seconds": [1.0, 2.0, 1.0], "solved": [1.0, 0.0, 1.0]}
-OURS = {"work/s": [20.0, 44.0, 18.0], "seconds": [0.5, 1.1, 0.4], "solved": [1.0, 1.0, 0.0]}
+BASE = {"work/s": [10.0, 20.0, 10.0], "seconds": [1.0, 2.0, 1.0], "MiB": [10.0] * 3, "solved": [1.0, 0.0, 1.0]}
+OURS = {"work/s": [20.0, 44.0, 18.0], "seconds": [0.5, 1.1, 0.4], "MiB": [5.0] * 3, "solved": [1.0, 1.0, 0.0]}
 
 
 @pytest.mark.parametrize(
@@ -175,13 +175,15 @@ OURS = {"work/s": [20.0, 44.0, 18.0], "seconds": [0.5, 1.1, 0.4], "solved": [1.0
         ({"work/s": [22.0, 90.0, 90.0]}, 0, "work/s: 4.50 (2.20 to 9.00) times the reference, was 2.00 (1.80 to 2.20)"),
         ({"seconds": [0.1, 0.1, 0.1]}, 1, "seconds: 0.10 (0.05 to 0.10) times the reference, was 0.50 (0.40 to 0.55)"),
         ({"seconds": [0.6, 1.3, 0.7]}, -1, "seconds: 0.65 (0.60 to 0.70) times the reference, was 0.50 (0.40 to 0.55)"),
+        ({"MiB": [5.2] * 3}, 0, "MiB: 0.52 (0.52 to 0.52) times the reference, was 0.50 (0.50 to 0.50)"),
+        ({"MiB": [5.3] * 3}, -1, "MiB: 0.53 (0.53 to 0.53) times the reference, was 0.50 (0.50 to 0.50)"),
     ],
 )
 def test_the_guard_names_what_left_its_range(bench: Any, changes: dict[str, list[float]], way: int, line: str) -> None:
     found = list(bench("results").moved(_figures(base=BASE, ours={**OURS, **changes}), _figures(base=BASE, ours=OURS)))
     assert (way, f"work, ours, {line}") in found
     assert [each for each, _ in found if each] == [way] * bool(way), "and nothing else"
-    assert len(found) == 2, "the reference solved nothing in a round: no ratio"
+    assert len(found) == 3, "the reference solved nothing in a round: no ratio"
 
 
 def test_the_guard_passes_over_what_was_not_measured(bench: Any) -> None:
@@ -200,8 +202,8 @@ def test_the_guard_counts_and_fails_by_what_fell(
     monkeypatch.setattr(sys, "argv", ["bench", "--against", str(tmp_path / "old.json")])
     (tmp_path / "old.json").write_text(json.dumps(_figures(base=BASE, ours=OURS)))
     for changes, said, status in (
-        ({"seconds": [0.1] * 3}, ["better: work, ours, seconds", "of 2 ratios 1 agree", "1 are better, 0 worse"], 0),
-        ({"work/s": [1.0] * 3}, ["worse: work, ours, work/s", "of 2 ratios 1 agree", "0 are better, 1 worse"], 1),
+        ({"seconds": [0.1] * 3}, ["better: work, ours, seconds", "of 3 ratios 2 agree", "1 are better, 0 worse"], 0),
+        ({"work/s": [1.0] * 3}, ["worse: work, ours, work/s", "of 3 ratios 2 agree", "0 are better, 1 worse"], 1),
     ):
         measured = {"base": BASE, "ours": {**OURS, **changes}}
         monkeypatch.setattr(command, "compare", lambda *_, measured=measured: measured)

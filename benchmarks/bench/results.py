@@ -26,7 +26,8 @@ PACKAGES = {
     "reverb": ("dm-reverb", "tensorflow", "numpy"),
 }
 UNIT_COST = "us a unit"  # of the area growth
-SAME = 1.01  # how far apart ranges may lie that count as overlapping
+# How far apart ranges may lie that count as overlapping: of memory, which is measured once in a run, and of the rest.
+MEMORY, SAME_MEMORY, SAME = ("MiB", "bytes/transition"), 1.05, 1.01
 # "comparisons", by title: area, reference, seconds, "on", which of "machines", and "subjects": {name: Rounds}
 Figures = dict[str, Any]
 
@@ -198,8 +199,7 @@ def exponents(subjects: dict[str, Rounds]) -> Iterator[str]:
 def moved(new: Figures, old: Figures) -> Iterator[tuple[int, str]]:
     """For each ratio to the reference that both have, a line, and how it moved.
 
-    -1: worse than before by more than both ranges, 1: better by more than both, 0: the ranges overlap, or
-    almost: what is measured once in a run, such as memory, has none.
+    -1: worse than before by more than both ranges, 1: better by more than both, 0: the ranges overlap, or almost.
     """
     for title, was in old["comparisons"].items():
         now = new["comparisons"].get(title)
@@ -210,7 +210,8 @@ def moved(new: Figures, old: Figures) -> Iterator[tuple[int, str]]:
                     continue
                 before = ratios(values, reference(was)[measure])
                 after = ratios(measured, reference(now)[measure])
-                rise = (min(after) > SAME * max(before)) - (SAME * max(after) < min(before))
+                same = SAME_MEMORY if measure in MEMORY else SAME
+                rise = (min(after) > same * max(before)) - (same * max(after) < min(before))
                 more_is_better = "/s" in measure or measure == "solved"
                 line = f"{title}, {subject}, {measure}: {spread(after)} times the reference, was {spread(before)}"
                 yield rise if more_is_better else -rise, line
