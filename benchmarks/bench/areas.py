@@ -150,12 +150,14 @@ def _growth() -> Iterator[Comparison]:
     for part, sizes in {
         "table": (10_000, 100_000, 1_000_000),
         "emulators": (1, 10, 100),
+        "actors": (1, 10, 100),
         "length": (500, 5000, 50_000),
         "runs": (3, 33, 336),
         "actions": (2, 6, 18),
     }.items():
-        subjects = {f"{size:,}": Subject("grow", (part, str(size))) for size in sizes}
-        once = part in ("length", "runs")  # a turn is a whole one
+        cores = 0 if part == "actors" else 1
+        subjects = {f"{size:,}": Subject("grow", (part, str(size)), cores=cores) for size in sizes}
+        once = part in ("actors", "length", "runs")  # a turn is a whole one
         rounds, seconds = (3, 0.0) if once else (7, 0.5)
         yield Comparison("growth", f"growth of {part}", subjects, f"{sizes[0]:,}", rounds, seconds, abreast=once)
 

@@ -1,12 +1,14 @@
 """What a part costs as its work grows: grow.py PART SIZE. Microseconds of each unit of work, and memory of all of it.
 
 table: transitions of 4 floats held; a unit is one inserted and one drawn. emulators: of CartPole, acted for at once; a
-unit is a step. length: steps of a lockstep run; a unit is a step. runs: in a report; a unit is a run. actions: of the
-nature network; a unit is an update of coop, divided by them.
+unit is a step. actors: synthetic ones at a learner and a replay service; a unit is what a second of an actor takes of
+the processor time of those two. length: steps of a lockstep run; a unit is a step. runs: in a report; a unit is a run.
+actions: of the nature network; a unit is an update of coop, divided by them.
 """
 
 from __future__ import annotations
 
+import argparse
 import resource
 import shutil
 import subprocess
@@ -19,6 +21,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from fan_in import measure
 from learn import run
 from made_up import random_batch, segments
 from start import BIN, PACKED
@@ -32,11 +35,13 @@ from common.process.threads import use_threads
 from learner.agent import Agent
 from replay.table.table import Table
 
-Cost = Callable[[float], float]  # seconds of a unit, measured for about so many seconds
+Turn = Callable[[float], tuple[float, float]]  # seconds of a unit, measured for about so many seconds; MiB of all of it
+ROLES = ("learner", "replay")
+RATE, PLAYED = 100.0, 10.0  # transitions/s of a synthetic actor; seconds
 
 
-def table(size: int) -> Cost:
-    spec = KINDS["mlp"][1]
+def table(size: int) -> Turn:
+    before, spec = resident_bytes(), KINDS["mlp"][1]
     held, stream = Table(spec, size, rng=np.random.default_rng(0)), segments(spec, STEPS)
     while held.inserted < 1.2 * size:
         held.insert(next(stream))
@@ -46,11 +51,11 @@ def table(size: int) -> Cost:
         for _ in range(STEPS // BATCH):
             held.sample(BATCH)
 
-    return lambda seconds: 1 / rate(unit, seconds, STEPS)
+    return lambda seconds: (1 / rate(unit, seconds, STEPS), _since(before))
 
 
-def emulators(size: int) -> Cost:
-    config = update_config("mlp", "coop", BATCH, "float32")
+def emulators(size: int) -> Turn:
+    before, config = resident_bytes(), update_config("mlp", "coop", BATCH, "float32")
     spec, env = env_spec(config.env), make_vector_env(config.env, size, seed=0)
     networks = tuple(FlatNetwork(build_network("mlp", spec, config.network.hidden, seed)) for seed in (0, 1))
     policy, seen = Policy(networks, spec, np.random.default_rng(0)), [env.reset()]
@@ -58,20 +63,31 @@ def emulators(size: int) -> Cost:
     def unit() -> None:
         seen[0] = env.step(policy.act(seen[0], 0.1)).obs
 
-    return lambda seconds: 1 / rate(unit, seconds, size)
+    return lambda seconds: (1 / rate(unit, seconds, size), _since(before))
 
 
-def length(size: int) -> Cost:
-    def cost(_: float) -> float:
+def actors(size: int) -> Turn:
+    def turn(_: float) -> tuple[float, float]:
+        options = argparse.Namespace(network="small", publish_every=10, processes=2, rate=RATE * size, seconds=PLAYED)
+        row = measure(size, options)
+        if row.problems:
+            raise RuntimeError("; ".join(row.problems))
+        cores, mebibytes = (sum(row.figures[f"{role}: {what}"] for role in ROLES) for what in ("cores", "MiB"))
+        return cores / size, mebibytes
+
+    return turn
+
+
+def length(size: int) -> Turn:
+    def turn(_: float) -> tuple[float, float]:
         with tempfile.TemporaryDirectory() as folder:
-            return (
-                float(run("lockstep", "cartpole", 0, Path(folder), "--total-steps", str(size))["wall_seconds"]) / size
-            )
+            summary = run("lockstep", "cartpole", 0, Path(folder), "--total-steps", str(size))
+        return float(summary["wall_seconds"]) / size, _largest_child()
 
-    return cost
+    return turn
 
 
-def runs(size: int) -> Cost:
+def runs(size: int) -> Turn:
     folder = Path(tempfile.mkdtemp())
     subprocess.run([BIN / "coop-report", PACKED, "--unpack", folder / "all"], check=True, stdout=subprocess.DEVNULL)
     chosen = sorted(path.parent for path in (folder / "all").rglob("config.toml"))[:size]
@@ -79,31 +95,45 @@ def runs(size: int) -> Cost:
         shutil.copytree(path, folder / "some" / path.name)
     subprocess.run([BIN / "coop-report", folder / "some", "--pack", folder / "some.parquet"], check=True)
 
-    def cost(_: float) -> float:
+    def turn(_: float) -> tuple[float, float]:
         begun = time.monotonic()
         command = [BIN / "coop-report", folder / "some.parquet", "--out", folder / "report"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        return (time.monotonic() - begun) / size
+        return (time.monotonic() - begun) / size, _largest_child()
 
-    return cost
+    return turn
 
 
-def actions(size: int) -> Cost:
-    spec = msgspec.structs.replace(ATARI, num_actions=size)
+def actions(size: int) -> Turn:
+    before, spec = resident_bytes(), msgspec.structs.replace(ATARI, num_actions=size)
     agent, batch = Agent(update_config("nature", "coop", BATCH, "float32"), spec), random_batch(spec, BATCH)
-    return lambda seconds: 1 / rate(partial(agent.update, batch), seconds, size)
+    return lambda seconds: (1 / rate(partial(agent.update, batch), seconds, size), _since(before))
+
+
+def _since(before: int) -> float:
+    """MiB by which this process has grown."""
+    return (resident_bytes() - before) / 2**20
+
+
+def _largest_child() -> float:
+    """MiB of the largest process that this one has started."""
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**10
 
 
 def main(part: str, size: int) -> None:
     use_threads(1)
-    before = resident_bytes()
-    cost = {"table": table, "emulators": emulators, "length": length, "runs": runs, "actions": actions}[part](size)
+    take = {
+        "table": table,
+        "emulators": emulators,
+        "actors": actors,
+        "length": length,
+        "runs": runs,
+        "actions": actions,
+    }[part](size)
 
     def turn(seconds: float) -> dict[str, float]:
-        microseconds = 1e6 * cost(seconds)
-        children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**10  # of the largest one
-        memory = children if part in ("length", "runs") else (resident_bytes() - before) / 2**20
-        return {"us a unit": microseconds, "MiB": memory}
+        cost, mebibytes = take(seconds)
+        return {"us a unit": 1e6 * cost, "MiB": mebibytes}
 
     attend(turn)
 
