@@ -23,6 +23,7 @@ STEPS = {"cartpole": 2, "minatar-breakout": 4}
 # The same for everybody, in place of our preset's.
 PERIODS = {"minatar-breakout": 250}  # updates between two targets
 RATES = {"minatar-breakout": 1e-3}
+N_STEPS = {"minatar-breakout": 3}  # of a return
 OURS = {"lockstep": ("coop-lockstep",), "distributed": ("coop-local", "--actors", "1")}
 
 
@@ -42,6 +43,7 @@ def ours(who: str, task: str, method: str, seed: int, folder: Path) -> tuple[int
     if task in PERIODS:
         period = "swap-every" if method == "coop" else "target-update-every"
         flags += [f"--learner.{period}", str(PERIODS[task]), "--learner.learning-rate", str(RATES[task])]
+        flags += ["--replay.n-step", str(N_STEPS[task])]
     summary = run(who, task, seed, folder, *flags, method=method)
     return summary["env_steps"], summary["return_mean_100"] >= mean
 

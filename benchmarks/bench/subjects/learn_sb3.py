@@ -10,7 +10,7 @@ import gymnasium
 import minatar.gym
 import numpy as np
 import torch
-from learn import PERIODS, RATES, STEPS, TASKS
+from learn import N_STEPS, PERIODS, RATES, STEPS, TASKS
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -43,6 +43,7 @@ SETTINGS = {
         "target_update_interval": PERIODS[MINATAR] * STEPS[MINATAR],
         "train_freq": STEPS[MINATAR],
         "gradient_steps": 1,
+        "n_steps": N_STEPS[MINATAR],
         "exploration_fraction": 20_000 / 150_000,
         "exploration_final_eps": 0.05,
     },

@@ -19,6 +19,7 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, DTypeCastTransform, GymWrapper, RewardSum, TransformedEnv
+from torchrl.envs.transforms import MultiStepTransform
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate
 from work import KINDS
@@ -74,6 +75,9 @@ def main(task: str, seed: int) -> None:
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(settings["buffer_size"]), batch_size=settings["batch_size"]
     )
+    if (n_steps := settings.get("n_steps", 1)) > 1:
+        # By default it takes `terminated` from a return's first step, and bootstraps behind ends in the later ones.
+        buffer.append_transform(MultiStepTransform(n_steps, settings["gamma"], done_keys=[]))
     collector = Collector(
         env,
         TensorDictSequential(actor, explore),
