@@ -72,18 +72,22 @@ class Comparison:
     abreast: bool = False
 
 
+def python_of(venv: str) -> Path:
+    """The interpreter of an environment in .bench/."""
+    return ROOT / ".bench" / venv / "bin" / "python"
+
+
 class Running:
     """A subject's process and its children's, one group, on `subject.cores` cores from number `core`."""
 
     def __init__(self, name: str, subject: Subject, core: int, log: Path) -> None:
         self.name = name
-        python = ROOT / ".bench" / subject.venv / "bin" / "python"
         path = f"{SUBJECTS.parent}:{SUBJECTS.parents[1]}"
         pin = ["taskset", "-c", f"{core}-{core + subject.cores - 1}"] if subject.cores else []
         self._log = log
         with log.open("w") as file:
             self._process = subprocess.Popen(
-                [*pin, str(python), str(SUBJECTS / f"{subject.script}.py"), *subject.arguments],
+                [*pin, str(python_of(subject.venv)), str(SUBJECTS / f"{subject.script}.py"), *subject.arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,

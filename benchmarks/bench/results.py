@@ -17,7 +17,7 @@ import numpy as np
 
 from bench import processor
 from bench.areas import TARGETS, Target
-from bench.comparison import ROOT, Comparison, Rounds
+from bench.comparison import Comparison, Rounds, python_of
 
 FIGURES = Path(__file__).parents[1] / "results.json"
 PAGE = Path(__file__).parents[1] / "RESULTS.md"
@@ -25,6 +25,12 @@ PACKAGES = {
     "bench": ("coop-rl", "torch", "numpy", "eclipse-zenoh", "stable-baselines3", "torchrl", "cpprb", "gymnasium"),
     "reverb": ("dm-reverb", "tensorflow", "numpy"),
 }
+_PRINT_VERSIONS = """
+import contextlib, importlib.metadata, sys
+for name in sys.argv[1:]:
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        print(name, importlib.metadata.version(name))
+"""
 UNIT_COST = "us a unit"  # of the area growth
 # How far apart ranges may lie that count as overlapping: of memory, which is measured once in a run, and of the rest.
 MEMORY, SAME_MEMORY, SAME = ("MiB", "bytes/transition"), 1.05, 1.01
@@ -51,7 +57,7 @@ def save(figures: Figures, path: Path) -> None:
 
 def add(figures: Figures, comparison: Comparison, measured: dict[str, Rounds]) -> None:
     """Put a comparison's figures in the place of its earlier ones."""
-    here = {"machine": machine(), "versions": {venv: versions(venv, names) for venv, names in PACKAGES.items()}}
+    here = {"machine": machine(), "versions": versions()}
     put(figures, comparison, measured, here)
 
 
@@ -77,7 +83,7 @@ def put(figures: Figures, comparison: Comparison, measured: dict[str, Rounds], h
 
 
 def machine() -> dict[str, str]:
-    """Processor and its instructions, cores, memory, system and Python."""
+    """Processor and its instructions, cores, memory, system and Python; the GPU, if there is one."""
     pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
     return {
         "processor": processor.model(),
@@ -86,15 +92,19 @@ def machine() -> dict[str, str]:
         "memory": f"{pages:.0f} GiB",
         "system": platform.platform(terse=True),
         "python": platform.python_version(),
+        **processor.gpu(),
     }
 
 
-def versions(venv: str, names: tuple[str, ...]) -> dict[str, str]:
-    """Versions of the packages of an environment in .bench/."""
-    script = "import sys, importlib.metadata as m\nfor name in sys.argv[1:]: print(m.version(name))"
-    python = ROOT / ".bench" / venv / "bin" / "python"
-    done = subprocess.run([python, "-c", script, *names], capture_output=True, text=True, check=True)
-    return dict(zip(names, done.stdout.split(), strict=True))
+def versions() -> dict[str, dict[str, str]]:
+    """By environment in .bench/, the versions of the packages that it has."""
+    return {venv: _versions(venv, names) for venv, names in PACKAGES.items() if python_of(venv).exists()}
+
+
+def _versions(venv: str, names: tuple[str, ...]) -> dict[str, str]:
+    command = [python_of(venv), "-c", _PRINT_VERSIONS, *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return dict(line.split() for line in done.stdout.splitlines())
 
 
 def ratios(over: list[float], under: list[float]) -> list[float]:

@@ -35,12 +35,13 @@ def _attend(turn: Callable[[float, int], Measures]) -> None:
         print(json.dumps(dict(turn(float(seconds), int(number)))), file=answers, flush=True)
 
 
-def rate(action: Callable[[], object], seconds: float, amount: float = 1.0) -> float:
+def rate(action: Callable[[], object], seconds: float, amount: float = 1.0, *, on: str = "cpu") -> float:
     """The amount that `action` does a second of this process's processor time, measured for at least so many seconds.
 
-    On a core of one's own that is what the clock says; on a shared one it leaves out the time of others.
+    On a core of one's own that is what the clock says; on a shared one it leaves out the time of others. On a GPU it
+    is the clock's.
     """
-    return amount / _cost(action, seconds, time.process_time)
+    return amount / _cost(action, seconds, time.process_time if on == "cpu" else time.perf_counter)
 
 
 def clocked(action: Callable[[], object], seconds: float) -> float:

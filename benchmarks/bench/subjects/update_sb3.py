@@ -68,7 +68,7 @@ flops = counter.get_total_flops()
 
 
 def turn(seconds: float) -> dict[str, float]:
-    updates = rate(update, seconds)
+    updates = rate(update, seconds, on=device)
     return {"updates/s": updates, "GFLOP/s": updates * flops / 1e9}
 
 
