@@ -145,7 +145,9 @@ def _runs(pid: int) -> bool:
 
 
 def _figures(**subjects: dict[str, list[float]]) -> dict[str, Any]:
-    return {"comparisons": {"work": {"area": "x", "reference": "base", "subjects": subjects}}}
+    commands = {name: {"script": "own", "arguments": ["7", name]} for name in subjects}
+    work = {"area": "x", "reference": "base", "subjects": subjects, "commands": commands}
+    return {"comparisons": {"work": work}}
 
 
 BASE = {"work/s": [10.0, 20.0, 10.0], "seconds": [1.0, 2.0, 1.0], "MiB": [10.0] * 3, "solved": [1.0, 0.0, 1.0]}
@@ -225,17 +227,18 @@ def test_figures_say_on_which_machine_they_were_measured(bench: Any) -> None:
         return [
             line
             for line in results.page(figures).splitlines()
-            if line.startswith(("## F", "## S", "On m", "1. ", "2. "))
+            if line.startswith(("## F", "## S", "`make bench A", "1. ", "2. "))
         ]
 
     one, two = (f"cores: {cores}; `.bench/bench`: torch 2." for cores in (1, 2))
-    assert measure("first", 0) == [f"1. {one}", "## First"]
-    assert measure("second", 0) == [f"1. {one}", "## First", "## Second"]
-    both = [f"1. {one}", f"2. {two}", "## First", "On machine 2.", "## Second", "On machine 1."]
+    alone, first, second = (f"`make bench AREAS=x`{where}." for where in ("", " on machine 1", " on machine 2"))
+    assert measure("first", 0) == [f"1. {one}", "## First", alone]
+    assert measure("second", 0) == [f"1. {one}", "## First", alone, "## Second", alone]
+    both = [f"1. {one}", f"2. {two}", "## First", second, "## Second", first]
     assert measure("first", 1) == both
     assert measure("first", 1) == both
-    assert measure("second", 1) == [f"1. {two}", "## First", "## Second"], "nothing is left of the other machine"
-    back = [f"1. {two}", f"2. {one}", "## First", "On machine 1.", "## Second", "On machine 2."]
+    assert measure("second", 1) == [f"1. {two}", "## First", alone, "## Second", alone], "nothing is left of the other"
+    back = [f"1. {two}", f"2. {one}", "## First", first, "## Second", second]
     assert measure("second", 0) == back, "and those that stay are numbered anew"
 
 
@@ -255,7 +258,9 @@ def test_a_target_without_others_is_a_figure(bench: Any, monkeypatch: pytest.Mon
     assert results.reached(targets[0], figures) == ("", [2.5, 2.0, 2.9])
     assert results.reached(target("work", "seconds", "ours", (), 2.0), figures) is None
     monkeypatch.setattr(results, "TARGETS", targets)
-    lines = [line for line in results.page(figures).splitlines() if line.startswith("| work: base")]
+    page = results.page(figures).splitlines()
+    assert "| base | 2.50 (2.00 to 2.90) | 1.00 (1.00 to 1.00) | `own.py 7 base` |" in page
+    lines = [line for line in page if line.startswith("| work: base")]
     assert lines == [
         "| work: base, seconds |  | 2.50 (2.00 to 2.90) | at most 2.60 | met |",
         "| work: base, seconds |  | 2.50 (2.00 to 2.90) | at most 2.40 | short |",

@@ -145,7 +145,8 @@ def _lines(figures: Figures) -> Iterator[str]:
         "`make bench` writes this page from `results.json`. Subjects take turns in one run; a cell is the median over "
         "the rounds (lowest to highest), and a ratio is that of the same round. Subjects of one process "
         "have one thread and share one core, but whole runs to a return have a core each; their rates count "
-        "seconds of processor time, those of several processes the clock's.\n"
+        "seconds of processor time, those of several processes the clock's. A command is a script of "
+        "`bench/subjects/`, which `.bench/bench/bin/python` runs, or that of `.bench/reverb` for Reverb.\n"
     )
     for number, here in enumerate(figures["machines"], start=1):
         facts = [f"{name}: {value}" for name, value in here["machine"].items()]
@@ -166,8 +167,8 @@ def _lines(figures: Figures) -> Iterator[str]:
     shown = set()
     for title, found in figures["comparisons"].items():
         yield f"\n## {title[0].upper()}{title[1:]}\n"
-        if len(figures["machines"]) > 1:
-            yield f"On machine {found['on'] + 1}.\n"
+        where = f" on machine {found['on'] + 1}" if len(figures["machines"]) > 1 else ""
+        yield f"`make bench AREAS={found['area']}`{where}.\n"
         yield from _tables(found)
         if found["area"] == "growth":
             yield "\n" + "; ".join(exponents(found["subjects"])) + "."
@@ -185,8 +186,9 @@ def reference(found: dict[str, Any]) -> Rounds:
 def _tables(found: dict[str, Any]) -> Iterator[str]:
     measures = list(dict.fromkeys(name for rounds in found["subjects"].values() for name in rounds))
     base = reference(found)
-    yield "| | " + " | ".join(f"{name} | ratio" if name in base else name for name in measures) + " |"
-    yield "| --- " * (1 + len(measures) + len([name for name in measures if name in base])) + "|"
+    heads = ["", *(f"{name} | ratio" if name in base else name for name in measures), "command"]
+    yield f"| {' | '.join(heads)} |"
+    yield "| --- " * " | ".join(heads).count("|") + "| --- |"
     for subject, rounds in found["subjects"].items():
         cells = []
         for name in measures:
@@ -194,7 +196,8 @@ def _tables(found: dict[str, Any]) -> Iterator[str]:
             cells.append(spread(values) if values else "")
             if name in base:
                 cells.append(spread(ratios(values, base[name])) if values else "")
-        yield f"| {subject} | " + " | ".join(cells) + " |"
+        command = found["commands"][subject]
+        yield f"| {' | '.join([subject, *cells])} | `{' '.join([command['script'] + '.py', *command['arguments']])}` |"
 
 
 def exponents(subjects: dict[str, Rounds]) -> Iterator[str]:
