@@ -242,6 +242,16 @@ def test_figures_say_on_which_machine_they_were_measured(bench: Any) -> None:
     assert measure("second", 0) == back, "and those that stay are numbered anew"
 
 
+def test_versions_are_those_of_the_packages_that_an_environment_has(
+    bench: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = bench("results")
+    pythons = {"own": Path(sys.executable), "missing": tmp_path / "python"}
+    monkeypatch.setattr(results, "python_of", pythons.get)
+    monkeypatch.setattr(results, "PACKAGES", dict.fromkeys(pythons, ("no-such-package", "pytest")))
+    assert results.versions() == {"own": {"pytest": pytest.__version__}}
+
+
 def test_a_target_is_measured_by_the_best_of_the_others(bench: Any) -> None:
     results, target = bench("results"), bench("areas").Target
     figures = _figures(ours={"work/s": [9.0, 8.0]}, one={"work/s": [3.0, 2.0]}, two={"work/s": [1.0, 1.0]})
