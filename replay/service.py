@@ -35,7 +35,6 @@ LEAVING = "the replay service is stopping"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"
 STATUS_EVERY = 0.5  # seconds
 IN_FLIGHT = 256  # segments of all actors together, but at least one of each
-INSERT_QUEUE = 1 << 14  # never full while actors keep to their windows: a full one blocks Zenoh's receiving threads
 
 T = TypeVar("T")
 
@@ -65,7 +64,7 @@ class ReplayService:
     def start(self) -> None:
         """Begin to answer requests."""
         node = self._node
-        node.serve(replay_key(node, "insert"), self._insert, depth=INSERT_QUEUE)
+        node.serve(replay_key(node, "insert"), self._insert)
         node.serve(replay_key(node, "sample"), self._sample)
         node.serve(replay_key(node, "stats"), self._stats)
         node.serve(replay_key(node, "limits"), self._limits)

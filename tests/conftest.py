@@ -94,7 +94,7 @@ def _left(before: tuple[set[int], set[str], set[threading.Thread]]) -> str:
     left += [f"socket {name}" for name in _sockets() - sockets]
     # pytest-timeout's own timer of the running test is still there when the session's fixtures end.
     own = [thread for thread in threading.enumerate() if thread.name.startswith("pytest_timeout")]
-    left += [f"thread {thread.name}" for thread in set(threading.enumerate()) - threads - set(own)]
+    left += [f"thread {thread!r}" for thread in set(threading.enumerate()) - threads - set(own)]
     return ", ".join(left)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from samples import until
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SUBJECT = """
@@ -110,7 +111,7 @@ def test_a_subject_that_hangs_is_ended(comparison: Any, tmp_path: Path, monkeypa
     subjects = {"a": comparison.Subject("own", ("long", str(note)))}
     with pytest.raises(comparison.SubjectError, match=r"^a took more than 2 s; see .*-a-0\.log$"):
         comparison.compare(comparison.Comparison("x", "one", subjects, "a"), 1, tmp_path)
-    assert not _runs(int(note.read_text()))
+    until(lambda: not _runs(int(note.read_text())))
 
 
 @pytest.mark.parametrize("abreast", [False, True])
@@ -131,10 +132,7 @@ def test_an_interrupt_ends_long_turns(comparison: Any, abreast: bool, tmp_path: 
             comparison.compare(whole, 2, tmp_path)
     finally:
         signal.signal(signal.SIGUSR1, before)
-    pid, deadline = int(note.read_text()), time.monotonic() + 10
-    while _runs(pid) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not _runs(pid)
+    until(lambda: not _runs(int(note.read_text())))
 
 
 def _runs(pid: int) -> bool:

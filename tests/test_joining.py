@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
-from samples import make_segment
+from samples import await_service, make_segment
 
 from common.errors import JoinError
 from common.messaging import joining, wire
@@ -148,6 +148,7 @@ def test_the_limiter_changes_while_the_run_goes_on(nodes: tuple[Node, Node], spe
     config = RunConfig(run="test", total_steps=1000)
     core = ReplayCore(config, spec)
     ReplayService(server, core, ReplayEpochs(tmp_path, 5)).start()
+    await_service(client, replay_key(client, "snapshot"))  # the last one that it declares
     key = replay_key(client, "limits")
     for sequence in range(125):
         core.insert(make_segment(spec, sequence))

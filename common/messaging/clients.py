@@ -90,6 +90,7 @@ class InsertClient:
         self._on_wait = on_wait
         self._key = replay_key(node, "insert")
         self._outstanding: deque[_Sent] = deque()
+        self._spare: list[bytearray] = []  # memory of acknowledged segments, for the next ones: sending copies
         self._backoff = Backoff()
 
     def submit(self, segment: Segment) -> bool:
@@ -102,8 +103,9 @@ class InsertClient:
         while len(self._outstanding) >= self._permitted:
             if not self._await_ack(self._outstanding[0]):
                 return False
-            self._outstanding.popleft()
-        payload = encode_segment(self._node.run, msgspec.structs.replace(segment, acked=self.acked))
+            self._end_first()
+        memory = self._spare.pop() if self._spare else None
+        payload = encode_segment(self._node.run, msgspec.structs.replace(segment, acked=self.acked), memory)
         self._outstanding.append(_Sent(payload, segment.steps, self._send(payload)))
         return True
 
@@ -112,7 +114,7 @@ class InsertClient:
         while self._outstanding:
             if not self._await_ack(self._outstanding[0]):
                 return False
-            self._outstanding.popleft()
+            self._end_first()
         return True
 
     def _collect_acks(self) -> None:
@@ -129,7 +131,10 @@ class InsertClient:
             if not accepted:
                 sent.pending = self._send(sent.payload)
                 return
-            self._outstanding.popleft()
+            self._end_first()
+
+    def _end_first(self) -> None:
+        self._spare.append(self._outstanding.popleft().payload)
 
     def _await_ack(self, sent: _Sent) -> bool:
         """Wait for one acknowledgement, sending again as often as necessary; return False if a stop was requested."""

@@ -49,22 +49,21 @@ def permit_many() -> None:
 
 
 class _Follower:
-    """Treats the sockets after each change of a session's links, and at most every `PAUSE` seconds.
+    """Treats the sockets where a session's links have changed, which it looks for every `PAUSE` seconds.
 
-    One thread for all sessions of the process, from the first one's opening to the last one's closing.
+    One thread for all sessions of the process, from the first one's opening to the last one's closing. Zenoh does not
+    call back: the thread that carries the links would wait for Python's lock, and what holds that may wait for a link.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._listeners: dict[str, Any] = {}  # by the session's id
-        self._changed = threading.Event()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
     def add(self, session: zenoh.Session) -> None:
         """Follow a session's links."""
-        changed: Any = zenoh.handlers.Callback(lambda _: self._changed.set(), indirect=False)
-        listener = session.info.declare_link_events_listener(changed, history=True)
+        listener = session.info.declare_link_events_listener(zenoh.handlers.RingChannel(1), history=True)
         with self._lock:
             self._listeners[str(session.zid())] = listener
             if self._thread is None:
@@ -81,16 +80,14 @@ class _Follower:
             if self._listeners or self._thread is None:
                 return
             self._closing.set()
-            self._changed.set()
             self._thread.join(PATIENCE)
             self._thread = None
         _await_callbacks()
 
     def _run(self) -> None:
-        while self._changed.wait() and not self._closing.is_set():
-            self._changed.clear()
-            _linger_off()
-            self._closing.wait(PAUSE)
+        while not self._closing.wait(PAUSE):
+            if sum(map(_has_changed, tuple(self._listeners.values()))):  # of each, so that none is seen as new again
+                _linger_off()
 
 
 _follower = _Follower()
@@ -118,6 +115,13 @@ def _await_callbacks() -> None:
     for thread in threading.enumerate():
         if thread.name.endswith(_CALLBACKS):
             thread.join(max(0.0, deadline - time.monotonic()))
+
+
+def _has_changed(listener: Any) -> bool:  # noqa: ANN401 (zenoh's)
+    """Whether a session's links have changed since the last look."""
+    with contextlib.suppress(zenoh.ZError):  # its session is being closed
+        return listener.try_recv() is not None
+    return False
 
 
 def _linger_off() -> None:

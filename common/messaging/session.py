@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import zenoh
@@ -17,6 +19,11 @@ from common.messaging.transport import NoAnswer
 
 MAX_LINKS = 1 << 16  # of a session; Zenoh's own limit is 1,000
 LONG_QUEUE, SHORT_QUEUE = 16, 4  # parts of messages, of 64 KiB each, that a link keeps memory for once it has sent them
+# Left to itself Zenoh wakes one thread after another for each part of a message: the one that accepts links waits for
+# their sockets, and others receive and send. It reads the variable when a process opens its first session.
+THREADS = "ZENOH_RUNTIME"
+RECEIVING = "(rx:(handover:acc),net:(handover:acc))"  # one thread waits and receives, another sends
+CONNECTING = "(rx:(handover:acc),net:(handover:acc),tx:(handover:acc))"  # one thread does it all
 
 _QUIET = {
     "scouting/multicast/enabled": False,
@@ -67,7 +74,8 @@ def open_session(
     except zenoh.ZError as error:
         raise UsageError(f"zenoh configuration: {first_line(error)}") from error
     try:
-        session = zenoh.open(config)
+        with _threads(mode, listens=bool(listen)):
+            session = zenoh.open(config)
     except zenoh.ZError as error:
         if mode == "client":
             raise NoAnswer(f"no router at {', '.join(connect)}") from error
@@ -76,3 +84,20 @@ def open_session(
         ) from error
     never_linger(session)
     return session
+
+
+@contextmanager
+def _threads(mode: str, *, listens: bool) -> Iterator[None]:
+    """Let fewer of Zenoh's threads carry this process's links, unless the user says how many.
+
+    What others connect to sends in a thread of its own: it answers many, and must not wait for one whose link is full
+    in the thread that would empty it. A router, which sends on what it receives, keeps all threads.
+    """
+    if mode == "router" or THREADS in os.environ:
+        yield
+        return
+    os.environ[THREADS] = RECEIVING if listens else CONNECTING
+    try:
+        yield
+    finally:
+        os.environ.pop(THREADS, None)  # a router that this process starts would inherit it

@@ -28,6 +28,7 @@ from common.messaging.wire import Message
 from common.process.lifecycle import Stop
 
 ASK_TIMEOUT = 5.0  # seconds
+QUEUE = 1 << 14  # queries that wait for an answer: one more blocks Zenoh's thread, which receives everything else
 
 
 class NoAnswer(RunError):
@@ -117,14 +118,14 @@ class Node:
         """Send a query and wait for its answer; raises as `Pending.wait`."""
         return self.begin(key, payload, timeout).wait()
 
-    def serve(self, key: str, answer: Callable[[Message], bytearray], depth: int = 64) -> None:
+    def serve(self, key: str, answer: Callable[[Message], bytearray]) -> None:
         """Answer the queries on `key`, one after another, in a new thread, until the session closes.
 
         A message that cannot be decoded, names another run, or makes `answer` raise BadMessage gets an error reply, is
         counted, and changes nothing. Any other CoopError of `answer` also becomes an error reply, and so does any
         other exception, which is a bug and is noted in `faults`.
         """
-        queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(depth), complete=True)
+        queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(QUEUE), complete=True)
         thread = threading.Thread(target=self._serve, args=(queryable, key, answer), name=f"serve {key}", daemon=True)
         self._threads.append(thread)
         thread.start()

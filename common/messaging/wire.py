@@ -37,6 +37,7 @@ DTYPES = {
 _NAMES = {np.dtype(name): name for name in DTYPES}
 
 _PREFIX = struct.Struct("<II")
+SMALL = 1 << 13  # bytes; arrays of at most so many are joined, and written together
 _TABLES = 256  # kept, of arrays: one for each number of frames that batches and segments have
 _pack = msgspec.msgpack.Encoder().encode
 
@@ -119,35 +120,41 @@ def encode(
     arrays: Mapping[str, Array | Source] | None = None,
     into: bytearray | None = None,
 ) -> bytearray:
-    """Build one message; each array is copied once, into its place.
+    """Build one message; arrays of more than `SMALL` bytes are copied once, into their places.
 
     into: an earlier message whose memory is reused, because it is in the processor's caches.
     """
     arrays = arrays or {}
-    table, packed = _table_of(tuple((name, array.dtype, array.shape) for name, array in arrays.items()))
+    table, stops, packed = _table_of(tuple([(name, array.dtype, array.shape) for name, array in arrays.items()]))
     header = _pack({"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": packed})
     head = _PREFIX.pack(MAGIC, len(header)) + header
     start = _aligned(len(head))
     payload = _sized(into, start + table.size)
-    payload[:start] = head.ljust(start, b"\0")
     whole = memoryview(payload)
-    end = start
-    for place, array in zip(table.places, arrays.values(), strict=True):
-        begin = start + place.offset
-        whole[end:begin] = bytes(begin - end)
-        end = start + place.end
-        if begin == end:
+    begin, small = 0, [head.ljust(start, b"\0")]  # parts that lie side by side
+    for place, stop, array in zip(table.places, stops, arrays.values(), strict=True):
+        if isinstance(array, np.ndarray) and array.nbytes <= SMALL:
+            small.append(array.tobytes().ljust(stop - place.offset, b"\0"))
             continue
+        whole[begin : start + place.offset] = b"".join(small)
+        begin = start + place.end
         if isinstance(array, np.ndarray):
-            whole[begin:end] = np.ascontiguousarray(array, place.dtype).data.cast("B")
-        else:
-            array.copy_to(np.ndarray(place.shape, place.dtype, payload, begin))
+            whole[start + place.offset : begin] = np.ascontiguousarray(array).data.cast("B")
+        elif place.nbytes:
+            array.copy_to(np.ndarray(place.shape, place.dtype, payload, start + place.offset))
+        small = [bytes(stop - place.end)]
+    whole[begin:] = b"".join(small)
     return payload
 
 
 @lru_cache(_TABLES)
-def _table_of(arrays: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]) -> tuple[ArrayTable, msgspec.Raw]:
-    """Lay out arrays (name, dtype, shape) one after another: their table, and how a header says it."""
+def _table_of(
+    arrays: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...],
+) -> tuple[ArrayTable, tuple[int, ...], msgspec.Raw]:
+    """Lay out arrays (name, dtype, shape) one after another.
+
+    Returns (their table, where each one's padding ends, the table as a header has it).
+    """
     places: list[Place] = []
     end = 0
     for name, dtype, shape in arrays:
@@ -155,7 +162,8 @@ def _table_of(arrays: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]) ->
         end = offset + math.prod(shape) * dtype.itemsize
         places.append(Place(name, DTYPES[_NAMES[dtype]], shape, offset, end))
     packed = _pack([(place.name, _NAMES[place.dtype], place.shape, place.offset) for place in places])
-    return ArrayTable(tuple(places), end), msgspec.Raw(packed)
+    stops = (*(place.offset for place in places[1:]), end)[: len(places)]
+    return ArrayTable(tuple(places), end), stops, msgspec.Raw(packed)
 
 
 def _sized(memory: bytearray | None, size: int) -> bytearray:

@@ -19,10 +19,10 @@ OPTIONAL = frozenset({"span"})  # journals and snapshots from before n-step retu
 _FIELDS = tuple(name for name in Segment.__struct_fields__ if name not in _ARRAYS)
 
 
-def encode_segment(run: str, segment: Segment) -> bytearray:
-    """Build an insert request."""
+def encode_segment(run: str, segment: Segment, into: bytearray | None = None) -> bytearray:
+    """Build an insert request; into: see `wire.encode`."""
     fields = {name: getattr(segment, name) for name in _FIELDS}
-    return wire.encode(KIND, run, fields, {name: getattr(segment, name) for name in _ARRAYS})
+    return wire.encode(KIND, run, fields, {name: getattr(segment, name) for name in _ARRAYS}, into)
 
 
 def transitions(spec: EnvSpec, rows: str) -> dict[str, tuple[str, tuple[int | str, ...]]]:
