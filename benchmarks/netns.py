@@ -30,7 +30,7 @@ RUN = "netns"
 PLACES = {"learner": "head", "replay": "rep", "actor 1": "act1", "actor 2": "act2"}
 LEARNER_PORT, REPLAY_PORT = 7447, 7448
 LOAD = 3.0  # seconds of work before and after
-STEPS = 8000  # of a run
+STEPS = 16_000  # of a run, so that it is still on when a cut ends
 RATIO, CLOSING_RATIO = "2", "0.1"  # updates per step: few steps pass during a scenario, and the rest soon after it
 INSIDE = "COOP_NETNS"  # set in the process that runs inside the head's namespace: the network's number
 
