@@ -15,14 +15,17 @@ import os, sys, time
 from pathlib import Path
 from common.messaging.session import open_session
 
-process, there = sys.argv[1:]
+process, there, *wanted = sys.argv[1:]
 before = dict(os.environ)
 listen = () if process == "connect" else ("tcp/127.0.0.1:0",)
 session = open_session(listen, (there,), mode="router" if process == "router" else "peer")
 assert os.environ == before, "a process started from here would inherit it"
-while not session.info.peers_zid():
-    time.sleep(0.01)
-print(*{(thread / "comm").read_text().split("-")[0].strip() for thread in Path("/proc/self/task").iterdir()})
+deadline = time.monotonic() + 30
+threads = set()
+while not threads.issuperset(wanted) and time.monotonic() < deadline:
+    time.sleep(0.5)  # those that nobody wants have this long to come
+    threads = {(thread / "comm").read_text().split("-")[0].strip() for thread in Path("/proc/self/task").iterdir()}
+print(*threads)
 session.close()
 """
 
@@ -42,7 +45,7 @@ def test_a_process_has_the_threads_that_its_links_need(
     env = {**os.environ, THREADS: own_choice} if own_choice else os.environ
     session = open_session((endpoint,))
     try:
-        command = [sys.executable, "-c", OPEN, process, endpoint]
+        command = [sys.executable, "-c", OPEN, process, endpoint, *threads]
         done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)
     finally:
         close(session)
