@@ -58,6 +58,16 @@ def test_messages_of_equal_shapes_share_a_table_and_nothing_else() -> None:
         wire.decode(other[: len(other) - wire.ALIGNMENT])
 
 
+def test_large_arrays_stand_between_small_ones() -> None:
+    large, small = np.arange(wire.SMALL + 1, dtype=np.int32), np.ones(5, np.uint8)
+    arrays = {"a": small, "b": large[::2], "c": np.zeros(0), "d": small, "e": large}
+    payload = wire.encode("k", "r", {}, arrays)
+    message = wire.decode(bytes(payload))
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(message.arrays[name], array)
+    assert wire.encode("k", "r", {}, arrays, into=bytearray(b"\xff" * len(payload))) == payload
+
+
 def test_arrays_need_not_be_contiguous() -> None:
     array = np.arange(24, dtype=np.int32).reshape(4, 6)
     for part in (array.T, array[::2, 1:3], array[0, 0]):
