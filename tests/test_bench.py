@@ -135,6 +135,24 @@ def test_an_interrupt_ends_long_turns(comparison: Any, abreast: bool, tmp_path: 
     until(lambda: not _runs(int(note.read_text())))
 
 
+def test_an_interrupt_leaves_no_limit_behind(comparison: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[threading.Timer] = []
+
+    class Interrupted(threading.Timer):
+        def start(self) -> None:
+            super().start()
+            limits.append(self)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading, "Timer", Interrupted)
+    subjects = {"a": comparison.Subject("own", ("long", str(tmp_path / "child")))}
+    with pytest.raises(KeyboardInterrupt):
+        comparison.compare(comparison.Comparison("x", "one", subjects, "a"), 1, tmp_path)
+    for limit in limits:
+        limit.join(5)
+        assert not limit.is_alive()
+
+
 def _runs(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"

@@ -95,6 +95,9 @@ class Running:
                 process_group=0,
                 env={**os.environ, **ONE_THREAD, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"},
             )
+
+    def ready(self) -> None:
+        """Wait until it can take its first turn."""
         self._answer()
 
     def turn(self, seconds: float, number: int) -> dict[str, float]:
@@ -133,8 +136,8 @@ class Running:
             self._send(signal.SIGKILL)
 
         limit = threading.Timer(LIMIT, end)
-        limit.start()
         try:
+            limit.start()
             for line in self._process.stdout:
                 if line.startswith("{"):  # a library may print something as it is imported
                     answer: dict[str, float] = json.loads(line)
@@ -156,13 +159,13 @@ class Running:
 def started(comparison: Comparison, core: int, logs: Path) -> Iterator[dict[str, Running]]:
     """The subjects of a comparison that use the core, ready for their first turn; core 0 has those of several cores."""
     with ExitStack() as stack:
-        yield {
-            name: stack.enter_context(
-                Running(name, subject, core, logs / f"{comparison.title}-{name}-{core}.log".replace(" ", "_"))
-            )
-            for name, subject in comparison.subjects.items()
-            if subject.cores == 1 or not core
-        }
+        lane = {}
+        for name, subject in comparison.subjects.items():
+            if subject.cores == 1 or not core:
+                log = logs / f"{comparison.title}-{name}-{core}.log".replace(" ", "_")
+                lane[name] = stack.enter_context(Running(name, subject, core, log))
+                lane[name].ready()
+        yield lane
 
 
 def compare(comparison: Comparison, rounds: int, logs: Path) -> dict[str, Rounds]:
