@@ -76,8 +76,10 @@ def _service() -> Iterator[Comparison]:
     subjects = {
         "Reverb": Subject("service_reverb", venv="reverb", cores=0),
         **{
-            f"{name} {way}": Subject(f"service_{name}", (way,), cores=0)
-            for name, way in product(("coop", "bare"), ("tcp", "shm"))
+            f"{name} {way}": Subject(f"service_{script}", (way, *work), cores=0)
+            for (name, script, *work), way in product(
+                (("coop", "coop"), ("bare", "bare", "copies"), ("bare draws", "bare", "draws")), ("tcp", "shm")
+            )
         },
         "coop router": Subject("service_coop", ("router",), cores=0),
     }

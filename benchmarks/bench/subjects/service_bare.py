@@ -1,4 +1,4 @@
-"""Zenoh and numpy alone: gathers a batch's frames from a ring, copies segments into it: service_bare.py tcp|shm."""
+"""Zenoh and numpy alone: copies segments into a ring, and batches out of it: service_bare.py tcp|shm copies|draws."""
 
 from __future__ import annotations
 
@@ -12,35 +12,27 @@ from typing import Any
 import numpy as np
 import zenoh
 from made_up import ATARI, segments
+from service_batches import FRAME_BYTES, REQUEST, WORK, Read
 from service_coop import PREFETCH, RUN, WINDOW
-from service_work import BATCH, CAPACITY, STEPS, Inserters, attend_service, insert_on_demand
+from service_work import CAPACITY, STEPS, Inserters, attend_service, insert_on_demand
 
 from common.messaging.messages.insert import encode_segment
 from common.messaging.session import open_session
 from common.process.memory import keep_freed_memory
 from common.process.processes import free_endpoint
 
-FRAMES = BATCH * (ATARI.stack + 1)  # of a batch without repeats
-FRAME_BYTES = 84 * 84
 
-
-def server(endpoint: str, shared_memory: bool, end: Connection) -> None:
+def server(endpoint: str, shared_memory: bool, work: str, end: Connection) -> None:
     """Two queryables, each in a thread of Zenoh's."""
     ring = np.ones((CAPACITY, FRAME_BYTES), np.uint8)
     keep_freed_memory()
-    rng = np.random.default_rng(0)
-    picks = rng.integers(0, CAPACITY - ATARI.stack, (1000, BATCH, 1)) + np.arange(ATARI.stack + 1)
-    payload = bytearray(FRAMES * FRAME_BYTES)
-    out = np.frombuffer(payload, np.uint8).reshape(FRAMES, FRAME_BYTES)
-    drawn = inserted = 0
+    answer = WORK[work][0](ring)
+    inserted = 0
 
     def sample(query: zenoh.Query) -> None:
-        nonlocal drawn
         with query:
-            # mode: without it numpy first gathers into a buffer
-            np.take(ring, picks[drawn % 1000].reshape(-1), axis=0, out=out, mode="clip")
-            drawn += 1
-            query.reply("bare/sample", payload)
+            assert query.payload is not None
+            query.reply("bare/sample", answer(query.payload.to_bytes()))
 
     def insert(query: zenoh.Query) -> None:
         nonlocal inserted
@@ -79,36 +71,37 @@ def inserter(endpoint: str, shared_memory: bool, end: Connection) -> None:
 class Sampler:
     """Keeps `PREFETCH` draws in flight."""
 
-    def __init__(self, session: zenoh.Session) -> None:
+    def __init__(self, session: zenoh.Session, read: Read) -> None:
         self._session = session
+        self._read = read
         self._waiting = deque(self._ask() for _ in range(PREFETCH))
 
     def next(self) -> object:
-        """The frames of one batch, uint8 [FRAMES, FRAME_BYTES]."""
+        """What is read of one batch."""
         reply = self._waiting.popleft().recv()
         self._waiting.append(self._ask())
         assert reply.ok is not None
-        return np.frombuffer(reply.ok.payload.to_bytes(), np.uint8).reshape(FRAMES, FRAME_BYTES)
+        return self._read(reply.ok.payload.to_bytes())
 
     def _ask(self) -> Any:  # noqa: ANN401 (zenoh's handler)
-        return self._session.get("bare/sample", handler=zenoh.handlers.FifoChannel(2), payload=b"x" * 200)
+        return self._session.get("bare/sample", handler=zenoh.handlers.FifoChannel(2), payload=REQUEST)
 
 
-def main(shared_memory: bool) -> None:
+def main(shared_memory: bool, work: str) -> None:
     keep_freed_memory()
     endpoint = free_endpoint()
     with ExitStack() as stack:
         spawn = multiprocessing.get_context("spawn")
         ours, theirs = spawn.Pipe()
-        process = spawn.Process(target=server, args=(endpoint, shared_memory, theirs))
+        process = spawn.Process(target=server, args=(endpoint, shared_memory, work, theirs))
         process.start()
         stack.callback(process.join)
         stack.callback(ours.send, None)
         assert ours.recv() == "ready"
         inserters = Inserters(stack, inserter, endpoint, shared_memory)
         session = stack.enter_context(open_session((), (endpoint,), shared_memory=shared_memory))
-        attend_service(inserters, Sampler(session).next)
+        attend_service(inserters, Sampler(session, WORK[work][1]).next)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] == "shm")
+    main(sys.argv[1] == "shm", sys.argv[2])
