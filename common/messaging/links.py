@@ -52,7 +52,7 @@ class _Follower:
     """Treats the sockets where a session's links have changed, which it looks for every `PAUSE` seconds.
 
     One thread for all sessions of the process, from the first one's opening to the last one's closing. Zenoh does not
-    call back: the thread that carries the links would wait for Python's lock, and what holds that may wait for a link.
+    call back, because the thread that carries the links would then wait for Python's lock.
     """
 
     def __init__(self) -> None:
