@@ -69,15 +69,16 @@ class WeightsFollower:
                 self._ask_at = math.inf
                 self.fetch()
 
-    def fetch(self) -> None:
-        """Ask the learner for both networks and the role; if it does not answer, nothing changes."""
+    def fetch(self) -> bool:
+        """Ask the learner for both networks and the role; False if it does not answer."""
         question = Current().encode(self._node.run)
         try:
             for key in self._keys:
                 self._load(self._node.ask(key, question, timeout=ANSWER_TIMEOUT))
             self._follow(self._node.ask(role_key(self._node), question, timeout=ANSWER_TIMEOUT))
         except NoAnswer:
-            return
+            return False
+        return True
 
     def _load(self, message: Message) -> None:
         try:

@@ -27,7 +27,7 @@ from experiments.episodes import AT_ONCE, Evaluator
 LOOK_EVERY = 0.05  # seconds between looks at what the learner has broadcast
 ANSWER_TIMEOUT = 2.0  # seconds to wait for each receipt
 PAUSE = 0.1  # seconds before a result is sent again
-LAST_RECEIPT = 5.0  # seconds to wait for a receipt at the run's end
+LAST_RECEIPT = 5.0  # seconds to wait for the final networks, and for a receipt, at the run's end
 
 
 Progress = tuple[int, int]
@@ -144,7 +144,9 @@ class EvaluatorService:
         if self._stop.reason.startswith("complete"):
             self._last = True
             self._evaluations.rush()
-            self._weights.fetch()
+            ends = time.monotonic() + LAST_RECEIPT
+            while not self._weights.fetch() and time.monotonic() < ends:
+                time.sleep(PAUSE)
             if self._weights.ready:
                 self._turn()
 
