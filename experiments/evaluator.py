@@ -26,7 +26,7 @@ from experiments.episodes import AT_ONCE, Evaluator
 
 LOOK_EVERY = 0.05  # seconds between looks at what the learner has broadcast
 ANSWER_TIMEOUT = 2.0  # seconds to wait for each receipt
-PAUSE = 0.1  # seconds before a result is sent again
+PAUSE = 0.1  # seconds before a result is sent, or networks are asked for, again
 LAST_RECEIPT = 5.0  # seconds to wait for the final networks, and for a receipt, at the run's end
 
 

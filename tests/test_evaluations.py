@@ -326,6 +326,19 @@ def test_an_evaluator_of_an_interrupted_run_stops_at_once(nodes: tuple[Node, Nod
     assert list(inbox.take()) == []
 
 
+def test_an_evaluator_asks_for_the_final_networks_until_it_has_them(nodes: tuple[Node, Node]) -> None:
+    stop = Stop()
+    agent, evaluations = service(nodes, stop, Plan(steps=100, episodes=2))
+    inbox = EvaluationInbox(nodes[0], lambda: 1000)
+    stop.set("complete: total_updates reached")
+    with ThreadPoolExecutor() as threads:
+        playing = threads.submit(evaluations.run)
+        time.sleep(0.5)
+        Broadcaster(nodes[0], agent, 390)
+        playing.result(20)
+    assert [one.env_step for one in inbox.take() if isinstance(one, EvaluationRow)] == [390]
+
+
 def test_an_evaluator_needs_to_know_how_often(nodes: tuple[Node, Node]) -> None:
     with pytest.raises(UsageError, match="--every: needed, as the run has no eval_every"):
         service(nodes, Stop(), Plan())

@@ -73,14 +73,11 @@ def _tables() -> Iterator[Comparison]:
 
 
 def _service() -> Iterator[Comparison]:
+    ways, bare = ("tcp", "shm"), {"bare": "copies", "bare draws": "draws"}
     subjects = {
         "Reverb": Subject("service_reverb", venv="reverb", cores=0),
-        **{
-            f"{name} {way}": Subject(f"service_{script}", (way, *work), cores=0)
-            for (name, script, *work), way in product(
-                (("coop", "coop"), ("bare", "bare", "copies"), ("bare draws", "bare", "draws")), ("tcp", "shm")
-            )
-        },
+        **{f"coop {way}": Subject("service_coop", (way,), cores=0) for way in ways},
+        **{f"{name} {way}": Subject("service_bare", (way, bare[name]), cores=0) for name, way in product(bare, ways)},
         "coop router": Subject("service_coop", ("router",), cores=0),
     }
     yield Comparison("service", "replay service", subjects, "Reverb", seconds=3.0)
