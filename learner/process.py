@@ -79,7 +79,15 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
             console.event("begins anew: no epoch is held by both")
         settings, episodes_received = config.learner, 0 if state is None else state["told"]
         samples = SampleClient(
-            node, stop, incarnation, spec, settings.batch_size, settings.prefetch, agent.updates, episodes_received
+            node,
+            stop,
+            incarnation,
+            spec,
+            settings.batch_size,
+            settings.prefetch,
+            agent.updates,
+            episodes_received,
+            shared_memory=options.shared_memory,
         )
         checkpoints = Checkpoints(node, path, samples, epochs, console.event)
         sizes = None if state is None else state["sizes"]

@@ -89,7 +89,7 @@ def _serve(
     console: Console,
 ) -> None:
     """Serve a run that this process has joined until the stop, and then until the learner has saved an epoch."""
-    service = _service(node, joined, folder, console)
+    service = _service(node, joined, folder, console, shared_memory=options.shared_memory)
 
     def learned(_: Joined, asked: float) -> None:
         service.confirm(asked + LEASE)
@@ -105,7 +105,9 @@ def _serve(
     console.event(f"{stop.reason}; {service.progress()}")
 
 
-def _service(node: Node, joined: Joined, folder: ReplayFolder, console: Console) -> ReplayService:
+def _service(
+    node: Node, joined: Joined, folder: ReplayFolder, console: Console, *, shared_memory: bool
+) -> ReplayService:
     """Build a service from the folder's state: the learner's epoch, and the journal after it if there is one.
 
     Raises:
@@ -114,7 +116,7 @@ def _service(node: Node, joined: Joined, folder: ReplayFolder, console: Console)
     """
     if joined.run_id != folder.run_id:
         raise RunError(f"another learner of run {node.run!r} has begun while this one joined")
-    core = ReplayCore(joined.config, joined.spec)
+    core = ReplayCore(joined.config, joined.spec, shared_memory=shared_memory)
     epochs = ReplayEpochs(folder.path, folder.run_id)
     if joined.anew:
         epochs.clear()

@@ -65,9 +65,11 @@ class ReplayCore:
     problem: why no segment can be inserted although the limiter admits it, in words; empty if there is no problem.
     """
 
-    def __init__(self, config: RunConfig, spec: EnvSpec, recorder: Recorder | None = None) -> None:
+    def __init__(
+        self, config: RunConfig, spec: EnvSpec, recorder: Recorder | None = None, *, shared_memory: bool = False
+    ) -> None:
         settings = config.replay
-        self.table = make_table(config, spec)
+        self.table = make_table(config, spec, shared_memory=shared_memory)
         self.limiter = RateLimiter(
             settings.ratio, settings.learning_starts, settings.tolerance, config.total_steps, settings.capacity
         )
@@ -261,7 +263,7 @@ class ReplayCore:
                 reply.batch.frames.release()
 
 
-def make_table(config: RunConfig, spec: EnvSpec) -> Table:
+def make_table(config: RunConfig, spec: EnvSpec, *, shared_memory: bool = False) -> Table:
     """Make the empty table of a run; raises UsageError if it does not fit into this machine's memory."""
     check_memory(config, spec)
     settings = config.replay
@@ -274,4 +276,5 @@ def make_table(config: RunConfig, spec: EnvSpec) -> Table:
         priority_exponent=settings.priority_exponent,
         importance_exponent=settings.importance_exponent,
         replacement=settings.replacement,
+        shared_memory=shared_memory,
     )

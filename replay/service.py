@@ -20,7 +20,7 @@ from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import SegmentReader
 from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
-from common.messaging.messages.sample import DrawRequest, encode_batch
+from common.messaging.messages.sample import DrawRequest, Memory, encode_batch, encode_slots
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.status import Ratio, ReplayStatus
 from common.messaging.transport import Node
@@ -152,17 +152,22 @@ class ReplayService:
         request = DrawRequest.decode(message)
         if request.batch_size != self._core.batch_size:
             raise BadMessage("fields.batch_size", f"{request.batch_size}; this run draws {self._core.batch_size}")
+        shared = self._core.table.shared_memory
+        if shared and request.memory not in (None, shared):
+            return Memory(shared).encode(self._node.run)
         outcome = self._admit(self._draws, lambda: self._draw(request))
         if isinstance(outcome, Wait):
             return Retry(outcome.reason).encode(self._node.run)
         return outcome
 
     def _draw(self, request: DrawRequest) -> bytearray | Wait:
-        """Draw a batch as a message, whose frames are copied straight from the table."""
+        """Draw a batch as a message; frames that the learner cannot read are copied straight into it."""
         reply = self._core.draw(request)
         if isinstance(reply, Wait):
             return reply
         batch, drawn = reply
+        if request.memory and self._core.table.shared_memory:
+            return encode_slots(self._node.run, batch.frames.slots, batch.columns, drawn)
         return encode_batch(self._node.run, batch.frames, batch.columns, drawn, into=self._batch)
 
     def _admit(self, gate: Gate, attempt: Callable[[], T | Wait]) -> T | Wait:

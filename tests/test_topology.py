@@ -11,7 +11,7 @@ import sysconfig
 import time
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -133,6 +133,29 @@ def test_coop_local_end_to_end(tmp_path: Path) -> None:
     assert again.returncode == 2
     assert again.stderr.count("\n") == 1
     assert "holds a run already" in again.stderr
+
+
+def test_a_learner_reads_frames_in_the_memory_of_the_replay_service(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    flags = ("--preset", "catch", "--actors", "1", "--total-steps", "3000", "--run-dir", str(path), "--shared-memory")
+
+    def shared(pid: int) -> set[str]:
+        """The memories that a process has mapped."""
+        with suppress(OSError):
+            return set(re.findall(r"/memfd:(coop-\w+)", Path(f"/proc/{pid}/maps").read_text()))
+        return set()
+
+    with running("coop-local", *flags, "--replay.journal", "--replay.journal-keep") as local:
+
+        def same() -> bool:
+            roles = children(local.pid)
+            learner, replay = (shared(roles.get(f"coop-{role}", 0)) for role in ("learner", "replay"))
+            return bool(learner) and learner == replay
+
+        wait_for("the learner reads the table", same)
+        _, err = local.communicate(timeout=120)
+        assert (local.returncode, err) == (0, "")
+    assert reexecute(path).missing_segments == 0, "what it read is what the journal has, bit for bit"
 
 
 def test_actors_that_all_run_elsewhere(tmp_path: Path, endpoint: str) -> None:

@@ -19,7 +19,8 @@ from common.errors import BadMessage
 from common.messaging.keys import KeySpace, replay_key
 from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.insert import encode_segment
-from common.messaging.messages.sample import BatchReader, Drawn, DrawRequest
+from common.messaging.messages.sample import BatchReader, Drawn, DrawRequest, Memory
+from common.messaging.shared_frames import SharedFrames
 from common.messaging.transport import NoAnswer, Node, Pending
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
@@ -185,6 +186,7 @@ class SampleClient:
     Args:
         first: number of the first batch, the learner's count of updates at the start.
         episodes: number of episodes that the learner has received before.
+        shared_memory: read the frames in the replay service's memory if it is on this machine and shares them.
 
     Attributes:
         episodes: number of episodes received so far.
@@ -201,6 +203,8 @@ class SampleClient:
         prefetch: int,
         first: int = 0,
         episodes: int = 0,
+        *,
+        shared_memory: bool = False,
     ) -> None:
         self.episodes = episodes
         self.waiting = ""
@@ -209,7 +213,10 @@ class SampleClient:
         self._incarnation = incarnation
         self._batch_size = batch_size
         self._prefetch = prefetch
+        self._spec = spec
         self._read = BatchReader(spec)
+        self._shares = shared_memory
+        self._shared: SharedFrames | None = None
         self._key = replay_key(node, "sample")
         self._outstanding: deque[tuple[int, Pending]] = deque()
         self._next = first
@@ -249,6 +256,10 @@ class SampleClient:
         sequence, pending = self._outstanding[0]
         try:
             message = pending.wait()
+            if message.kind == Memory.kind:
+                self._share(Memory.decode(message).address)
+                self._outstanding[0] = (sequence, self._request(sequence))
+                return None
             if message.kind != Retry.kind:
                 accepted = self._accept(message, sequence)
                 self._outstanding.popleft()
@@ -268,11 +279,22 @@ class SampleClient:
 
     def _request(self, sequence: int) -> Pending:
         priorities = self._carried[sequence]
-        request = DrawRequest(self._incarnation, sequence, self._base, self._batch_size, self.episodes, priorities)
+        memory = self._shared.address if self._shared else "" if self._shares else None
+        request = DrawRequest(
+            self._incarnation, sequence, self._base, self._batch_size, self.episodes, priorities, memory
+        )
         return self._node.begin(self._key, request.encode(self._node.run))
 
+    def _share(self, address: str) -> None:
+        """Read frames there from now on, or nowhere if this process does not reach them."""
+        if self._shared is None or self._shared.address != address:
+            try:
+                self._shared = SharedFrames(address, self._spec)
+            except OSError:
+                self._shared, self._shares = None, False
+
     def _accept(self, message: Message, sequence: int) -> tuple[Batch, Drawn]:
-        batch, drawn = self._read(message)
+        batch, drawn = self._read(message, self._shared)
         if drawn.sequence != sequence:
             raise BadMessage("fields.sequence", f"{drawn.sequence} instead of {sequence}")
         self._backoff.reset()

@@ -58,7 +58,7 @@ class RoleOptions:
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
-    """Use shared memory for messages between processes on one machine."""
+    """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class RunOptions(RunConfig):
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
-    """Use shared memory for messages between processes on one machine."""
+    """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
     wandb: bool = False
     """Mirror TensorBoard's scalars to Weights & Biases, whose own variables (WANDB_MODE, WANDB_PROJECT) apply."""
 

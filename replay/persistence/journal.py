@@ -77,7 +77,7 @@ class Journal:
 
     def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
         """Record a draw. If there is no space, it is kept and written before the next record."""
-        self._late.append((DRAW, msgpack.packb([*msgspec.structs.astuple(request), ids.tobytes()])))
+        self._late.append((DRAW, msgpack.packb([*msgspec.structs.astuple(request)[:-1], ids.tobytes()])))
         with contextlib.suppress(OSError):
             self._append_late()
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from common.process.shared_memory import SUPPORTED, SharedMemory
 from common.types import Array
 
 Slots = NDArray[np.intp]
@@ -21,12 +22,18 @@ GROWTH = 1.5
 class FrameStore:
     """Slots of one frame each; a slot becomes free when its last reference is dropped.
 
-    Freed slots are used first, then unused ones in ascending order, in one private mapping that is enlarged in
-    place: memory is committed page by page as frames are written, so it follows the largest number of frames held at
-    once. Not thread-safe: one owner makes all calls, including those of `PinnedFrames`.
+    Freed slots are used first, then unused ones in ascending order, in one mapping that is enlarged in place: memory
+    is committed page by page as frames are written, so it follows the largest number of frames held at once. Not
+    thread-safe: one owner makes all calls, including those of `PinnedFrames`.
+
+    Args:
+        shared_memory: map memory that other processes of this machine can read, if the system has it.
+
+    Attributes:
+        shared_memory: its address, see `SharedMemory`; empty if it is private.
     """
 
-    def __init__(self, frame_shape: tuple[int, ...], frame_dtype: str) -> None:
+    def __init__(self, frame_shape: tuple[int, ...], frame_dtype: str, *, shared_memory: bool = False) -> None:
         self.frame_shape = frame_shape
         self.dtype = np.dtype(frame_dtype)
         self.frame_bytes = math.prod(frame_shape) * self.dtype.itemsize
@@ -36,7 +43,13 @@ class FrameStore:
         self._references = np.zeros(FIRST_SLOTS, np.int32)
         self._free = np.zeros(FIRST_SLOTS, np.int32)  # a stack of free slots below `_used`
         self._mark = np.zeros(FIRST_SLOTS, np.int32)  # scratch of `unique`
-        self._memory = mmap.mmap(-1, FIRST_SLOTS * self.frame_bytes, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        size = FIRST_SLOTS * self.frame_bytes
+        self.shared_memory = ""
+        if shared_memory and SUPPORTED:
+            self._shared = SharedMemory(size)  # which closes its file when it is collected
+            self._memory, self.shared_memory = self._shared.mapped, self._shared.address
+        else:
+            self._memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         self._rows = self._view(FIRST_SLOTS)
 
     @property
@@ -141,6 +154,11 @@ class PinnedFrames:
 
     def __len__(self) -> int:
         return len(self._slots)
+
+    @property
+    def slots(self) -> Slots:
+        """Where the frames lie: intp [n]."""
+        return self._slots
 
     @property
     def dtype(self) -> np.dtype[Any]:

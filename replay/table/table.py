@@ -54,6 +54,7 @@ class Table:
         priority_exponent: float = PRIORITY_EXPONENT,
         importance_exponent: float = IMPORTANCE_EXPONENT,
         replacement: bool = True,
+        shared_memory: bool = False,
     ) -> None:
         """Raise UsageError for a capacity below 1, exponents below 0 or an unknown policy."""
         if capacity < 1:
@@ -74,7 +75,7 @@ class Table:
             "importance_exponent": importance_exponent,
         }
         self._rng = rng
-        self._frames = FrameStore(spec.frame_shape, spec.frame_dtype)
+        self._frames = FrameStore(spec.frame_shape, spec.frame_dtype, shared_memory=shared_memory)
         evicts, draws = EVICTIONS.get(eviction), SAMPLERS.get(sampling)
         self._prioritized = evicts.priorities or draws.priorities
         self._columns = seen = Columns(capacity, spec.stack, prioritized=self._prioritized)
@@ -89,6 +90,11 @@ class Table:
 
     def __len__(self) -> int:
         return min(self.inserted, self.capacity)
+
+    @property
+    def shared_memory(self) -> str:
+        """Where other processes of this machine read the frames, see `FrameStore`."""
+        return self._frames.shared_memory
 
     @property
     def terminal(self) -> int:

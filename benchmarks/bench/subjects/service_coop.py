@@ -75,7 +75,7 @@ def main(way: str) -> None:
         if way == "router":
             serve("router", "--connect", head, "--listen", gate)
         inserters = Inserters(stack, inserter, (gate,) if way == "router" else (head, replay), way)
-        sampler = SampleClient(node, Stop(), incarnation, ATARI, BATCH, PREFETCH)
+        sampler = SampleClient(node, Stop(), incarnation, ATARI, BATCH, PREFETCH, shared_memory=way == "shm")
         inserters.insert(1.0)
         attend_service(inserters, sampler.next)
 

@@ -13,7 +13,9 @@ from common.errors import BadMessage
 from common.messaging import wire
 from common.messaging.messages.body import Body, Layout, check_kind, to_struct
 from common.messaging.messages.insert import OPTIONAL, check_range, check_transitions, transitions
+from common.messaging.shared_frames import SharedFrames
 from common.messaging.wire import Message, Source
+from common.process.shared_memory import ADDRESS
 from common.types import Array, Batch, EnvSpec, EpisodeEnd
 
 MAX_EPISODES = 1000  # in one answer; the next answer carries the rest
@@ -58,6 +60,8 @@ class DrawRequest(Body, frozen=True):
         has drawn fewer, or that served another incarnation, sets its own count of draws to it.
     episodes_from: number of the first episode that the learner has not received.
     priorities: new priorities (id of a transition, |TD error|), set before the draw.
+    memory: the memory of the table's frames if the learner reads them there; "" if it could, but doesn't know where.
+        Otherwise the answer carries the frames.
     """
 
     kind: ClassVar[str] = "sample"
@@ -68,6 +72,7 @@ class DrawRequest(Body, frozen=True):
     batch_size: Annotated[int, Meta(ge=1, le=MAX_BATCH)]
     episodes_from: Count
     priorities: Annotated[tuple[tuple[Counter, Priority], ...], Meta(max_length=MAX_PRIORITIES)] = ()
+    memory: Annotated[str, Meta(pattern=f"{ADDRESS}|^$")] | None = None
 
     @classmethod
     def decode(cls, message: Message) -> Self:
@@ -79,11 +84,24 @@ class DrawRequest(Body, frozen=True):
         return request
 
 
+class Memory(Body, frozen=True):
+    """Says where the frames of the table lie, so that the learner asks again and reads them there, or cannot."""
+
+    kind: ClassVar[str] = "memory"
+
+    address: Annotated[str, Meta(pattern=ADDRESS)]
+
+
 def encode_batch(
     run: str, frames: Array | Source, columns: Mapping[str, Array], drawn: Drawn, into: bytearray | None = None
 ) -> bytearray:
     """Build the answer to a draw from a batch's frames and its other columns; into: see `wire.encode`."""
     return wire.encode(KIND, run, drawn, {"frames": frames, **columns}, into)
+
+
+def encode_slots(run: str, slots: Array, columns: Mapping[str, Array], drawn: Drawn) -> bytearray:
+    """Build the answer to a draw whose frames, in these slots, int64 [unique], the learner reads in the table."""
+    return wire.encode(KIND, run, drawn, {"slots": slots, **columns})
 
 
 class BatchReader:
@@ -98,14 +116,20 @@ class BatchReader:
             "age": ("int64", ("batch",)),
             "reuse": ("int32", ("batch",)),
         }
-        self._layout = Layout(arrays, OPTIONAL)
+        self._layout = Layout(dict(arrays), OPTIONAL)
+        del arrays["frames"]
+        self._layout_of_slots = Layout({**arrays, "slots": ("int64", ("frames",))}, OPTIONAL)
 
-    def __call__(self, message: Message) -> tuple[Batch, Drawn]:
-        """Read one; raises BadMessage."""
+    def __call__(self, message: Message, shared: SharedFrames | None = None) -> tuple[Batch, Drawn]:
+        """Read one; shared: where its frames may lie. Raises BadMessage."""
         check_kind(message, KIND)
-        arrays = message.arrays
-        if not self._layout.lengths(message.table)["batch"]:
+        arrays = dict(message.arrays)
+        slots = None if shared is None else arrays.pop("slots", None)
+        layout = self._layout if slots is None else self._layout_of_slots
+        if not layout.lengths(message.table)["batch"]:
             raise BadMessage("arrays.actions", "an empty batch")
+        if shared is not None and slots is not None:
+            arrays["frames"] = shared.read(slots)
         check_transitions(self._spec, arrays)
         check_range("arrays.weights", arrays["weights"], 0.0, MAX_FLOAT32)
         return Batch(**arrays), to_struct(message, Drawn)
