@@ -55,9 +55,9 @@ def _serve(node: Node, core: ReplayCore, folder: Path, asker: Node) -> None:
     await_service(asker, replay_key(asker, "snapshot"))
 
 
-def _sampler(node: Node) -> SampleClient:
-    """Draws one batch after another, so that a twin of the table can draw the same ones."""
-    return SampleClient(node, Stop(), 1, SPEC, 4, prefetch=1, shared_memory=True)
+def _sampler(node: Node, prefetch: int = 1) -> SampleClient:
+    """With a prefetch of one it draws one batch after another, and so does a twin of a table that changes meanwhile."""
+    return SampleClient(node, Stop(), 1, SPEC, 4, prefetch, shared_memory=True)
 
 
 def _next(sampler: SampleClient) -> Batch:
@@ -178,6 +178,17 @@ def test_a_learner_follows_the_next_service(nodes: tuple[Node, Node], endpoint: 
             assert core.drawn == number + 1
         addresses.add(core.table.shared_memory)
     assert len(addresses) == 3
+
+
+def test_batches_that_are_asked_for_ahead_are_drawn_in_their_order(nodes: tuple[Node, Node], tmp_path: Path) -> None:
+    server, asker = nodes
+    core, twin = ReplayCore(CONFIG, SPEC, shared_memory=True), ReplayCore(CONFIG, SPEC)
+    for each in (core, twin):
+        _insert(each, *range(20))
+    _serve(server, core, tmp_path, asker)
+    sampler = _sampler(asker, prefetch=4)
+    for _ in range(12):
+        _assert_equal(_next(sampler), _draw_here(twin))
 
 
 def test_slots_that_do_not_exist_are_refused() -> None:

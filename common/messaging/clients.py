@@ -258,7 +258,8 @@ class SampleClient:
             message = pending.wait()
             if message.kind == Memory.kind:
                 self._share(Memory.decode(message).address)
-                self._outstanding[0] = (sequence, self._request(sequence))
+                # All of them, in their order: the later ones have met the same answer, or will.
+                self._outstanding = deque((number, self._request(number)) for number, _ in self._outstanding)
                 return None
             if message.kind != Retry.kind:
                 accepted = self._accept(message, sequence)
