@@ -130,6 +130,15 @@ def test_a_service_with_private_memory_sends_frames(nodes: tuple[Node, Node], tm
         assert "frames" in _draw(asker, sequence, memory).arrays
 
 
+def test_a_system_without_such_memory_sends_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "memfd_create")
+    core, twin = ReplayCore(CONFIG, SPEC, shared_memory=True), ReplayCore(CONFIG, SPEC)
+    assert core.table.shared_memory == ""
+    for each in (core, twin):
+        _insert(each, *range(20))
+    _assert_equal(_draw_here(core), _draw_here(twin))
+
+
 def test_a_drawn_batch_stays_until_the_learner_has_it(nodes: tuple[Node, Node], tmp_path: Path) -> None:
     server, asker = nodes
     core = ReplayCore(CONFIG, SPEC, shared_memory=True)

@@ -6,15 +6,14 @@ It is an anonymous file. Its address names the process and the descriptor that h
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import mmap
 import os
 import secrets
-import sys
 import weakref
 from pathlib import Path
 
-SUPPORTED = sys.platform == "linux"
 ADDRESS = r"^[0-9]{1,10}/[0-9]{1,10}/coop-[0-9a-f]{32}$"
 
 
@@ -23,6 +22,8 @@ class SharedMemory:
 
     def __init__(self, size: int) -> None:
         """Raise OSError if there is not so much memory, or if the system has no such files."""
+        if not hasattr(os, "memfd_create"):
+            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
         name = f"coop-{secrets.token_hex(16)}"
         file = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         weakref.finalize(self, os.close, file)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import mmap
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common.process.shared_memory import SUPPORTED, SharedMemory
+from common.process.shared_memory import SharedMemory
 from common.types import Array
 
 Slots = NDArray[np.intp]
@@ -45,11 +46,11 @@ class FrameStore:
         self._mark = np.zeros(FIRST_SLOTS, np.int32)  # scratch of `unique`
         size = FIRST_SLOTS * self.frame_bytes
         self.shared_memory = ""
-        if shared_memory and SUPPORTED:
-            self._shared = SharedMemory(size)  # which closes its file when it is collected
-            self._memory, self.shared_memory = self._shared.mapped, self._shared.address
-        else:
-            self._memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        self._memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        if shared_memory:
+            with suppress(OSError):
+                self._shared = SharedMemory(size)  # which closes its file when it is collected
+                self._memory, self.shared_memory = self._shared.mapped, self._shared.address
         self._rows = self._view(FIRST_SLOTS)
 
     @property
