@@ -10,7 +10,7 @@ from actors.policy import Policy
 from actors.segments import SegmentAssembler
 from actors.weights import WeightsFollower
 from common.envs.protocol import VectorEnv
-from common.messaging.clients import InsertClient, QuerySender
+from common.messaging.insert_client import InsertClient, QuerySender
 from common.messaging.messages.status import ActorStatus
 from common.messaging.transport import Node
 from common.process.console import Console

@@ -19,7 +19,7 @@ from pathlib import Path
 import msgspec
 from made_up import ATARI, segments
 
-from common.messaging.clients import InsertClient
+from common.messaging.insert_client import InsertClient
 from common.messaging.keys import replay_key
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.session import open_session

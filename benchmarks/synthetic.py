@@ -21,7 +21,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 from actors.weights import GRACE
 from common.errors import RunError
 from common.messaging import wire
-from common.messaging.clients import INSERT_TIMEOUT
+from common.messaging.insert_client import INSERT_TIMEOUT
 from common.messaging.joining import RETRY_PAUSE
 from common.messaging.keys import join_key, replay_key, role_key, run_key, status_key, weights_key
 from common.messaging.members import ROUTE

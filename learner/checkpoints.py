@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import CoopError, RunError
-from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key
 from common.messaging.messages.answers import Retry
 from common.messaging.messages.epoch import Snapshot, Written
+from common.messaging.sample_client import SampleClient
 from common.messaging.transport import NoAnswer, Node
 from common.messaging.wire import Message
 from learner.records.epochs import complete_epochs, save_epoch

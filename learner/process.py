@@ -7,8 +7,8 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from common.errors import RunError, UsageError
-from common.messaging.clients import SampleClient
 from common.messaging.links import locators
+from common.messaging.sample_client import SampleClient
 from common.messaging.session import SHORT_QUEUE, open_session
 from common.messaging.transport import Node, new_incarnation
 from common.process.console import Console, say

@@ -8,12 +8,12 @@ from typing import Any
 import msgspec
 
 from common.errors import RunError
-from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key, stop_key
 from common.messaging.messages.evaluate import EvaluationRow
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.status import LearnerStatus
 from common.messaging.messages.stop import EndOfRun
+from common.messaging.sample_client import SampleClient
 from common.messaging.transport import NoAnswer, Node
 from common.process.console import Console, progress_line
 from common.process.lifecycle import Stop

@@ -8,7 +8,6 @@ from typing import Any
 import msgspec
 
 from common.errors import BadMessage
-from common.messaging.clients import SampleClient
 from common.messaging.keys import status_key
 from common.messaging.members import Origin
 from common.messaging.messages.status import (
@@ -21,6 +20,7 @@ from common.messaging.messages.status import (
     ReplayStatus,
     Wait,
 )
+from common.messaging.sample_client import SampleClient
 from common.messaging.transport import Node
 from common.process.console import Console
 from common.process.rates import Rate

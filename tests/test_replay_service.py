@@ -12,7 +12,7 @@ from samples import await_service, make_segment, until
 
 from common.bounds import MAX_COUNT
 from common.errors import RunError
-from common.messaging.clients import InsertClient, SampleClient
+from common.messaging.insert_client import InsertClient
 from common.messaging.keys import replay_key
 from common.messaging.links import locators
 from common.messaging.members import ROUTE
@@ -21,6 +21,7 @@ from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
+from common.messaging.sample_client import SampleClient
 from common.messaging.session import open_session
 from common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation
 from common.process.lifecycle import Stop

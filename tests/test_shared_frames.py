@@ -14,10 +14,10 @@ import pytest
 from samples import await_service, make_segment
 
 from common.errors import BadMessage
-from common.messaging.clients import SampleClient
 from common.messaging.keys import replay_key
 from common.messaging.messages.insert import encode_segment
 from common.messaging.messages.sample import BatchReader, DrawRequest, Memory
+from common.messaging.sample_client import SampleClient
 from common.messaging.session import open_session
 from common.messaging.shared_frames import SharedFrames
 from common.messaging.transport import Node, Refused, new_incarnation

@@ -14,7 +14,7 @@ import zenoh
 from samples import await_service, make_segment
 from test_topology import lines, running, wait_for
 
-from common.messaging.clients import InsertClient
+from common.messaging.insert_client import InsertClient
 from common.messaging.keys import replay_key, status_key
 from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.insert import encode_segment

@@ -35,6 +35,7 @@ ROLL_AT = 1 << 28  # bytes after which the next file begins
 
 _HEADER = struct.Struct("<IIQQ")
 _LANES = 1024  # 64-bit columns that a checksum adds up
+_RECORDED = DrawRequest.__struct_fields__.index("memory")  # fields of a request that say what is drawn
 _SPARE = "spare"  # a file to be overwritten
 
 
@@ -77,7 +78,7 @@ class Journal:
 
     def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
         """Record a draw. If there is no space, it is kept and written before the next record."""
-        self._late.append((DRAW, msgpack.packb([*msgspec.structs.astuple(request)[:-1], ids.tobytes()])))
+        self._late.append((DRAW, msgpack.packb([*msgspec.structs.astuple(request)[:_RECORDED], ids.tobytes()])))
         with contextlib.suppress(OSError):
             self._append_late()
 

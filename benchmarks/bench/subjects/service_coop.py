@@ -12,8 +12,9 @@ import msgspec
 from made_up import ATARI, segments
 from service_work import BATCH, CAPACITY, STEPS, Inserters, attend_service, insert_on_demand
 
-from common.messaging.clients import InsertClient, SampleClient
+from common.messaging.insert_client import InsertClient
 from common.messaging.route import open_client
+from common.messaging.sample_client import SampleClient
 from common.messaging.session import open_session
 from common.messaging.transport import Node, new_incarnation
 from common.process.lifecycle import Stop

@@ -17,7 +17,7 @@ from made_up import segments
 from turns import attend
 from work import ATARI, update_config
 
-from common.messaging.clients import InsertClient
+from common.messaging.insert_client import InsertClient
 from common.messaging.joining import join
 from common.messaging.keys import replay_key
 from common.messaging.messages.join import Join

@@ -109,16 +109,16 @@ class BatchReader:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        arrays = {
+        columns = {
             **transitions(spec, "batch"),
             "weights": ("float32", ("batch",)),
             "ids": ("int64", ("batch",)),
             "age": ("int64", ("batch",)),
             "reuse": ("int32", ("batch",)),
         }
-        self._layout = Layout(dict(arrays), OPTIONAL)
-        del arrays["frames"]
-        self._layout_of_slots = Layout({**arrays, "slots": ("int64", ("frames",))}, OPTIONAL)
+        frames = columns.pop("frames")
+        self._layout = Layout({"frames": frames, **columns}, OPTIONAL)
+        self._layout_of_slots = Layout({"slots": ("int64", ("frames",)), **columns}, OPTIONAL)
 
     def __call__(self, message: Message, shared: SharedFrames | None = None) -> tuple[Batch, Drawn]:
         """Read one; shared: where its frames may lie. Raises BadMessage."""

@@ -1,0 +1,157 @@
+"""The client that inserts: segments in a bounded window, each sent until it is acknowledged.
+
+It has no thread of its own: Zenoh works in the background, and the caller processes the answers.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import msgspec
+
+from common.errors import BadMessage
+from common.messaging.keys import KeySpace, replay_key
+from common.messaging.messages.answers import Ack, Retry
+from common.messaging.messages.insert import encode_segment
+from common.messaging.repeating import BAD_ANSWER, NO_ANSWER, Backoff
+from common.messaging.transport import NoAnswer, Pending
+from common.messaging.wire import Message
+from common.process.lifecycle import Stop
+from common.types import Segment
+
+# Seconds. A segment may wait behind its whole window while the limiter admits segments one by one; a lost peer is
+# noticed sooner, by its link.
+INSERT_TIMEOUT = 60.0
+
+
+class QuerySender(KeySpace, Protocol):
+    """The connection that carries queries to the replay service: a `Node`, or an actor's `ReplayRoute`."""
+
+    run: str
+
+    def begin(self, key: str, payload: bytearray, timeout: float) -> Pending:
+        """See `Node`."""
+
+
+@dataclass(slots=True)
+class _Sent:
+    payload: bytearray
+    steps: int
+    pending: Pending
+
+
+class InsertClient:
+    """Sends each segment until it is acknowledged, with at most `window` segments in flight.
+
+    The first one goes alone; each acknowledgement says how many the replay service permits from then on.
+
+    Args:
+        on_wait: called repeatedly while inserts wait.
+
+    Attributes:
+        acked: transitions acknowledged.
+        inserted: the table's count of accepted transitions, as of the last acknowledgement.
+        waiting: why inserts wait, in words; empty while they do not.
+    """
+
+    def __init__(self, node: QuerySender, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
+        self.acked = 0
+        self.inserted = 0
+        self.waiting = ""
+        self._node = node
+        self._stop = stop
+        self._window = window
+        self._permitted = 1
+        self._on_wait = on_wait
+        self._key = replay_key(node, "insert")
+        self._outstanding: deque[_Sent] = deque()
+        self._spare: list[bytearray] = []  # memory of acknowledged segments, for the next ones: sending copies
+        self._backoff = Backoff()
+
+    def submit(self, segment: Segment) -> bool:
+        """Send a segment once there is room in the window; return False if a stop was requested first.
+
+        Raises:
+            Refused: the replay service rejected a segment as invalid.
+        """
+        self._collect_acks()
+        while len(self._outstanding) >= self._permitted:
+            if not self._await_ack(self._outstanding[0]):
+                return False
+            self._end_first()
+        memory = self._spare.pop() if self._spare else None
+        payload = encode_segment(self._node.run, msgspec.structs.replace(segment, acked=self.acked), memory)
+        self._outstanding.append(_Sent(payload, segment.steps, self._send(payload)))
+        return True
+
+    def drain(self) -> bool:
+        """Wait until all segments are acknowledged; return False if a stop was requested first."""
+        while self._outstanding:
+            if not self._await_ack(self._outstanding[0]):
+                return False
+            self._end_first()
+        return True
+
+    def _collect_acks(self) -> None:
+        """Process the acknowledgements that have arrived, without waiting."""
+        while self._outstanding:
+            sent = self._outstanding[0]
+            try:
+                message = sent.pending.ready()
+                if message is None:
+                    return
+                accepted = self._accept(message, sent)
+            except (NoAnswer, BadMessage):
+                return  # it is sent again when the window is full
+            if not accepted:
+                sent.pending = self._send(sent.payload)
+                return
+            self._end_first()
+
+    def _end_first(self) -> None:
+        self._spare.append(self._outstanding.popleft().payload)
+
+    def _await_ack(self, sent: _Sent) -> bool:
+        """Wait for one acknowledgement, sending again as often as necessary; return False if a stop was requested."""
+        while True:
+            try:
+                message = self._wait(sent.pending)
+                if message is None:
+                    return False
+                if self._accept(message, sent):
+                    return True
+            except NoAnswer:
+                self.waiting = NO_ANSWER
+            except BadMessage as error:
+                self.waiting = f"{BAD_ANSWER}: {error}"
+            self._on_wait()
+            if self._backoff.pause(self._stop):
+                return False
+            sent.pending = self._send(sent.payload)
+
+    def _wait(self, pending: Pending) -> Message | None:
+        """The answer, or None if a stop was requested first; raises as `Pending.ready`."""
+        looks = Backoff(0.001, 0.05)
+        while (message := pending.ready()) is None:
+            if looks.pause(self._stop):
+                return None
+            self._on_wait()
+        return message
+
+    def _send(self, payload: bytearray) -> Pending:
+        return self._node.begin(self._key, payload, INSERT_TIMEOUT)
+
+    def _accept(self, message: Message, sent: _Sent) -> bool:
+        if message.kind == Retry.kind:
+            self.waiting = Retry.decode(message).reason
+            return False
+        ack = Ack.decode(message)
+        self.inserted = max(self.inserted, ack.inserted)
+        self._permitted = min(self._window, ack.window or self._window)
+        self.acked += sent.steps
+        self.waiting = ""
+        self._backoff.reset()
+        return True
