@@ -30,10 +30,10 @@ class SharedFrames:
         """Copy the frames in `slots`, int64 [n]: [n, *frame_shape]; raises BadMessage if there is no such slot."""
         if not len(slots):
             return np.empty((0, *self._shape), self._dtype)
-        if slots.item(slots.argmax()) >= len(self._rows):  # the store may have grown
+        least, most = slots.item(slots.argmin()), slots.item(slots.argmax())
+        if most >= len(self._rows):  # the store may have grown
             memory = self._reader.map()
             self._rows = np.frombuffer(memory, self._whole, len(memory) // self._whole.itemsize)
-        least, most = slots.item(slots.argmin()), slots.item(slots.argmax())
         if not 0 <= least <= most < len(self._rows):
             raise BadMessage("arrays.slots", f"values from {least} to {most}; there are {len(self._rows)} slots")
         frames = self._rows.take(slots, mode="clip")
