@@ -193,8 +193,8 @@ OURS = {"work/s": [20.0, 44.0, 18.0], "seconds": [0.5, 1.1, 0.4], "MiB": [5.0] *
         ({"work/s": [22.0, 90.0, 90.0]}, 0, "work/s: 4.50 (2.20 to 9.00) times the reference, was 2.00 (1.80 to 2.20)"),
         ({"seconds": [0.1, 0.1, 0.1]}, 1, "seconds: 0.10 (0.05 to 0.10) times the reference, was 0.50 (0.40 to 0.55)"),
         ({"seconds": [0.6, 1.3, 0.7]}, -1, "seconds: 0.65 (0.60 to 0.70) times the reference, was 0.50 (0.40 to 0.55)"),
-        ({"MiB": [5.4] * 3}, 0, "MiB: 0.54 (0.54 to 0.54) times the reference, was 0.50 (0.50 to 0.50)"),
-        ({"MiB": [5.6] * 3}, -1, "MiB: 0.56 (0.56 to 0.56) times the reference, was 0.50 (0.50 to 0.50)"),
+        ({"MiB": [5.2] * 3}, 0, "MiB: 0.52 (0.52 to 0.52) times the reference, was 0.50 (0.50 to 0.50)"),
+        ({"MiB": [5.3] * 3}, -1, "MiB: 0.53 (0.53 to 0.53) times the reference, was 0.50 (0.50 to 0.50)"),
     ],
 )
 def test_the_guard_names_what_left_its_range(bench: Any, changes: dict[str, list[float]], way: int, line: str) -> None:

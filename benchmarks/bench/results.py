@@ -33,7 +33,7 @@ for name in sys.argv[1:]:
 """
 UNIT_COST = "us a unit"  # of the area growth
 # How far apart ranges may lie that count as overlapping: of memory, which is measured once in a run, and of the rest.
-MEMORY, SAME_MEMORY, SAME = ("MiB", "bytes/transition"), 1.1, 1.01
+MEMORY, SAME_MEMORY, SAME = ("MiB", "bytes/transition"), 1.05, 1.01
 # "comparisons", by title: area, reference, seconds, "on", which of "machines", and "subjects": {name: Rounds}
 Figures = dict[str, Any]
 
