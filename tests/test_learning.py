@@ -85,8 +85,8 @@ def test_coop_finds_optimal_values_over_the_real_topology(config: RunConfig, tmp
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["exit"] == "complete"
     assert summary["transitions_lost"] == 0
-    # Both actors explore as the whole run asks for, not as their own half of the steps would (0.12 more). No actor knows
-    # more steps than were inserted; one that waits for a core knows an older count, hence the median.
+    # Both actors explore as the whole run asks for, not as their own half of the steps would (0.12 more). No actor
+    # knows more steps than were inserted; one that waits for a core knows an older count, hence the median.
     with (tmp_path / "run" / "episodes.csv").open(encoding="utf-8") as file:
         told = [(int(row["env_step"]), float(row["epsilon"])) for row in csv.DictReader(file)]
     assert all(epsilon > schedules.epsilon(config.actor, step) for step, epsilon in told)
