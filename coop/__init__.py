@@ -1,10 +1,10 @@
 """The Python API: train, load, evaluate and sweep from a script or a notebook.
 
-run = coop.train(preset="cartpole", method="coop", seed=0, total_steps=20_000, run_dir="runs/a")
-for row in run.metrics():
-print(row["env_step"], row["loss"])
-policy = coop.load("runs/a").policy()
-print(coop.evaluate(policy, episodes=20).mean)
+    run = coop.train(preset="cartpole", method="coop", seed=0, total_steps=20_000, run_dir="runs/a")
+    for row in run.metrics():
+        print(row["env_step"], row["loss"])
+    policy = coop.load("runs/a").policy()
+    print(coop.evaluate(policy, episodes=20).mean)
 """
 
 from __future__ import annotations

@@ -1,9 +1,12 @@
 """What an actor does in a turn: actions, episode ends, and what chose them; real emulators, no socket."""
 
 from functools import partial
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 
 from actors.player import Player, Turn
 from actors.policy import Policy
@@ -15,8 +18,21 @@ from common.settings.config import ActorSettings
 from common.settings.environment import EnvSettings
 
 
-def make_player(num_envs: int = 3, epsilon: float = 0.5) -> tuple[Player, VectorEnv, Policy]:
-    env = make_vector_env(EnvSettings(id="CartPole-v0"), num_envs, seed=1)
+class Generous(CartPoleEnv):
+    """CartPole with rewards of 3, which clipping changes."""
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        obs, reward, *rest = super().step(action)
+        return obs, 3 * reward, *rest
+
+
+gymnasium.register("Generous-v0", entry_point=Generous, max_episode_steps=200)
+
+
+def make_player(
+    num_envs: int = 3, epsilon: float = 0.5, settings: EnvSettings | None = None
+) -> tuple[Player, VectorEnv, Policy]:
+    env = make_vector_env(settings or EnvSettings(id="CartPole-v0"), num_envs, seed=1)
     first, second = (FlatNetwork(build_network("mlp", env.spec, (8,), seed=seed)) for seed in (0, 1))
     policy = Policy((first, second), env.spec, np.random.default_rng(0))
     return Player(env, policy, lambda _: epsilon), env, policy
@@ -31,8 +47,13 @@ def play(player: Player, turns: int) -> list[Turn]:
     return played
 
 
-def test_episodes_sum_the_unclipped_rewards_of_their_stream() -> None:
-    player, env, _ = make_player()
+@pytest.mark.parametrize(
+    "settings",
+    [EnvSettings(id="CartPole-v0"), EnvSettings(id="Generous-v0", clip_rewards=True)],
+    ids=lambda one: one.id,
+)
+def test_episodes_sum_the_unclipped_rewards_of_their_stream(settings: EnvSettings) -> None:
+    player, env, _ = make_player(settings=settings)
     turns = play(player, 300)
     env.close()
     begun = [0] * 3
