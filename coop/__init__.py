@@ -5,6 +5,8 @@
         print(row["env_step"], row["loss"])
     policy = coop.load("runs/a").policy()
     print(coop.evaluate(policy, episodes=20).mean)
+
+docs/python.md has more examples.
 """
 
 from __future__ import annotations
