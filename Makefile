@@ -36,7 +36,7 @@ netns: $(READY)
 	@$(BIN)/python benchmarks/netns.py
 
 chaos: $(READY)
-	@$(BIN)/python -m deploy.chaos --run-dir runs/chaos-$(STAMP)
+	@$(BIN)/python benchmarks/chaos.py --run-dir runs/chaos-$(STAMP)
 
 soak: $(READY)
 	@$(BIN)/python benchmarks/soak.py

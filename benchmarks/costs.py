@@ -1,4 +1,4 @@
-"""Processor time of a run's parts, for `deploy/sizing.py`: `python benchmarks/costs.py cartpole catch breakout-small`.
+"""Processor time of a run's parts: `python benchmarks/costs.py cartpole catch breakout-small`.
 
 A run of each preset with one actor, its roles as real processes: first without the actor, then at the preset's replay
 ratio, where the learner is busy all the time, then at a ratio so low that the actor is. The processor time of the three

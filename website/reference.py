@@ -16,7 +16,6 @@ from common.settings.methods import METHODS, table_of
 from common.settings.options import RunOptions, with_methods
 from common.settings.tables import load_tables, preset_names, resolve
 from deploy.local import LocalOptions
-from deploy.plan import PlanOptions
 from deploy.router import RouterOptions
 from deploy.watch import WatchOptions
 from experiments.evaluation_cli import EvalOptions
@@ -41,7 +40,6 @@ COMMANDS: dict[str, type[Any]] = {
     "coop-eval": EvalOptions,
     "coop-export": ExportOptions,
     "coop-watch": WatchOptions,
-    "coop-plan": PlanOptions,
     "coop-report": ReportOptions,
 }
 

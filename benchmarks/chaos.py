@@ -1,4 +1,4 @@
-"""`python -m deploy.chaos` kills roles of a `coop-local` run at random moments and counts the losses."""
+"""`python benchmarks/chaos.py` kills roles of a `coop-local` run at random moments and counts the losses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SETTLED = 100  # minimum number of updates between two kills, so that each kill 
 
 @dataclass(frozen=True)
 class ChaosOptions:
-    """Flags of `deploy.chaos`."""
+    """Flags of `benchmarks/chaos.py`."""
 
     run_dir: Path
     """Folder for the run's files; must be new."""
