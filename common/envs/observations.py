@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
@@ -22,15 +21,9 @@ class FrameMaker:
     shape, dtype: of a frame; dtype is "uint8", "bool" or "float32".
     """
 
-    def __init__(self, settings: EnvSettings, space: gymnasium.Space[Array]) -> None:
-        """Raise UsageError for a space, or a change of pictures, that is not supported."""
-        name = f"env.id: {settings.id!r}"
-        if not isinstance(space, Box) or not 1 <= len(space.shape) <= 3:
-            raise UsageError(
-                f"{name} has the observation space {space}; allowed is a Box of one dimension, or of pictures, height "
-                "x width or height x width x channels"
-            )
-        self._name, self._space = name, space
+    def __init__(self, settings: EnvSettings, space: Box) -> None:
+        """Raise UsageError for a change of pictures that is not supported."""
+        self._name, self._space = f"env.id: {settings.id!r}", space
         self.shape: tuple[int, ...] = space.shape
         self.dtype = str(space.dtype) if str(space.dtype) in KEPT else "float32"
         self._to_gray = settings.grayscale
@@ -51,15 +44,6 @@ class FrameMaker:
         picture = grayscale(observation) if self._to_gray else observation
         picture = picture if self._resize is None else self._resize(picture)
         return np.rint(picture) if self.dtype == "uint8" else picture
-
-    def check(self, observation: Array) -> None:
-        """Raise UsageError for an observation that its space does not describe."""
-        found = np.asarray(observation)
-        if found.shape != self._space.shape or not np.can_cast(found.dtype, self._space.dtype, "same_kind"):
-            raise UsageError(
-                f"{self._name} gives observations {found.dtype}{list(found.shape)}; its observation space says "
-                f"{self._space.dtype}{list(self._space.shape)}"
-            )
 
     def _need(self, asked: str, holds: bool, what: str) -> None:
         if not holds or self.dtype == "bool":
