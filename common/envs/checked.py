@@ -15,15 +15,24 @@ from numpy.typing import NDArray
 from common.bounds import MAX_MAGNITUDE
 from common.errors import RunError, UsageError
 from common.imports import describe
-from common.process.notices import warn
+from common.process.notices import warn, warn_once
 from common.types import Array
 
 RAISED = (Exception, SystemExit)  # by users' code, which may end neither a process nor a run by itself
 _STEP = "gymnasium's step gives (observation, reward, terminated, truncated, info)"
 _RESET = "gymnasium's reset takes seed and options, and gives (observation, info)"
 _BOUND = f"allowed: finite, from -{MAX_MAGNITUDE:,.0f} to {MAX_MAGNITUDE:,.0f}"
+MOST_FLAGS = 100  # observations with no other values than 0 and 1, and some of each, after which there is a warning
 
 T = TypeVar("T")
+
+
+def of_flags(name: str) -> str:
+    """The warning of uint8 observations that are only 0 and 1."""
+    return (
+        f"{name}: uint8 observations of only 0 and 1, which networks see divided by 255; in a space of bool or float32 "
+        "they see them as they are"
+    )
 
 
 class Unfit(Exception):
@@ -37,10 +46,12 @@ class Unfit(Exception):
 class ObservationCheck:
     """Refuses observations of another shape or dtype than their space's, and values that nobody can learn from."""
 
-    def __init__(self, space: Box) -> None:
+    def __init__(self, name: str, space: Box) -> None:
+        self._name = name
         self._shape, self._dtype = space.shape, space.dtype
         self._says = f"its observation space says {space.dtype}{list(space.shape)}"
         self._any_value = space.dtype in (np.uint8, np.bool_)
+        self._flags_in_a_row = 0 if space.dtype == np.uint8 else MOST_FLAGS
 
     def __call__(self, given: Any) -> Array:  # noqa: ANN401 (whatever there is)
         """The observation as an array; raises Unfit."""
@@ -56,7 +67,16 @@ class ObservationCheck:
             least, most = observation.item(observation.argmin()), observation.item(observation.argmax())
             if not (least >= -MAX_MAGNITUDE and most <= MAX_MAGNITUDE):  # not true of NaN either
                 raise Unfit(f"gives observations with values from {least:g} to {most:g}", _BOUND)
+        if self._flags_in_a_row < MOST_FLAGS:
+            self._look_for_flags(observation)
         return observation
+
+    def _look_for_flags(self, observation: Array) -> None:
+        """Warn of uint8 that holds truth values."""
+        most = observation.max()
+        self._flags_in_a_row = self._flags_in_a_row + int(most) if most <= 1 else MOST_FLAGS + 1
+        if self._flags_in_a_row == MOST_FLAGS:
+            warn_once(of_flags(self._name))
 
     def _unfit(self, found: Array) -> Unfit:
         return Unfit(f"gives observations {found.dtype}{list(found.shape)}", self._says)
@@ -73,7 +93,7 @@ class CheckedEnv:
         """emulator: its number, if there are others."""
         self._env, self._name = env, f"env.id: {env_id!r}"
         self._of = "" if emulator is None else f" of emulator {emulator}"
-        self._observation = ObservationCheck(space)
+        self._observation = ObservationCheck(self._name, space)
         self._steps = 0
 
     def reset(self, seed: int | None = None) -> Array:
@@ -146,10 +166,10 @@ class CheckedEnv:
         )
 
     def _refuse(self, what: str, why: str, *, reset: bool = False) -> NoReturn:
-        raise UsageError(f"{self._name} {what} {self._when(reset)}; {why}") from None
+        raise UsageError(f"{self._name} {self._when(reset)} {what}; {why}") from None
 
     def _failed(self, error: BaseException, *, reset: bool = False) -> NoReturn:
-        raise RunError(f"{self._name} raised {_described(error)} {self._when(reset)}") from error
+        raise RunError(f"{self._name} {self._when(reset)} raised {_described(error)}") from error
 
     def _when(self, reset: bool) -> str:
         if not self._steps:

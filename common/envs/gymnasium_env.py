@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from common.bounds import MAX_ACTIONS, MAX_SIDE
+from common.bounds import LONGEST_EPISODE, MAX_ACTIONS, MAX_SIDE
 from common.envs.checked import RAISED, CheckedEnv
 from common.envs.observations import FrameMaker
 from common.envs.pictures import coloured
@@ -20,11 +20,12 @@ from common.envs.protocol import Steps
 from common.envs.registry import find_registered
 from common.errors import UsageError
 from common.imports import describe
+from common.process.notices import warn_once
 from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
 
 PICTURES_PER_S = 10.0  # where the environment does not say
-FASTEST = 1000.0  # pictures a second
+SLOWEST, FASTEST = 0.1, 1000.0  # pictures a second
 
 
 class GymnasiumEnv:
@@ -33,8 +34,11 @@ class GymnasiumEnv:
     `stack` frames make one observation; zeros stand for frames before an episode's first.
     """
 
-    def __init__(self, settings: EnvSettings, seeds: list[int], render_mode: str | None = None) -> None:
-        envs, self.episode_limit = _make(settings, len(seeds), render_mode)
+    def __init__(
+        self, settings: EnvSettings, seeds: list[int], render_mode: str | None = None, *, bounded: bool = False
+    ) -> None:
+        """bounded: see `make_vector_env`."""
+        envs, self._limit = _make(settings, len(seeds), render_mode)
         observations, actions = _spaces(settings, envs[0])
         self._frame = FrameMaker(settings, observations)
         self.spec = _spec_of(settings, actions, self._frame)
@@ -44,6 +48,9 @@ class GymnasiumEnv:
             CheckedEnv(env, settings.id, observations, row if several else None) for row, env in enumerate(envs)
         ]
         self._seeds = seeds
+        self._bounded = bounded and not self._limit
+        if self._bounded:
+            self._limit = LONGEST_EPISODE
         self._clip = settings.clip_rewards
         self._limit_terminal = settings.time_limit_terminal
         self._first_action, self._action_dtype = actions.start, actions.dtype
@@ -61,11 +68,10 @@ class GymnasiumEnv:
             UsageError: the environment gives what its spaces or gymnasium's interface rule out.
             RunError: its own code raises an exception.
         """
-        frames = [env.reset(seed) for env, seed in zip(self._envs, self._seeds, strict=True)]
         self._lengths = [0] * self.num_envs
         self._obs = np.zeros((self.num_envs, *self.spec.obs_shape), self.spec.frame_dtype)
-        for row, frame in enumerate(frames):
-            self._put(self._obs, row, frame)
+        for row, seed in enumerate(self._seeds):
+            self._put(self._obs, row, self._envs[row].reset(seed))
         return self._obs
 
     def send(self, actions: NDArray[np.int32]) -> None:
@@ -86,11 +92,13 @@ class GymnasiumEnv:
             self._put(next_obs, row, frame)
             rewards.append(reward)
             lengths[row] += 1
-            is_over = terminated or truncated or lengths[row] == self.episode_limit
-            if is_over:
-                over.append(row)
+            is_over = terminated or truncated or lengths[row] == self._limit
             if terminated or (is_over and self._limit_terminal):
                 terminal.append(row)
+            if is_over:
+                over.append(row)
+                if self._bounded and not (terminated or truncated):
+                    self._tell_cut()
         raw_rewards = np.array(rewards, np.float64)
         learned = np.clip(raw_rewards, -1.0, 1.0) if self._clip else raw_rewards
         self._obs = self._restart(next_obs, over) if over else next_obs
@@ -123,6 +131,12 @@ class GymnasiumEnv:
         else:
             obs[row] = frame
 
+    def _tell_cut(self) -> None:
+        warn_once(
+            f"env.id: {self.spec.env_id!r}: an episode had not ended after {LONGEST_EPISODE:,} steps, and was cut "
+            "there; env.max_episode_steps sets a limit"
+        )
+
     def _mask(self, rows: list[int]) -> NDArray[np.bool_]:
         if not rows:
             return self._none
@@ -142,7 +156,7 @@ class FilmedGymnasium(GymnasiumEnv):
         CheckedEnv(env, settings.id, observations).close()
         if vectors and "rgb_array" not in (metadata.get("render_modes") or ()):
             raise UsageError(f"env.id: {settings.id!r} has no pictures to film")
-        super().__init__(settings, [seed], "rgb_array" if vectors else None)
+        super().__init__(settings, [seed], "rgb_array" if vectors else None, bounded=True)
         self.pictures_per_s = _speed(metadata.get("render_fps"))
         self._renders = vectors
 
@@ -157,7 +171,7 @@ class FilmedGymnasium(GymnasiumEnv):
 
 def _speed(stated: object) -> float:
     """Pictures a second by what an environment states, which may be anything."""
-    return float(stated) if isinstance(stated, int | float) and 0 < stated <= FASTEST else PICTURES_PER_S
+    return float(stated) if isinstance(stated, int | float) and SLOWEST <= stated <= FASTEST else PICTURES_PER_S
 
 
 def gymnasium_spec(settings: EnvSettings) -> EnvSpec:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from gymnasium.spaces import Box
 
+from common.envs.checked import of_flags
 from common.envs.pictures import grayscale, make_resizer
 from common.errors import UsageError
+from common.process.notices import warn_once
 from common.settings.environment import EnvSettings
 from common.types import Array
 
@@ -25,6 +27,7 @@ class FrameMaker:
         """Raise UsageError for a change of pictures that is not supported."""
         self._name, self._space = f"env.id: {settings.id!r}", space
         self.shape: tuple[int, ...] = space.shape
+        self._warn()
         self.dtype = str(space.dtype) if str(space.dtype) in KEPT else "float32"
         self._to_gray = settings.grayscale
         if settings.grayscale:
@@ -44,6 +47,17 @@ class FrameMaker:
         picture = grayscale(observation) if self._to_gray else observation
         picture = picture if self._resize is None else self._resize(picture)
         return np.rint(picture) if self.dtype == "uint8" else picture
+
+    def _warn(self) -> None:
+        """Warn of spaces that are probably meant otherwise than they are taken."""
+        space, shape = self._space, list(self._space.shape)
+        if space.dtype == np.uint8 and space.high.max() <= 1:
+            warn_once(of_flags(self._name))
+        if len(shape) == 3 and shape[0] < min(shape[1:]):
+            warn_once(
+                f"{self._name}: observations {shape} are read as pictures of height {shape[0]}, width {shape[1]} and "
+                f"{shape[2]} channels; if the channels come first, move them to the end"
+            )
 
     def _need(self, asked: str, holds: bool, what: str) -> None:
         if not holds or self.dtype == "bool":
