@@ -38,7 +38,7 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
     """
     if path is not None:
         try:
-            return tomllib.loads(path.read_text(encoding="utf-8"))
+            return tomllib.loads(path.read_text(encoding="utf-8-sig"))  # some editors begin files with a mark
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise UsageError(f"--config {path}: {error}") from error
     if preset not in preset_names():
