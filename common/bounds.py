@@ -34,3 +34,4 @@ MAX_INTEGER = 2**63 - 1  # the largest integer in TOML and in the counters on th
 MAX_NOOPS = 10_000
 MAX_FRAME_SKIP = 1000
 MAX_GAME_STEPS = 2_000_000
+LONGEST_EPISODE = 10_000  # steps, of an evaluation's episodes where nothing else limits them

@@ -6,6 +6,7 @@ import importlib
 
 from common.process.importing import importing
 from common.process.lifecycle import end_on_signals
+from common.process.threads import despite_threads
 
 
 def actor() -> None:
@@ -47,4 +48,5 @@ def _begin(program: str, module: str) -> None:
     end_on_signals(program)
     with importing():
         main = importlib.import_module(module).main
-    main()
+    with despite_threads():
+        main()

@@ -14,7 +14,7 @@ from common.process.files import write_atomic
 from common.process.flags import HttpAddress
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
-from common.process.ports import check_can_listen
+from common.process.ports import check_can_listen, check_loopback
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.capacity import check_memory, check_messages
 from common.settings.config import RunConfig, check_distributed
@@ -148,6 +148,7 @@ def _run() -> None:
         raise UsageError(f"--actors {options.actors}: must be at least 1, or 0 with --listen")
     config = options.run_config()
     check_distributed(config)
+    check_loopback()
     spec = env_spec(config.env)  # refuses invalid environments before anything starts
     check_memory(config, spec)
     check_messages(config, spec)

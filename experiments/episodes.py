@@ -5,12 +5,16 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from contextlib import closing
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from common.envs.make import env_spec, make_vector_env
 from common.envs.protocol import VectorEnv
+from common.errors import CoopError, UsageError
+from common.imports import describe
 from common.messaging.messages.evaluate import EvaluationRow
 from common.networks.acting import ActingNetwork
 from common.settings.config import RunConfig
@@ -18,6 +22,8 @@ from common.types import Array, EnvSpec
 
 Acting = Callable[[Array], Any]
 """Actions, int [envs], for observations <frame_dtype>[envs, *obs_shape]."""
+
+T = TypeVar("T")
 
 AT_ONCE = 8  # emulators, if nothing else is asked for
 
@@ -32,7 +38,7 @@ def play(env: VectorEnv, act: Acting, episodes: int, stopped: Callable[[], bool]
     returns: list[float] = []
     obs = env.reset()
     while len(returns) < episodes and not stopped():
-        steps = env.step(np.asarray(act(obs), np.int32).reshape(env.num_envs))
+        steps = env.step(chosen(act, obs, env.spec))
         obs = steps.obs
         totals += steps.raw_rewards
         for number in np.flatnonzero(steps.episode_over & (left > 0)).tolist():
@@ -40,6 +46,20 @@ def play(env: VectorEnv, act: Acting, episodes: int, stopped: Callable[[], bool]
             left[number] -= 1
         totals[steps.episode_over] = 0.0
     return returns
+
+
+def chosen(act: Acting, obs: Array, spec: EnvSpec) -> NDArray[np.int32]:
+    """The actions, int32 [envs], of a policy; raises UsageError if they are none."""
+    given = np.asarray(act(obs))
+    if given.size == len(obs) and given.dtype.kind in "iu":
+        actions = given.reshape(len(obs))
+        if actions.min() >= 0 and actions.max() < spec.num_actions:
+            return actions.astype(np.int32)
+    what = f"{given.dtype}{list(given.shape)}" if given.size > 1 else repr(given.tolist())
+    raise UsageError(
+        f"policy: gives {what} for {len(obs)} of {spec.env_id!r}'s observations; allowed: an int from 0 to "
+        f"{spec.num_actions - 1} for each"
+    )
 
 
 def greedy(network: ActingNetwork, spec: EnvSpec) -> Acting:
@@ -62,45 +82,63 @@ class Evaluator:
 
     Args:
         config: of the run. episodes: of each evaluation. at_once: emulators at most.
-        stopped: returns whether an evaluation should be abandoned.
+        stopped: returns whether an evaluation should be abandoned. tell: called with a line if one fails: training goes
+            on without it.
     """
 
     def __init__(
         self,
         config: RunConfig,
         stopped: Callable[[], bool],
+        tell: Callable[[str], None],
         episodes: int | None = None,
         epsilon: float = 0.0,
         at_once: int = AT_ONCE,
     ) -> None:
         self._config = config
         self._stopped = stopped
+        self._tell = tell
         self._episodes = episodes or config.eval_episodes
         self._epsilon = epsilon
         self._at_once = at_once
 
     def evaluate(self, network: ActingNetwork, number: int, update: int, env_step: int) -> EvaluationRow | None:
-        """Evaluate a network, 1 or 2, after `env_step` steps of the run; None if that was abandoned.
+        """Evaluate a network, 1 or 2, after `env_step` steps of the run; None if that was abandoned, or has failed.
 
         The emulators' seed follows from the run's seed and the step, so that a repetition gives the same result.
         """
         began, config, episodes = time.monotonic(), self._config, self._episodes
         env_seed, policy_seed = np.random.SeedSequence([config.seed, 5, env_step]).spawn(2)
-        env = make_vector_env(config.env, min(episodes, self._at_once), int(env_seed.generate_state(1)[0]))
         rng = np.random.default_rng(policy_seed)
-        act = exploring(greedy(network, env.spec), self._epsilon, env.spec.num_actions, rng)
-        try:
-            returns = play(env, act, episodes, self._stopped)
-        finally:
-            env.close()
-        if len(returns) < episodes:
+
+        def played() -> list[float]:
+            at_once, seed = min(episodes, self._at_once), int(env_seed.generate_state(1)[0])
+            with closing(make_vector_env(config.env, at_once, seed, bounded=True)) as env:
+                act = exploring(greedy(network, env.spec), self._epsilon, env.spec.num_actions, rng)
+                return play(env, act, episodes, self._stopped)
+
+        returns = self._tried(f"evaluation after {env_step:,} steps", played)
+        if returns is None or len(returns) < episodes:
             return None
         mean, sd, seconds = statistics.fmean(returns), statistics.pstdev(returns), time.monotonic() - began
         return EvaluationRow(env_step, update, number, episodes, mean, sd, self._epsilon, seconds)
 
-    def film(self, network: ActingNetwork, env_step: int) -> bytes:
-        """Film the beginning of an episode that a network plays greedily after `env_step` steps: an animated GIF."""
+    def film(self, network: ActingNetwork, env_step: int) -> bytes | None:
+        """Film the beginning of an episode that a network plays greedily after `env_step` steps: an animated GIF.
+
+        None if that has failed.
+        """
         from experiments.film import Film, short_gif  # noqa: PLC0415 (most runs film nothing)
 
         settings, seed = self._config.env, np.random.SeedSequence([self._config.seed, 6, env_step]).generate_state(1)
-        return short_gif(Film(greedy(network, env_spec(settings)), settings, int(seed[0])))
+        act = greedy(network, env_spec(settings))
+        return self._tried(f"video after {env_step:,} steps", lambda: short_gif(Film(act, settings, int(seed[0]))))
+
+    def _tried(self, what: str, work: Callable[[], T]) -> T | None:
+        try:
+            return work()
+        except CoopError as error:
+            self._tell(f"no {what}: {error}")
+        except Exception as error:  # libraries and users' code may raise anything
+            self._tell(f"no {what}: {describe(error)}")
+        return None

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from common.bounds import MAX_EVALUATED, MAX_INTEGER, MAX_STREAMS
 from common.envs.make import make_vector_env
 from common.errors import RunError, UsageError
 from common.settings.environment import EnvSettings
@@ -80,16 +82,31 @@ def evaluate(
         at_once: emulators that play at once, each its share of the episodes.
 
     Raises:
-        UsageError: there are no episodes to play; a function without an environment of its own got none.
+        UsageError: an argument is invalid, or lacks; or the policy gives something else than actions.
+        RunError: the environment's own code raises an exception.
     """
-    if episodes < 1:
-        raise UsageError(f"episodes = {episodes}: must be at least 1")
+    if not callable(policy):
+        raise UsageError(f"policy: {type(policy).__name__} is no function of observations")
+    _check_whole("episodes", episodes, 1, MAX_EVALUATED)
+    _check_whole("seed", seed, 0, MAX_INTEGER)
+    _check_whole("at_once", at_once, 1, MAX_STREAMS)
+    if isinstance(epsilon, bool) or not isinstance(epsilon, int | float | np.number) or not 0 <= epsilon <= 1:
+        raise UsageError(f"epsilon = {epsilon!r}: must be from 0 to 1")
+    if not isinstance(env, str | Mapping | None):
+        raise UsageError(f"env = {env!r}: must be an id, or a table of settings")
     own = policy.env if isinstance(policy, SavedPolicy) else None
     if env is None and own is None:
         raise UsageError("env: a policy that no run has trained needs one")
     changes = {"id": env} if isinstance(env, str) else dict(env or {})
     settings = resolve({"env": {**(asdict(own) if own else {}), **changes}}).env
     return Evaluation(_returns(policy, settings, episodes, seed, epsilon, at_once))
+
+
+def _check_whole(name: str, value: object, least: int, most: int) -> None:
+    """Raise UsageError unless an argument is a whole number within bounds."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (whole and least <= value <= most):  # type: ignore[operator]
+        raise UsageError(f"{name} = {value!r}: must be a whole number from {least} to {most:,}")
 
 
 def evaluate_checkpoint(
@@ -153,9 +170,6 @@ def _derived(run: SavedRun, seed: int) -> int:
 def _returns(
     policy: Acting, settings: EnvSettings, episodes: int, seed: int, epsilon: float, at_once: int
 ) -> list[float]:
-    env = make_vector_env(settings, min(episodes, at_once), seed)
-    try:
+    with closing(make_vector_env(settings, min(episodes, at_once), seed, bounded=True)) as env:
         act = exploring(policy, epsilon, env.spec.num_actions, np.random.default_rng(seed))
         return play(env, act, episodes)
-    finally:
-        env.close()

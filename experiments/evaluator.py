@@ -130,7 +130,7 @@ class EvaluatorService:
         self._node, self._stop, self._console, self._incarnation = node, stop, console, incarnation
         self._weights = WeightsFollower(node, self._policy)
         self._evaluations, self._films = Schedule(plan.seconds, steps), Schedule(None, config.video_every)
-        self._evaluator = Evaluator(config, self._abandons, plan.episodes, plan.epsilon, plan.at_once)
+        self._evaluator = Evaluator(config, self._abandons, console.event, plan.episodes, plan.epsilon, plan.at_once)
         self._number = 0
         self._last = False
 
@@ -163,8 +163,9 @@ class EvaluatorService:
                 self._send(Evaluated(self._incarnation, self._number, result), said)
         if self._films.due(progress, now) and not self._abandons():
             self._films.begun(progress, now)
-            gif = np.frombuffer(self._evaluator.film(network, env_step), np.uint8)
-            self._send(Video(self._incarnation, self._number, env_step, gif), f"a video after {env_step:,} steps")
+            if (gif := self._evaluator.film(network, env_step)) is not None:
+                video = Video(self._incarnation, self._number, env_step, np.frombuffer(gif, np.uint8))
+                self._send(video, f"a video after {env_step:,} steps")
 
     def _send(self, message: Evaluated | Video, said: str) -> None:
         """Send a result until it is acknowledged, or for `LAST_RECEIPT` seconds at the run's end."""

@@ -14,13 +14,15 @@ from common.bounds import MAX_VIDEO
 from common.envs.make import make_filmed_env
 from common.errors import UsageError
 from common.settings.environment import EnvSettings
-from experiments.episodes import Acting
+from experiments.episodes import Acting, chosen
 
 Picture = NDArray[np.uint8]
 """uint8 [height, width, 3]."""
 
 SMALLEST = 240  # pixels: smaller pictures are enlarged
 LONGEST = 900  # pictures of a film that goes to TensorBoard; a minute of an Atari game
+LONGEST_GIF = 3000  # pictures of a GIF, which is made in memory
+LONGEST_STILL = 600_000  # milliseconds of one picture; a GIF has 16 bits for hundredths of a second
 FORMATS = (".mp4", ".gif")
 
 
@@ -44,7 +46,7 @@ class Film:
             obs = self._env.reset()
             while not self.over:
                 yield _enlarged(self._env.picture())
-                steps = self._env.step(np.asarray(self._act(obs), np.int32).reshape(1))
+                steps = self._env.step(chosen(self._act, obs, self._env.spec))
                 obs, self.over = steps.obs, bool(steps.episode_over[0])
                 self.steps += 1
                 self.episode_return += float(steps.raw_rewards[0])
@@ -66,9 +68,9 @@ def check_video(path: Path) -> None:
 
 
 def write_video(film: Film, path: Path) -> None:
-    """Write a whole episode to a file of one of `FORMATS`."""
+    """Write an episode to a file of one of `FORMATS`; a GIF holds at most `LONGEST_GIF` pictures of it."""
     if path.suffix == ".gif":
-        path.write_bytes(_gif(film, film.pictures_per_s))
+        path.write_bytes(_gif(islice(film, LONGEST_GIF), film.pictures_per_s))
         return
     import imageio_ffmpeg  # noqa: PLC0415
 
@@ -77,8 +79,13 @@ def write_video(film: Film, path: Path) -> None:
     height, width, _ = first.shape
     writer = imageio_ffmpeg.write_frames(path, (width, height), fps=film.pictures_per_s, macro_block_size=2, quality=8)
     writer.send(None)
-    for picture in chain([first], pictures):
-        writer.send(np.ascontiguousarray(picture))
+    try:
+        for picture in chain([first], pictures):
+            writer.send(np.ascontiguousarray(picture))
+    except BaseException:
+        writer.close()
+        path.unlink(missing_ok=True)
+        raise
     writer.close()
 
 
@@ -93,10 +100,20 @@ def short_gif(film: Film) -> bytes:
 def _gif(pictures: Iterable[Picture], per_s: float) -> bytes:
     from PIL import Image  # noqa: PLC0415 (needed seldom)
 
-    content = io.BytesIO()
-    images = map(Image.fromarray, pictures)
-    next(images).save(content, "gif", save_all=True, append_images=images, duration=round(1000 / per_s), loop=0)
+    content, duration = io.BytesIO(), round(1000 / per_s)
+    images = map(Image.fromarray, _moving(pictures, duration))
+    next(images).save(content, "gif", save_all=True, append_images=images, duration=duration, loop=0)
     return content.getvalue()
+
+
+def _moving(pictures: Iterable[Picture], duration: int) -> Iterator[Picture]:
+    """Leave out pictures, of so many milliseconds each, with which one that stays the same would last too long."""
+    before, still = None, 0
+    for picture in pictures:
+        still = still + duration if before is not None and np.array_equal(picture, before) else duration
+        before = picture
+        if still <= LONGEST_STILL:
+            yield picture
 
 
 def _enlarged(picture: Picture) -> Picture:

@@ -100,7 +100,7 @@ def play_lockstep(
         RunError: there is no space for the closing epoch or the summary.
     """
     trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
-    evaluator = Evaluator(run.config, stop.is_set)
+    evaluator = Evaluator(run.config, stop.is_set, say)
     _evaluate(run, directory, evaluator)  # what a stop has abandoned
     while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
         for effects in run.play():
@@ -139,7 +139,9 @@ def _evaluate(run: Lockstep, directory: RunDirectory, evaluator: Evaluator) -> N
         if result is not None:
             directory.evaluation(result)
     if config.video_every and step % config.video_every == 0:
-        directory.video(evaluator.film(network, step), step)
+        gif = evaluator.film(network, step)
+        if gif is not None:
+            directory.video(gif, step)
 
 
 def _progress(run: Lockstep) -> str:

@@ -19,7 +19,7 @@ from common.process.summaries import read_summary
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
 from common.settings.tables import load_tables, resolve
-from common.types import EnvSpec
+from common.types import Array, EnvSpec
 from learner.qnetwork import make_network
 from learner.records.epochs import load_learner, newest_epoch
 from learner.records.evaluations import EVALUATIONS
@@ -67,9 +67,10 @@ class SavedPolicy:
         """Q-values, float32 [actions], of one stacked observation, [*obs_shape]; [batch, actions] of a batch.
 
         Raises:
-            UsageError: the observation has another shape than those of the environment.
+            UsageError: the observation has another shape or dtype than those of the environment, or values that are not
+                finite.
         """
-        given = np.asarray(obs, self.spec.frame_dtype)
+        given = self._as_stored(obs)
         batch = given if given.ndim > len(self.spec.obs_shape) else given[None]
         if batch.shape[1:] != self.spec.obs_shape:
             shape = "x".join(map(str, self.spec.obs_shape))
@@ -77,6 +78,22 @@ class SavedPolicy:
         each = [network.q_values(batch, self.spec) for network in self.networks]
         values: NDArray[np.float32] = np.mean(each, axis=0)
         return values if batch is given else values[0]
+
+    def _as_stored(self, obs: ArrayLike) -> Array:
+        """An observation in the dtype of the environment's; numbers in lists may stand for it if they fit exactly."""
+        dtype = np.dtype(self.spec.frame_dtype)
+        try:
+            given = np.asarray(obs)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"observation: not an array: {error}") from error
+        if given.dtype.kind not in "biuf" or not (
+            np.can_cast(given.dtype, dtype, "same_kind")
+            or (given.dtype.kind != "f" and np.array_equal(given.astype(dtype), given))
+        ):
+            raise UsageError(f"observation of dtype {given.dtype}: {self.spec.env_id} has {dtype}, or ints that fit it")
+        if given.dtype.kind == "f" and not np.isfinite(given).all():
+            raise UsageError(f"observation with values that are not finite: {self.spec.env_id} has finite ones")
+        return given.astype(dtype, copy=False)
 
 
 class SavedRun:

@@ -13,7 +13,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from common.errors import RunError, UsageError
+from common.errors import CoopError, RunError, UsageError
+from common.imports import describe
 from common.process.lifecycle import Stop
 from common.process.processes import ChildProcess, command
 from common.process.summaries import read_summary
@@ -100,8 +101,11 @@ class TrainingRun:
             RunError: the run has failed or diverged.
         """
         self._thread.join(timeout)
-        if self._failure is not None:
-            raise self._failure
+        failure = self._failure
+        if isinstance(failure, Exception) and not isinstance(failure, RunError):
+            raise RunError(str(failure) if isinstance(failure, CoopError) else describe(failure)) from failure
+        if failure is not None:
+            raise failure
         return self.summary
 
     def _run(self) -> None:

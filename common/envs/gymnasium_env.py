@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from common.bounds import MAX_ACTIONS, MAX_SIDE
+from common.bounds import LONGEST_EPISODE, MAX_ACTIONS, MAX_SIDE
+from common.envs.checked import RAISED, CheckedEnv
 from common.envs.observations import FrameMaker
 from common.envs.pictures import coloured
 from common.envs.protocol import Steps
 from common.envs.registry import find_registered
 from common.errors import UsageError
 from common.imports import describe
+from common.process.notices import warn_once
 from common.settings.environment import EnvSettings
 from common.types import Array, EnvSpec
 
 PICTURES_PER_S = 10.0  # where the environment does not say
+SLOWEST, FASTEST = 0.1, 1000.0  # pictures a second
 
 
 class GymnasiumEnv:
@@ -30,17 +34,26 @@ class GymnasiumEnv:
     `stack` frames make one observation; zeros stand for frames before an episode's first.
     """
 
-    def __init__(self, settings: EnvSettings, seeds: list[int], render_mode: str | None = None) -> None:
-        self._envs, self._limit = _make(settings, len(seeds), render_mode)
-        self._frame = FrameMaker(settings, self._envs[0].observation_space)
-        self.spec = _spec_of(settings, self._envs[0], self._frame)
+    def __init__(
+        self, settings: EnvSettings, seeds: list[int], render_mode: str | None = None, *, bounded: bool = False
+    ) -> None:
+        """bounded: see `make_vector_env`."""
+        envs, self._limit = _make(settings, len(seeds), render_mode)
+        observations, actions = _spaces(settings, envs[0])
+        self._frame = FrameMaker(settings, observations)
+        self.spec = _spec_of(settings, actions, self._frame)
         self.num_envs = len(seeds)
+        several = self.num_envs > 1
+        self._envs = [
+            CheckedEnv(env, settings.id, observations, row if several else None) for row, env in enumerate(envs)
+        ]
         self._seeds = seeds
+        self._bounded = bounded and not self._limit
+        if self._bounded:
+            self._limit = LONGEST_EPISODE
         self._clip = settings.clip_rewards
         self._limit_terminal = settings.time_limit_terminal
-        actions = self._envs[0].action_space
-        assert isinstance(actions, Discrete)
-        self._first_action = int(actions.start)
+        self._first_action, self._action_dtype = actions.start, actions.dtype
         self._lengths = [0] * self.num_envs
         self._obs = np.empty(0)
         self._actions = np.empty(0, np.int32)
@@ -52,14 +65,13 @@ class GymnasiumEnv:
         """Start every emulator from its seed: <frame_dtype>[envs, *obs_shape].
 
         Raises:
-            UsageError: the observations differ from what the environment's space says.
+            UsageError: the environment gives what its spaces or gymnasium's interface rule out.
+            RunError: its own code raises an exception.
         """
-        frames = [env.reset(seed=seed)[0] for env, seed in zip(self._envs, self._seeds, strict=True)]
         self._lengths = [0] * self.num_envs
         self._obs = np.zeros((self.num_envs, *self.spec.obs_shape), self.spec.frame_dtype)
-        for row, frame in enumerate(frames):
-            self._frame.check(frame)
-            self._put(self._obs, row, frame)
+        for row, seed in enumerate(self._seeds):
+            self._put(self._obs, row, self._envs[row].reset(seed))
         return self._obs
 
     def send(self, actions: NDArray[np.int32]) -> None:
@@ -67,23 +79,26 @@ class GymnasiumEnv:
         self._actions = actions
 
     def recv(self) -> Steps:
-        """Play the stored actions; plain environments have no threads that could begin earlier."""
+        """Play the stored actions; plain environments have no threads that could begin earlier. Raises as `reset`."""
         next_obs = np.empty_like(self._obs)
         if self.spec.stack > 1:
             next_obs[:, :-1] = self._obs[:, 1:]
         rewards, lengths = [], self._lengths
         terminal: list[int] = []
         over: list[int] = []
-        for row, action in enumerate(self._actions.tolist()):
-            frame, reward, terminated, truncated, _ = self._envs[row].step(action + self._first_action)
+        # What Discrete.sample gives, numpy's integers, is what environments are written for.
+        for row, action in enumerate(self._actions.astype(self._action_dtype) + self._first_action):
+            frame, reward, terminated, truncated = self._envs[row].step(action)
             self._put(next_obs, row, frame)
             rewards.append(reward)
             lengths[row] += 1
             is_over = terminated or truncated or lengths[row] == self._limit
-            if is_over:
-                over.append(row)
             if terminated or (is_over and self._limit_terminal):
                 terminal.append(row)
+            if is_over:
+                over.append(row)
+                if self._bounded and not (terminated or truncated):
+                    self._tell_cut()
         raw_rewards = np.array(rewards, np.float64)
         learned = np.clip(raw_rewards, -1.0, 1.0) if self._clip else raw_rewards
         self._obs = self._restart(next_obs, over) if over else next_obs
@@ -91,7 +106,7 @@ class GymnasiumEnv:
         return Steps(self._obs, next_obs, learned.astype(np.float32), raw_rewards, self._mask(terminal), ended, ended)
 
     def step(self, actions: NDArray[np.int32]) -> Steps:
-        """`send`, then `recv`."""
+        """`send`, then `recv`; raises as `recv`."""
         self.send(actions)
         return self.recv()
 
@@ -104,7 +119,7 @@ class GymnasiumEnv:
         obs = next_obs.copy()
         for row in rows:
             obs[row] = 0
-            self._put(obs, row, self._envs[row].reset()[0])
+            self._put(obs, row, self._envs[row].reset())
             self._lengths[row] = 0
         return obs
 
@@ -115,6 +130,12 @@ class GymnasiumEnv:
             obs[row, -1] = frame
         else:
             obs[row] = frame
+
+    def _tell_cut(self) -> None:
+        warn_once(
+            f"env.id: {self.spec.env_id!r}: an episode had not ended after {LONGEST_EPISODE:,} steps, and was cut "
+            "there; env.max_episode_steps sets a limit"
+        )
 
     def _mask(self, rows: list[int]) -> NDArray[np.bool_]:
         if not rows:
@@ -130,12 +151,13 @@ class FilmedGymnasium(GymnasiumEnv):
     def __init__(self, settings: EnvSettings, seed: int) -> None:
         """Raise UsageError for an environment that has no pictures, or lacks a package for them."""
         (env,), _ = _make(settings, 1)
-        metadata, vectors = env.metadata, len(FrameMaker(settings, env.observation_space).shape) == 1
-        env.close()
-        if vectors and "rgb_array" not in metadata.get("render_modes", ()):
+        observations, _ = _spaces(settings, env)
+        metadata, vectors = env.metadata or {}, len(FrameMaker(settings, observations).shape) == 1
+        CheckedEnv(env, settings.id, observations).close()
+        if vectors and "rgb_array" not in (metadata.get("render_modes") or ()):
             raise UsageError(f"env.id: {settings.id!r} has no pictures to film")
-        super().__init__(settings, [seed], "rgb_array" if vectors else None)
-        self.pictures_per_s = float(metadata.get("render_fps", PICTURES_PER_S))
+        super().__init__(settings, [seed], "rgb_array" if vectors else None, bounded=True)
+        self.pictures_per_s = _speed(metadata.get("render_fps"))
         self._renders = vectors
 
     def picture(self) -> NDArray[np.uint8]:
@@ -144,10 +166,12 @@ class FilmedGymnasium(GymnasiumEnv):
             return coloured(self._obs[0, -1] if self.spec.stack > 1 else self._obs[0])
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs neither a screen
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # nor to greet
-        try:
-            return np.asarray(self._envs[0].render(), np.uint8)
-        except gymnasium.error.DependencyNotInstalled as error:
-            raise UsageError(f"env.id: {self.spec.env_id!r} can't be filmed: {describe(error)}") from None
+        return coloured(self._envs[0].render())
+
+
+def _speed(stated: object) -> float:
+    """Pictures a second by what an environment states, which may be anything."""
+    return float(stated) if isinstance(stated, int | float) and SLOWEST <= stated <= FASTEST else PICTURES_PER_S
 
 
 def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
@@ -156,11 +180,11 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
     Raises:
         UsageError: the id is unknown, or a space or setting is not supported.
     """
-    envs, _ = _make(settings, 1)
-    try:
-        return _spec_of(settings, envs[0], FrameMaker(settings, envs[0].observation_space))
-    finally:
-        envs[0].close()
+    (env,), _ = _make(settings, 1)
+    observations, actions = _spaces(settings, env)
+    spec = _spec_of(settings, actions, FrameMaker(settings, observations))
+    CheckedEnv(env, settings.id, observations).close()
+    return spec
 
 
 def _make(
@@ -180,16 +204,36 @@ def _make(
         envs = [gymnasium.make(plain) for _ in range(count)]
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"env.id: {settings.id!r} needs a package that is not installed: {error}") from None
-    except Exception as error:
+    except RAISED as error:
         text = f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {describe(error)}"
         raise UsageError(text) from error
     return envs, settings.max_episode_steps or registered.max_episode_steps or 0
 
 
-def _spec_of(settings: EnvSettings, env: gymnasium.Env[Any, Any], frame: FrameMaker) -> EnvSpec:
-    actions = env.action_space
+def _spaces(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> tuple[Box, Discrete]:
+    """The spaces of an environment's observations and actions; raises UsageError."""
+    name = f"env.id: {settings.id!r}"
+    try:
+        observations, actions = env.observation_space, env.action_space
+    except RAISED as error:
+        raise UsageError(f"{name} has no observation_space and action_space: {describe(error)}") from error
+    if not isinstance(observations, Box) or not 1 <= len(observations.shape) <= 3:
+        raise UsageError(
+            f"{name} has the observation space {_one_line(observations)}; allowed is a Box of one dimension, or of "
+            "pictures, height x width or height x width x channels"
+        )
+    if not math.prod(observations.shape):
+        raise UsageError(f"{name} has the observation space {observations}: there are no values in it")
     if not isinstance(actions, Discrete):
-        raise UsageError(f"env.id: {settings.id!r} has the action space {actions}; allowed is Discrete")
+        raise UsageError(f"{name} has the action space {_one_line(actions)}; allowed is Discrete")
+    return observations, actions
+
+
+def _one_line(space: object) -> str:
+    return " ".join(str(space).split())
+
+
+def _spec_of(settings: EnvSettings, actions: Discrete, frame: FrameMaker) -> EnvSpec:
     for what, most, limit in (
         ("actions", int(actions.n), MAX_ACTIONS),
         ("values on a side", max(frame.shape), MAX_SIDE),

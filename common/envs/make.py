@@ -12,12 +12,17 @@ import numpy as np
 
 from common.envs.protocol import FilmedEnv, VectorEnv
 from common.errors import UsageError
+from common.process.notices import warn_once
 from common.settings.environment import EnvSettings
 from common.types import EnvSpec
 
+ALE_VERSION = "5"
 
-def make_vector_env(settings: EnvSettings, num_envs: int, seed: int) -> VectorEnv:
+
+def make_vector_env(settings: EnvSettings, num_envs: int, seed: int, *, bounded: bool = False) -> VectorEnv:
     """Make `num_envs` emulators, each with its own seed derived from `seed`.
+
+    bounded: where nothing limits the length of an episode, cut it after `LONGEST_EPISODE` steps, and say so.
 
     Raises:
         UsageError: the id or game is unknown, or a space is not supported.
@@ -31,11 +36,11 @@ def make_vector_env(settings: EnvSettings, num_envs: int, seed: int) -> VectorEn
         return AtariEnv(settings, game, seeds.tolist())
     from common.envs.gymnasium_env import GymnasiumEnv  # noqa: PLC0415
 
-    return GymnasiumEnv(settings, seeds.tolist())
+    return GymnasiumEnv(settings, seeds.tolist(), bounded=bounded)
 
 
 def make_filmed_env(settings: EnvSettings, seed: int) -> FilmedEnv:
-    """Make one emulator that shows pictures too.
+    """Make one emulator that shows pictures too, and plays episodes that are `bounded`.
 
     Raises:
         UsageError: as `make_vector_env`; or the environment has no pictures, or lacks a package for them.
@@ -76,6 +81,18 @@ def env_spec(settings: EnvSettings) -> EnvSpec:
     return gymnasium_spec(settings)
 
 
+def _check_version(settings: EnvSettings, version: str) -> None:
+    """Raise UsageError for an id of gymnasium that does not exist; warn of one that there means sticky actions."""
+    if version not in ("", ALE_VERSION):
+        known = settings.id.removesuffix(version) + ALE_VERSION
+        raise UsageError(f"env.id: unknown environment {settings.id!r}; ALE's ids have version 5: {known}")
+    if version and not settings.repeat_action_probability:
+        warn_once(
+            f"env.id: {settings.id!r} has sticky actions elsewhere (probability 0.25), and none here unless "
+            "env.repeat_action_probability is set"
+        )
+
+
 def _atari_game(settings: EnvSettings) -> str | None:
     """The ROM's name if the id names an ALE game; None if it is gymnasium's."""
     if not settings.atari:
@@ -83,9 +100,10 @@ def _atari_game(settings: EnvSettings) -> str | None:
     from ale_py.roms import get_all_rom_ids  # noqa: PLC0415
 
     games = {game.replace("_", ""): game for game in get_all_rom_ids()}
-    wanted = settings.id.removeprefix("ALE/").split("-v")[0]
+    wanted, _, version = settings.id.removeprefix("ALE/").partition("-v")
     plain = wanted.replace("_", "").replace("-", "").lower()
     if plain in games:
+        _check_version(settings, version)
         return games[plain]
     near = ", ".join(games[name] for name in get_close_matches(plain, games, n=3)) or "breakout, pong, space_invaders"
     raise UsageError(f"env.id: unknown game {wanted!r}; ale-py has {len(games)} games, such as {near}")

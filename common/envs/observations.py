@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
+from common.envs.checked import of_flags
 from common.envs.pictures import grayscale, make_resizer
 from common.errors import UsageError
+from common.process.notices import warn_once
 from common.settings.environment import EnvSettings
 from common.types import Array
 
@@ -22,16 +23,11 @@ class FrameMaker:
     shape, dtype: of a frame; dtype is "uint8", "bool" or "float32".
     """
 
-    def __init__(self, settings: EnvSettings, space: gymnasium.Space[Array]) -> None:
-        """Raise UsageError for a space, or a change of pictures, that is not supported."""
-        name = f"env.id: {settings.id!r}"
-        if not isinstance(space, Box) or not 1 <= len(space.shape) <= 3:
-            raise UsageError(
-                f"{name} has the observation space {space}; allowed is a Box of one dimension, or of pictures, height "
-                "x width or height x width x channels"
-            )
-        self._name, self._space = name, space
+    def __init__(self, settings: EnvSettings, space: Box) -> None:
+        """Raise UsageError for a change of pictures that is not supported."""
+        self._name, self._space = f"env.id: {settings.id!r}", space
         self.shape: tuple[int, ...] = space.shape
+        self._warn()
         self.dtype = str(space.dtype) if str(space.dtype) in KEPT else "float32"
         self._to_gray = settings.grayscale
         if settings.grayscale:
@@ -52,13 +48,15 @@ class FrameMaker:
         picture = picture if self._resize is None else self._resize(picture)
         return np.rint(picture) if self.dtype == "uint8" else picture
 
-    def check(self, observation: Array) -> None:
-        """Raise UsageError for an observation that its space does not describe."""
-        found = np.asarray(observation)
-        if found.shape != self._space.shape or not np.can_cast(found.dtype, self._space.dtype, "same_kind"):
-            raise UsageError(
-                f"{self._name} gives observations {found.dtype}{list(found.shape)}; its observation space says "
-                f"{self._space.dtype}{list(self._space.shape)}"
+    def _warn(self) -> None:
+        """Warn of spaces that are probably meant otherwise than they are taken."""
+        space, shape = self._space, list(self._space.shape)
+        if space.dtype == np.uint8 and space.high.max() <= 1:
+            warn_once(of_flags(self._name))
+        if len(shape) == 3 and shape[0] < min(shape[1:]):
+            warn_once(
+                f"{self._name}: observations {shape} are read as pictures of height {shape[0]}, width {shape[1]} and "
+                f"{shape[2]} channels; if the channels come first, move them to the end"
             )
 
     def _need(self, asked: str, holds: bool, what: str) -> None:

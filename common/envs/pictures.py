@@ -20,16 +20,18 @@ def grayscale(picture: Array) -> NDArray[np.float32]:
 
 
 def coloured(frame: Array) -> NDArray[np.uint8]:
-    """A stored frame, <dtype>[height, width] or [height, width, channels], in colour: uint8 [height, width, 3].
+    """A picture of any numbers, [height, width] or [height, width, channels], in colour: uint8 [height, width, 3].
 
     Three channels are red, green and blue; of other numbers of channels, each has a colour of its own, and the last
-    one that is not 0 shows. float32 runs from the least to the largest value.
+    one that is not 0 shows. Floats run from the least to the largest value.
     """
-    if frame.dtype == np.float32:
+    if frame.dtype.kind == "f":
         low, high = float(frame.min()), float(frame.max())
         frame = ((frame - low) * (255 / max(high - low, 1e-12))).astype(np.uint8)
     elif frame.dtype == np.bool_:
         frame = frame.view(np.uint8) * np.uint8(255)
+    elif frame.dtype != np.uint8:
+        frame = np.clip(frame, 0, 255).astype(np.uint8)
     if frame.ndim == 2:
         return np.repeat(frame[..., None], 3, axis=2)
     if frame.shape[2] == 3:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -37,9 +38,20 @@ def find_registered(settings: EnvSettings) -> EnvSpec:
                 text = f"env.id = {settings.id!r}: cannot load {point.value!r}: {describe(error)}"
                 raise UsageError(text) from error
     try:
-        return gymnasium.spec(name)
+        found = gymnasium.spec(name)
     except gymnasium.error.Error:
         raise UsageError(_unknown(settings, name, space)) from None
+    if str(found.entry_point).startswith("ale_py"):  # registered if something has imported ale-py
+        raise UsageError(_unknown(settings, name, space))
+    return found
+
+
+def _game(name: str) -> str | None:
+    """The ALE game of an id such as BreakoutNoFrameskip-v4, in which old versions of gym had its emulator; or None."""
+    from ale_py.roms import get_all_rom_ids  # noqa: PLC0415
+
+    plain = re.sub(r"(-ram)?(Deterministic|NoFrameskip)?-v\d+$", "", name).lower()
+    return next((game for game in get_all_rom_ids() if game.replace("_", "") == plain), None)
 
 
 @cache
@@ -57,6 +69,10 @@ def _unknown(settings: EnvSettings, name: str, space: str) -> str:
     asked = f"env.id: unknown environment {settings.id!r}"
     if space in _PACKAGES and not any(known.startswith(f"{space}/") for known in gymnasium.registry):
         return f"{asked}; ids of {space} need the package {_PACKAGES[space]}, which is not installed"
+    if settings.module is None and (game := _game(name)) is not None:
+        return (
+            f"{asked}; ALE's game is {game!r} here, with env.frame_skip and env.repeat_action_probability for the rest"
+        )
     near = ", ".join(get_close_matches(name, gymnasium.registry, n=3)) or "CartPole-v0, coop/Catch-v0"
     if settings.module is not None:
         return f"{asked}; the module {settings.module} does not register {name}; known are {near}"

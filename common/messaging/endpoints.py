@@ -12,7 +12,7 @@ from common.errors import UsageError
 
 PORTS = ("tcp", "tls", "udp", "quic", "ws")  # protocols whose address is HOST:PORT
 OTHERS = ("unixsock-stream", "unixpipe", "serial", "vsock")
-_OS_ERROR = re.compile(r"\(os error (\d+)\)")
+_OS_ERROR = re.compile(r"os error (\d+)", re.IGNORECASE)
 _WORDS = {
     errno.EADDRINUSE: "the port is in use",
     errno.EADDRNOTAVAIL: "this machine does not have that address",
@@ -60,6 +60,14 @@ def explain_listen_error(listen: Sequence[str], error: Exception) -> str:
         return first_line(error)
     number = int(found[1])
     return _WORDS.get(number, os.strerror(number).lower())
+
+
+def explain_shared_memory(error: Exception) -> str:
+    """Explain an error of Zenoh's about its shared memory; empty if it is about something else."""
+    if "shm" not in str(error).lower():
+        return ""
+    found = _OS_ERROR.search(str(error))
+    return f"--shared-memory: /dev/shm: {os.strerror(int(found[1])).lower() if found else first_line(error)}"
 
 
 def first_line(error: Exception) -> str:

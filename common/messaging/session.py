@@ -12,7 +12,7 @@ import zenoh
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import RunError, UsageError
-from common.messaging.endpoints import check_endpoints, explain_listen_error, first_line
+from common.messaging.endpoints import check_endpoints, explain_listen_error, explain_shared_memory, first_line
 from common.messaging.links import never_linger, permit_many
 from common.messaging.presence import LEASE
 from common.messaging.transport import NoAnswer
@@ -77,6 +77,8 @@ def open_session(
         with _threads(mode, listens=bool(listen)):
             session = zenoh.open(config)
     except zenoh.ZError as error:
+        if shared_memory and (problem := explain_shared_memory(error)):
+            raise RunError(problem) from error
         if mode == "client":
             raise NoAnswer(f"no router at {', '.join(connect)}") from error
         raise RunError(

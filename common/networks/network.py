@@ -159,6 +159,10 @@ class FlatNetwork:
             x = function(x)
         return x
 
+    def __reduce__(self) -> tuple[type[FlatNetwork], tuple[nn.Module]]:
+        """Pickle the module alone; the functions over its parameters are made again."""
+        return FlatNetwork, (self.module,)
+
     @property
     def size(self) -> int:
         """Number of parameters."""

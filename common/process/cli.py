@@ -6,12 +6,15 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import tyro
 from tyro import _errors as tyro_errors  # private; pyproject.toml pins the version
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from common.errors import UsageError
+from common.process.files import user_path
 from common.process.flags import SHELLS, completion, placeholder, sections
 from common.process.help import full_help, short_help
 from common.suggestions import closest, not_among, refusal
@@ -20,6 +23,22 @@ PACKAGE = "coop-rl"
 ANSWERS = ("--help", "--help-all", "--version", "--completion")
 
 T = TypeVar("T")
+
+_PATHS = ConstructorRegistry()
+
+
+@_PATHS.primitive_rule
+def _path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
+    """Reads every flag that is a path as `user_path` does."""
+    if info.type is not Path:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda words: user_path(words[0]),
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda value: [str(value)],
+    )
 
 
 def parse(
@@ -52,7 +71,7 @@ def parse(
     def refuse(event: tyro_errors.ParseErrorEvent) -> NoReturn:
         raise UsageError(_problem(event, kind))
 
-    with tyro_errors.on_parse_error(refuse):
+    with _PATHS, tyro_errors.on_parse_error(refuse):
         if default is None:
             return tyro.cli(kind, prog=program, args=args, add_help=False)
         return tyro.cli(kind, prog=program, args=args, add_help=False, default=default)
@@ -102,6 +121,8 @@ def _reason(message: str) -> str:
     """Why a value cannot be read, in one line; tyro's own messages show types and have several."""
     first = message.partition("\n")[0]
     value = re.search(r"(?: from|arguments:|base 10:|to float:) (.+?)\.?$", first)
+    if value and value[1] in ("''", "['']"):
+        return "an empty value"
     return f"can't read {value[1]}" if value else first
 
 

@@ -130,3 +130,10 @@ def sync_folder(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def user_path(text: str | Path) -> Path:
+    """A path as users write it: ~ is their home; raises ValueError for an empty one, which would be this folder."""
+    if not str(text):
+        raise ValueError("an empty path; this folder is .")
+    return Path(text).expanduser()

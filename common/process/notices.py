@@ -13,6 +13,13 @@ def warn(text: str) -> None:
     print(f"warning: {text}", file=sys.stderr, flush=True)
 
 
+def warn_once(text: str) -> None:
+    """Print a warning, the first time in this process."""
+    if (text, "") not in _told:
+        _told.add((text, ""))
+        warn(text)
+
+
 def note_renamed(names: Mapping[str, str]) -> None:
     """Print former names that were read and their present ones in one line; each pair once per process."""
     fresh = [f"{former} is now {present}" for former, present in names.items() if (former, present) not in _told]

@@ -5,9 +5,25 @@ from __future__ import annotations
 import re
 import socket
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
 
 LOOPBACK = "127.0.0.1"
+CONNECTING = 5.0  # seconds
+
+
+def check_loopback() -> None:
+    """Raise RunError where processes of this machine can't connect to each other: no time would make them."""
+    with socket.socket() as listening:
+        try:
+            listening.bind((LOOPBACK, 0))
+            listening.listen()
+            socket.create_connection(listening.getsockname(), CONNECTING).close()
+        except OSError as error:
+            problem = error.strerror or error
+            raise RunError(
+                f"this machine's loopback interface can't be used ({LOOPBACK}: {problem}), by which the processes of a "
+                "run reach each other; ip link set lo up"
+            ) from error
 
 
 def http_address(flag: str, text: str) -> tuple[str, int]:

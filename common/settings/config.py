@@ -30,6 +30,7 @@ from common.settings.names import EvictionName, MethodName, SamplingName
 from common.settings.policies import EVICTIONS, SAMPLERS
 
 OUTSIDE = ("checkpoint_every", "eval_every", "eval_episodes", "video_every")  # training does not depend on these
+OF_MACHINE = ("device", "threads")  # of `learner`: a run may move to another machine
 NETWORK_KINDS = ("mlp", "nature", "nips2013", "minatar")
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 

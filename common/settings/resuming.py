@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import RunError, UsageError
-from common.settings.config import OUTSIDE, RunConfig
+from common.settings.config import OF_MACHINE, OUTSIDE, RunConfig
 from common.settings.overrides import leaves
 from common.settings.tables import to_tables
 
@@ -19,8 +19,8 @@ def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
     """Refuse changes that would make it a different run.
 
     A run may be made longer: `total_steps`, `total_updates` and `total_episodes` may grow, and `target_return` and
-    what training does not depend on may take any value. Schedules that span the run (`learner.learning_rate_final`)
-    then follow the longer run.
+    what training does not depend on may take any value, as may the learner's device and threads. Schedules that span
+    the run (`learner.learning_rate_final`) then follow the longer run.
 
     Args:
         config: the config that the command line asks for. saved: the run's config so far. source: the file of `saved`.
@@ -46,7 +46,7 @@ def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
 
 
 def _may_change(path: tuple[str, ...], here: Any, there: Any) -> bool:  # noqa: ANN401 (values of any field)
-    if here == there or path[0] in _FREE:
+    if here == there or path[0] in _FREE or (path[0] == "learner" and path[1] in OF_MACHINE):
         return True
     if path == ("total_steps",):
         return bool(here > there)

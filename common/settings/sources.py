@@ -23,10 +23,10 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     early.add_argument("--preset")
-    early.add_argument("--config", type=Path)
+    early.add_argument("--config", type=_path)
     early.add_argument("--method")
     early.add_argument("--total-steps", "--total_steps", type=int)
-    early.add_argument("--run-dir", "--run_dir", type=Path)
+    early.add_argument("--run-dir", "--run_dir", type=_path)
     early.add_argument("--resume", action="store_true")
     try:
         known, _ = early.parse_known_args(sys.argv[1:] if args is None else args)
@@ -55,3 +55,8 @@ def chosen_config(
     if file and method and "methods" not in tables and method != tables.get("method", method):
         warn(f"{file} has no settings for single methods: {method} gets those of {tables['method']}")
     return resolve(tables, method)
+
+
+def _path(text: str) -> Path:
+    """As `user_path`, which will refuse an empty one with its flag."""
+    return Path(text).expanduser()

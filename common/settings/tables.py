@@ -13,7 +13,7 @@ import pydantic
 import tomli_w
 
 from common.errors import UsageError
-from common.settings.config import OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
+from common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from common.settings.methods import METHODS
 from common.settings.overrides import merged, of_method
 from common.settings.renamed import current, with_stack
@@ -38,7 +38,7 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
     """
     if path is not None:
         try:
-            return tomllib.loads(path.read_text(encoding="utf-8"))
+            return tomllib.loads(path.read_text(encoding="utf-8-sig"))  # some editors begin files with a mark
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise UsageError(f"--config {path}: {error}") from error
     if preset not in preset_names():
@@ -132,9 +132,12 @@ def to_tables(config: RunConfig) -> dict[str, Any]:
 def identity(config: RunConfig) -> dict[str, Any]:
     """The settings, as nested tables, that all processes of a run must share.
 
-    These are all but those that training does not depend on, and the settings of other methods.
+    These are all but those that training does not depend on, those of the learner's machine, and the settings of other
+    methods.
     """
-    return {name: value for name, value in to_tables(config).items() if name not in (*OUTSIDE, "methods")}
+    tables = {name: value for name, value in to_tables(config).items() if name not in (*OUTSIDE, "methods")}
+    learner = {name: value for name, value in tables["learner"].items() if name not in OF_MACHINE}
+    return {**tables, "learner": learner}
 
 
 def first_difference(here: Mapping[str, Any], there: Mapping[str, Any], name: str = "") -> tuple[str, Any, Any] | None:

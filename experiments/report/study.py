@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
-from common.settings.config import RunConfig, value_of
+from common.settings.config import OF_MACHINE, RunConfig, value_of
 from common.settings.methods import METHODS
 from common.settings.tables import identity, load_tables, resolve
 from experiments.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
@@ -244,7 +244,8 @@ def _axes(configs: list[RunConfig]) -> tuple[str, ...]:
     """Fields that differ within a method; those that differ only between methods belong to the method."""
     values: dict[tuple[str, str], set[Any]] = {}
     for config in configs:
-        for name, value in _flat(identity(config)):
+        machine = {f"learner.{name}": getattr(config.learner, name) for name in OF_MACHINE}
+        for name, value in (*_flat(identity(config)), *machine.items()):
             values.setdefault((config.method, name), set()).add(value)
     names = dict.fromkeys(name for (_, name), found in values.items() if len(found) > 1)
     return tuple(name for name in names if name not in NOT_AXES)

@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from common.errors import RunError
+from common.imports import describe
 from common.messaging.messages.evaluate import EvaluationRow
 from common.process.console import say
 from common.process.files import LineFile, truncate, write_atomic
@@ -135,11 +136,13 @@ class RunDirectory:
         self.draw(title)
 
     def draw(self, title: str) -> None:
-        """Draw the learning curve if there is space for it."""
+        """Draw the learning curve; a run whose curve can't be drawn is as complete."""
         try:
             draw_learning_curve(self.path, title)
         except OSError as error:
             say(f"{self.path}: no learning curve: {error.strerror or error}")
+        except Exception as error:  # matplotlib's own settings, and the fonts and programs that they name
+            say(f"{self.path}: no learning curve: {describe(error)[:200]}")
 
     def sizes(self) -> dict[str, int]:
         """The present sizes of the growing files, in bytes."""

@@ -45,15 +45,17 @@ def check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
     for name in ("obs_index", "next_index"):
         check_range(f"arrays.{name}", arrays[name], 0, len(frames) - 1)
     check_range("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
-    check_range("arrays.rewards", arrays["rewards"], -MAX_MAGNITUDE, MAX_MAGNITUDE)
+    most = MAX_MAGNITUDE
+    if "span" in arrays:
+        check_range("arrays.span", arrays["span"], 1, MAX_N_STEP)
+        most *= int(arrays["span"].max())  # rewards that a transition sums
+    check_range("arrays.rewards", arrays["rewards"], -most, most)
     if frames.dtype == np.bool_:
         check_range("arrays.frames", frames.view(np.uint8), 0, 1)
     elif frames.dtype == np.float32:
         check_range("arrays.frames", frames, -MAX_MAGNITUDE, MAX_MAGNITUDE)
     check_range("arrays.terminated", arrays["terminated"].view(np.uint8), 0, 1)
     check_range("arrays.param_version", arrays["param_version"], 0, MAX_UPDATES)
-    if "span" in arrays:
-        check_range("arrays.span", arrays["span"], 1, MAX_N_STEP)
 
 
 def check_range(field: str, array: Array, low: float, high: float) -> None:
