@@ -5,6 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Bytes of all files in git.
+LARGEST := 25000000
 STAMP = $(shell date +%Y%m%d-%H%M%S)
 # The tests start hundreds of processes: they share what Python has compiled, also where it is told not to keep it.
 unexport PYTHONDONTWRITEBYTECODE
@@ -22,10 +24,13 @@ check: $(READY)
 	@$(BIN)/ruff format --check . > $(VENV)/format.log 2>&1 || { cat $(VENV)/format.log; exit 1; }
 	@$(BIN)/mypy --no-error-summary
 	@$(BIN)/lint-imports --no-logo > $(VENV)/lint-imports.log || { cat $(VENV)/lint-imports.log; exit 1; }
+	@test ! -e .git || test $$(git ls-files -z | xargs -0 cat 2>/dev/null | wc -c) -lt $(LARGEST) || \
+		{ echo "make check: the files in git hold more than $(LARGEST) bytes; what make results makes need not be there"; exit 1; }
 
 # Every figure and table of results/, from the packed studies there.
 results: $(READY)
 	@for study in results/cartpole/*.parquet results/minatar/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
+	@$(BIN)/python -m experiments.registered figure results/minatar/study.parquet
 	@$(BIN)/coop-report results/pong.parquet --curves results/pong
 
 # Checks that take longer; docs/robustness.md says what each shows.

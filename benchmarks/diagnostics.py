@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from common.process.threads import use_threads
+from common.returns import METRICS_EVERY
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
-from learner.trainer import METRICS_EVERY
 
 START = 300  # steps before the first update
 BATCHES = 20  # drawn before the measurements

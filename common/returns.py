@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 RETURN_WINDOW = 100  # episodes
+METRICS_EVERY = 200  # updates from one row of metrics to the next
 
 
 def running_mean(values: ArrayLike, window: int = RETURN_WINDOW) -> NDArray[np.float64]:

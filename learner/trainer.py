@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.messaging.messages.sample import Drawn, EpisodeRecord
+from common.returns import METRICS_EVERY
 from common.types import Batch
 from learner.protocol import Agent
 from learner.telemetry import Telemetry
 
-METRICS_EVERY = 200  # updates
 NOTHING_DRAWN = Drawn(0, 0, 0, 0, 0, 0, ())
 
 

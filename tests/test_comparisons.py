@@ -13,7 +13,8 @@ from common.settings.tables import resolve
 from experiments.report.answer import answer
 from experiments.report.comparisons import common_breaking_table, interaction_table, learning_table, sizes_table
 from experiments.report.figures import figures
-from experiments.report.learning import area, course, end_of_running_mean, over_seeds, reward_threshold
+from experiments.report.intervals import over_seeds
+from experiments.report.learning import area, course, end_of_running_mean, reward_threshold
 from experiments.report.page import page
 from experiments.report.results import runs_table, settings_table, tables
 from experiments.report.study import Run, load_study
@@ -57,8 +58,10 @@ def test_area_and_running_mean() -> None:
 def test_over_seeds() -> None:
     assert over_seeds([3.0]) == pytest.approx((3.0, math.nan, math.nan), nan_ok=True)
     assert over_seeds([2.0, 2.0, 2.0]) == (2.0, 2.0, 2.0)
-    told = over_seeds([0.0, 1.0])
-    assert (told.value, told.low, told.high) == (0.5, 0.0, 1.0)
+    # 4.3027 and 2.2622: the quantiles of t in printed tables.
+    assert over_seeds([1.0, 2.0, 3.0]) == pytest.approx((2.0, 2 - 4.3027 / 3**0.5, 2 + 4.3027 / 3**0.5), abs=1e-4)
+    ten = [float(n) for n in range(10)]
+    assert over_seeds(ten) == pytest.approx((4.5, 4.5 - 2.2622 * 0.957427, 4.5 + 2.2622 * 0.957427), abs=1e-4)
 
 
 def test_thresholds_are_gymnasiums() -> None:

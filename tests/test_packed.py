@@ -161,3 +161,31 @@ def test_what_cannot_be_packed_or_unpacked(folder: Path, tmp_path: Path) -> None
     pack(folder, tmp_path / "a.parquet")
     with pytest.raises(UsageError, match=r"--unpack .*: File exists"):
         unpack(tmp_path / "a.parquet", folder)
+
+
+def test_a_thinned_study_keeps_its_episodes_and_warnings(folder: Path, tmp_path: Path) -> None:
+    left_out = {"time": 1e9, "loss": 0.5, "reuse_histogram": [1, 2]}
+    rows = [
+        {**left_out, **ROW, "env_step": 200 * n, "q_abs_mean": 9.0, "q_bound": 8.0 if n == 4 else 10.0}
+        for n in range(1, 101)
+    ]
+    (folder / "dqn-seed=0" / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    pack(folder, tmp_path / "thin.parquet", rows=10)
+    unpack(tmp_path / "thin.parquet", tmp_path / "thin")
+    for file in ("config.toml", "summary.json", "episodes.csv"):
+        assert (tmp_path / "thin" / "dqn-seed=0" / file).read_bytes() == (folder / "dqn-seed=0" / file).read_bytes()
+    kept = [json.loads(line) for line in (tmp_path / "thin" / "dqn-seed=0" / "metrics.jsonl").read_text().splitlines()]
+    assert [row["env_step"] for row in kept] == [800, *range(2000, 20001, 2000)]
+    assert set(kept[0]) == {*ROW, "q_abs_mean", "q_bound"}
+    whole, thin = load_study(folder), load_study(tmp_path / "thin.parquet")
+    assert [run.above_bound for run in whole.runs] == [run.above_bound for run in thin.runs] == [1, 1, 0]
+    few = json.loads((tmp_path / "thin" / "dqn-seed=1" / "metrics.jsonl").read_text().splitlines()[0])
+    assert few == json.loads((folder / "dqn-seed=1" / "metrics.jsonl").read_text().splitlines()[0])
+
+
+@pytest.mark.parametrize("flags", [["--rows", "5"], ["--rows", "0", "--pack", "x.parquet"]])
+def test_rows_that_are_refused(flags: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["coop-report", str(folder), *flags])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2

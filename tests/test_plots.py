@@ -19,7 +19,7 @@ SIZES = np.array([0.0, 50, 100, 200, 300, 500, 1000, 1500, 2000, 3000, 3500, 400
 
 def figure_of(labels: list[str], panels: int, sizes: np.ndarray = SIZES) -> Figure:
     lines = [Line(label, sizes, Interval(sizes, sizes - 1, sizes + 1), dashed=label == "stream-q") for label in labels]
-    shown = [Panel("", "capacity", "return", lines, marks=True, wide_x=True) for _ in range(panels)]
+    shown = [Panel("", "capacity", "return", lines, marks=True, sizes=True) for _ in range(panels)]
     return Figure("figure", "A figure", "", "", shown)
 
 

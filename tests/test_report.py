@@ -3,11 +3,11 @@
 import base64
 import csv
 import json
+import math
 import re
 import shutil
 import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,16 @@ from common.returns import running_mean
 from experiments.lockstep import Lockstep
 from experiments.report import cli
 from experiments.report.figures import NETWORKS, figures
-from experiments.report.intervals import REPS, Interval, improvement, iqm_by_task, iqm_overall, profiles
+from experiments.report.intervals import (
+    drawn_seeds,
+    improvement,
+    iqm,
+    iqm_by_task,
+    iqm_overall,
+    over_seeds,
+    profiles,
+    tail,
+)
 from experiments.report.measures import breaking_point
 from experiments.report.paper import table_1
 from experiments.report.results import breaking_table
@@ -151,7 +160,7 @@ def test_curves_recomputed(study: Path, report: Path) -> None:
 def test_curves_and_points_of_the_diagnostics(study: Path, report: Path) -> None:
     runs = [study / f"coop-capacity=300-seed={seed}" for seed in (0, 1)]
     lines = [[json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()] for run in runs]
-    points = [row for row in rows(report / "networks.csv") if "churn" not in row["panel"] and row["line"] == "coop"]
+    points = [row for row in rows(report / "networks.csv") if row["line"] == "coop"]
     ends = [float(row["y"]) for row in points if row["panel"] == "effective rank of the last hidden layer"]
     assert ends[-1] == pytest.approx(statistics.fmean(each[-1]["effective_rank"] for each in lines))
     assert {row["panel"] for row in rows(report / "networks.csv")} == set(NETWORKS.values())
@@ -258,36 +267,59 @@ def rliable() -> tuple[Any, Any]:
     return library, metrics
 
 
-def of_rliable(function: Callable[..., np.ndarray], *scores: np.ndarray) -> Interval:
-    """What rliable gives, which draws from numpy's global generator."""
-    np.random.seed(0)
-    drawn = scores if len(scores) > 1 else scores[0]
-    library, _ = rliable()
-    values, bounds = library.get_interval_estimates({"x": drawn}, function, reps=REPS)
-    return Interval(values["x"], *bounds["x"])
-
-
-def assert_equal(ours: Interval, theirs: Interval) -> None:
-    for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12)
-
-
-def test_statistics_and_intervals_are_rliables() -> None:
+def test_statistics_are_rliables() -> None:
     library, metrics = rliable()
     generator = np.random.default_rng(3)
     x, y = generator.integers(0, 9, (7, 3)).astype(np.float64), generator.integers(0, 9, (5, 3)).astype(np.float64)
-    assert_equal(iqm_overall(x), of_rliable(lambda sample: np.array([metrics.aggregate_iqm(sample)]), x))
-    assert_equal(
-        iqm_by_task(x), of_rliable(lambda sample: np.array([metrics.aggregate_iqm(task) for task in sample.T]), x)
-    )
-    assert_equal(
-        improvement(x, y), of_rliable(lambda *both: np.array([metrics.probability_of_improvement(*both)]), x, y)
-    )
+    assert iqm_overall(x).value == pytest.approx(metrics.aggregate_iqm(x))
+    assert iqm_by_task(x).value == pytest.approx([metrics.aggregate_iqm(task) for task in x.T])
+    assert improvement(x, y).value == pytest.approx(metrics.probability_of_improvement(x, y))
     levels = np.arange(-1.0, 10.0)
-    np.random.seed(0)
-    shares, bounds = library.create_performance_profile({"x": x, "y": y}, levels, reps=REPS)
+    shares, _ = library.create_performance_profile({"x": x, "y": y}, levels, reps=10)
     for name, ours in profiles({"x": x, "y": y}, levels).items():
-        assert_equal(ours, Interval(shares[name], *bounds[name]))
+        np.testing.assert_allclose(ours.value, shares[name], rtol=1e-12)
+
+
+def test_bootstrap_intervals_are_as_wide_as_those_of_t() -> None:
+    """Of means: their bootstrap distribution is nearly normal from ten seeds on, and narrower by sqrt((n - 1) / n)."""
+    from scipy import stats  # noqa: PLC0415
+
+    for seeds in (10, 20, 100):
+        sample = np.random.default_rng(seeds).normal(size=seeds)
+        drawn = sample[drawn_seeds(seeds, np.random.default_rng(1))].mean(axis=1)
+        low, high = np.quantile(drawn, [tail(seeds), 1 - tail(seeds)])
+        wide = 2 * stats.t.ppf(0.975, seeds - 1) * stats.sem(sample)
+        assert high - low == pytest.approx(wide, rel=0.06)
+        if seeds < 100:
+            assert np.diff(np.percentile(drawn, [2.5, 97.5])) < 0.96 * wide
+
+
+@pytest.mark.parametrize("seeds", [5, 10])
+@pytest.mark.parametrize("cap", [math.inf, 1.0])
+def test_intervals_hold_what_they_estimate(seeds: int, cap: float) -> None:
+    """In 95 of 100 samples about: of a normal distribution, and of one with a cap that a sixth of it reaches."""
+    population = np.random.default_rng(0).normal(size=200_000).clip(max=cap)
+    samples = np.random.default_rng(1).choice(population, (400, seeds))
+    means = [over_seeds(sample) for sample in samples]
+    found = iqm_by_task(samples.T)
+    held = np.mean([each.low <= population.mean() <= each.high for each in means])
+    middle = iqm(population[:, None])
+    assert 0.92 <= held <= 0.98
+    assert 0.92 <= ((found.low <= middle) & (middle <= found.high)).mean() <= 0.99
+    assert (found.high <= cap).all()
+    drawn = samples[:, drawn_seeds(seeds, np.random.default_rng(2))[:500]].mean(axis=2)
+    low, high = np.percentile(drawn, [2.5, 97.5], axis=1)
+    assert ((low <= population.mean()) & (population.mean() <= high)).mean() < 0.92  # what plain percentiles hold
+
+
+def test_settings_of_one_seed_are_no_independent_runs() -> None:
+    """Twelve settings that all return what the seed alone decides tell no more than one of them does."""
+    one, other = (np.random.default_rng(seed).normal(size=(5, 1)) for seed in (1, 2))
+    alone, twelve = (iqm_overall(np.tile(one, (1, settings))) for settings in (1, 12))
+    assert twelve.high - twelve.low >= 0.9 * (alone.high - alone.low)
+    for better in (improvement, lambda x, y: profiles({"x": x - y}, np.zeros(1))["x"]):
+        once, often = (better(np.tile(one, (1, n)), np.tile(other, (1, n))) for n in (1, 12))
+        np.testing.assert_allclose(often, once)
 
 
 def test_the_running_mean_takes_a_hundred_episodes() -> None:

@@ -10,10 +10,12 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from experiments import registered
+from benchmarks import feedback
+from experiments import controls, registered
 from experiments.film import Film
 from experiments.report import comparisons, results
 from experiments.report.baseline import baseline_table, find_baseline
+from experiments.report.measures import shorter_runs
 from experiments.report.sources import open_source
 from experiments.report.study import Study, load_study
 from experiments.saved import SavedRun
@@ -53,6 +55,8 @@ def study_of(name: str) -> Study:
 
 @cache
 def table_of(study: str, name: str) -> pd.DataFrame:
+    if name in controls.TABLES:
+        return controls.TABLES[name](study_of(study))
     if name in registered.RULES:
         return registered.table_of(name, study_of(study))
     kind, _, baseline = name.partition(" ")
@@ -77,6 +81,8 @@ def texts(claim: dict[str, Any]) -> Iterator[str]:
     rows = table_of(claim["study"], claim["table"])
     if "where" in claim:
         rows = rows.query(claim["where"])
+    for column in claim.get("percent", []):
+        rows = rows.assign(**{column: 100 * rows[column]})
     by, key = claim.get("by", []), claim.get("key", [])
     by, key = ([each] if isinstance(each, str) else each for each in (by, key))
     if claim.get("average"):
@@ -86,7 +92,7 @@ def texts(claim: dict[str, Any]) -> Iterator[str]:
     for at, group in rows.groupby(by, sort=False) if by else [((), rows)]:
         names = {"at": at[0] if len(at) == 1 else at}
         for row in group.to_dict("records"):
-            name = " ".join(str(row[each]) for each in key) or "row"
+            name = re.sub("[.:]", "_", " ".join(str(row[each]) for each in key)) or "row"
             assert name not in names, f"two rows are called {name}"
             names[f"n{name}" if name[:1].isdigit() else name] = row
         templates = [claim["text"]] if isinstance(claim["text"], str) else claim["text"]
@@ -222,3 +228,59 @@ def test_studies_that_share_runs() -> None:
         assert sorted(chosen) == [0, 1, 2, 3, 4]
         returns.append(chosen)
     assert returns[0] == returns[1] == returns[2]
+
+
+INTERVAL = re.compile(r"\[[+-]?\d[\d.,]*, [+-]?\d[\d.,]*\]")
+
+
+def test_the_page_counts_its_intervals() -> None:
+    here, cartpole, minatar = (len(INTERVAL.findall(PAGES[f"{at}README.md"])) for at in ("", "cartpole/", "minatar/"))
+    assert (
+        f"This page has {here} intervals, that of CartPole {cartpole}, that of MinAtar {minatar};" in PAGES["README.md"]
+    )
+
+
+def test_what_the_pages_say_of_short_runs() -> None:
+    short = {name: shorter_runs(study_of(name)) for name in ("authors", "authors-buffers")}
+    runs = {name: len(study_of(name).runs) for name in short}
+    assert f"in {short['authors']} of {runs['authors']} runs all of them" in PAGES["cartpole/README.md"]
+    counted = (short["authors-buffers"], runs["authors-buffers"])
+    assert "{} of the {} runs have fewer than 100".format(*counted) in PAGES["cartpole/README.md"]
+    assert "(of {} of the {} runs: of all episodes".format(*counted) in PAGES["README.md"]
+
+
+def test_what_the_pages_say_of_s() -> None:
+    """How much EDL was on: s when a run begins and ends, its feedback, and whether targets are double."""
+    ends = {}
+    for name in ("minatar/study", "preset-buffers", "authors-buffers"):
+        run = next(run for run in study_of(name).runs if run.config.method == "coop")
+        edl = run.config.edl
+        ends[name] = (
+            edl.rate,
+            edl.noise,
+            edl.feedback,
+            edl.rate * edl.decay ** (run.config.total_steps / edl.decay_every),
+        )
+        assert run.config.learner.double == (name != "minatar/study")
+    assert ends["minatar/study"] == (0.01, "normal", "transform", pytest.approx(0.002, abs=1e-4))
+    assert ends["preset-buffers"] == (0.1, "normal", "transform", pytest.approx(0.1 * 0.9**50))
+    assert ends["authors-buffers"] == (0.1, "constant", "weight-gradient", pytest.approx(0.0904, abs=1e-4))
+    assert "s is 0.01 N(0, 1) and falls by 0.9 every 10,000 updates, to 0.002 at the end" in PAGES["minatar/README.md"]
+    for page in ("README.md", "../README.md"):
+        assert "s = 0.01 N(0, 1)" in PAGES[page]
+        assert "falling to 0.002" in PAGES[page]
+
+
+def test_what_feedback_does_to_a_step() -> None:
+    """The table of docs/algorithm.md, and what the pages quote of it."""
+    rows = feedback.measure(1000)
+    page = (RESULTS / "../docs/algorithm.md").read_text()
+    columns = ("gradient", "cosine", "step", "step_cosine")
+    for (case, when), part in rows.groupby(["case", "when"], sort=False):
+        told = " | ".join(", ".join(f"{value:.2f}" for value in part[what]) for what in columns)
+        assert f"| {case} | {when} | {told} |" in page
+    later = rows[rows["when"] == "later"].set_index("case")
+    plain = [f"{value:.2f}" for value in later.loc["transform, constant s", "gradient"]]
+    turned = [f"{value:.2f}" for value in later.loc["weight-gradient, constant s", "step_cosine"]]
+    assert f"{plain[0]}, {plain[1]}, {plain[2]} and {plain[3]} times as long by layer" in PAGES["README.md"]
+    assert f"cosine {turned[1]} and {turned[2]}" in PAGES["README.md"]

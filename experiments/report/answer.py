@@ -15,7 +15,7 @@ BEST = "the interquartile mean of the return of the last 100 episodes"
 
 
 def answer(study: Study, tables: Sequence[ResultTable]) -> list[str]:
-    """Sentences; intervals in brackets hold 95 % of the bootstrap."""
+    """Sentences, with 95 % intervals in brackets."""
     by_name = {table.name: table for table in tables}
     told = [_subject(study)]
     if "baseline" in by_name:
@@ -131,7 +131,7 @@ def _doubts(study: Study) -> list[str]:
     fewest = min(len(study.of(method, at)) for method in study.methods for at in study.settings if study.of(method, at))
     if fewest < FEW:
         runs = "a single run" if fewest == 1 else f"{fewest} runs"
-        told.append(f"Some settings have {runs}: intervals over so few are narrow by construction and prove nothing.")
+        told.append(f"Some settings have {runs}: intervals of so few cover less than 95 %, and prove nothing.")
     if study.warnings:
         runs = counted(len(study.warnings), "run")
         told.append(f"In {runs} mean |Q| exceeded its bound at times: do not trust such a run.")

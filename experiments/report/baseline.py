@@ -10,7 +10,8 @@ import pandas as pd
 from common.errors import UsageError
 from common.suggestions import closest, refusal
 from experiments.report.comparisons import MEASURES
-from experiments.report.learning import Estimate, by_seed, differences, over_seeds
+from experiments.report.intervals import Estimate, over_seeds
+from experiments.report.learning import by_seed, differences
 from experiments.report.plots import Figure, Panel
 from experiments.report.slices import counts, label
 from experiments.report.study import Study
@@ -105,7 +106,7 @@ def baseline_table(study: Study, baseline: Baseline) -> ResultTable:
     ]
     columns = ["measure", "method", "setting", "mean", "baseline", "difference", "low", "high", "seeds"]
     note = (
-        f"Each method's mean minus that of {baseline.name}, over the seeds that both have, with 95 % bootstrap "
+        f"Each method's mean minus that of {baseline.name}, over the seeds that both have, with 95 % t "
         "intervals over seeds (none for one seed). area: mean over steps of the running mean of 100 episodes."
     )
     beside = {"difference": ["low", "high"]}
@@ -130,7 +131,7 @@ def baseline_figure(study: Study, baseline: Baseline) -> Figure:
                 points.setdefault(each.method, {})[tick] = each.estimate
         lines = tick_lines(points, {} if alone else dodge(methods))
         panels.append(Panel("", "", f"difference of {measure}", lines, True, ticks=ticks, reference=0.0))
-    text = f"Mean minus that of {baseline.name} over the seeds that both have; 95 % bootstrap interval over seeds."
+    text = f"Mean minus that of {baseline.name} over the seeds that both have; 95 % t interval over seeds."
     return Figure("baseline", f"Differences from {baseline.name}", text, counts(study.runs), panels)
 
 

@@ -27,6 +27,8 @@ class ReportOptions:
     """Report the differences from this method, or from the method and setting of this run, over the same seeds."""
     pack: Path | None = None
     """Instead of a report: write the folder's runs into this Parquet file."""
+    rows: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """With --pack: keep about this many rows of each run's metrics, without times and histograms."""
     curves: Path | None = None
     """Instead of a report: draw the learning curve of every run, finished or not, into a subfolder of this folder."""
     unpack: Path | None = None
@@ -43,13 +45,16 @@ def _run() -> None:
     runs = options.runs
     if not runs.exists():
         raise UsageError(f"{runs}: no such folder or file")
+    if options.rows is not None and (options.pack is None or options.rows < 1):
+        problem = "at least 1" if options.pack else "only with --pack"
+        raise UsageError(f"--rows {options.rows}: {problem}")
     if find_spec("pyarrow") is None:
         raise RunError("pyarrow is not installed; it comes with the extra report: pip install 'coop-rl[report]'")
     # Imported only after the flags have been checked: the statistics' libraries take seconds.
     if options.pack is not None:
         from experiments.report.packed import pack  # noqa: PLC0415
 
-        print(pack(runs, options.pack))
+        print(pack(runs, options.pack, options.rows))
     elif options.unpack is not None:
         from experiments.report.packed import unpack  # noqa: PLC0415
 

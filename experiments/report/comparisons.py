@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from common.settings.config import value_of
+from experiments.report.intervals import over_seeds
 from experiments.report.learning import (
     area,
     by_seed,
     course,
     differences,
     end_of_running_mean,
-    over_seeds,
     reward_threshold,
     squared_gap_of_means,
 )
@@ -84,7 +84,7 @@ def paired_table(study: Study) -> ResultTable:
                 where = "all" if at is None else label(study, study.settings[at])
                 rows.append([name, where, x, y, *estimate, len(apart)])
     columns = ["measure", "setting", "x", "y", "x - y", "low", "high", "seeds"]
-    note = f"Mean over seeds that both methods have, 95 % bootstrap interval over seeds. {LATER}"
+    note = f"Mean over seeds that both methods have, 95 % t interval over seeds. {LATER}"
     return ResultTable("paired", "Differences over the same seeds", columns, rows, note, {"x - y": BOUNDS})
 
 
@@ -134,7 +134,7 @@ def common_breaking_table(study: Study) -> ResultTable:
     names = [axis for axis in study.axes if axis != CAPACITY]
     note = (
         "The smallest capacity at which the mean over runs is at least 95 % of the best method's at the largest "
-        f"capacity; 95 % bootstrap interval over runs. Empty: at none. {LATER}"
+        f"capacity; 95 % bootstrap interval over seeds. Empty: at none. {LATER}"
     )
     columns = [*names, "method", "best return", "breaking point", "low", "high"]
     beside = {"breaking point": BOUNDS}
@@ -205,5 +205,5 @@ def _sizes_note(study: Study) -> str:
     sizes = sorted({int(value_of(run.config, CAPACITY)) for run in study.runs if not run.config.streaming})
     half = math.ceil(len(sizes) / 2)
     small, large = (", ".join(map(str, part)) for part in (sizes[:half], sizes[half:]))
-    seeds = "Means over the seeds that have all of them, 95 % bootstrap intervals over seeds."
+    seeds = "Means over the seeds that have all of them, 95 % t intervals over seeds."
     return f"small: capacities {small}; large: {large}. {seeds} {LATER}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from common.returns import running_mean
 from common.settings.methods import METHODS
-from experiments.report.intervals import Interval, iqm_by_task
+from experiments.report.intervals import Interval, iqm_by_task, iqm_of
 from experiments.report.measures import (
     by_episodes,
     by_steps,
@@ -22,17 +22,17 @@ from experiments.report.measures import (
 )
 from experiments.report.plots import Figure, Line, Panel
 from experiments.report.slices import CAPACITY, along, counts, label, other_settings
-from experiments.report.study import Floats, Run, Setting, Study
+from experiments.report.study import CHURN, Floats, Run, Setting, Study
 from experiments.report.summaries import MOST_TICKS, aggregates, final_returns
 
 RATE = "edl.rate"
 MOST_PANELS = 9
 RETURN = "mean return of 100 episodes"
-BANDS = " Interquartile mean over runs, band: 95 % bootstrap interval (none for a single run)."
+BANDS = " Interquartile mean over runs, band: 95 % bootstrap interval over seeds (none for a single run)."
 NETWORKS = {
     "archive_td_error": "|TD error| on old transitions",
     "archive_drift": "change of Q on old states",
-    "policy_churn": "share of greedy actions changed",
+    CHURN: "greedy actions changed in 100 updates of a network, share",
     "dormant_share": "share of dormant units",
     "effective_rank": "effective rank of the last hidden layer",
     "q_share": "mean |Q| / its bound",
@@ -40,8 +40,8 @@ NETWORKS = {
 }
 SHARES = frozenset({"evicted_unsampled", "dormant_share"})  # drawn from 0 to 1; others are small
 MEANING = (
-    "On the first transitions drawn, which stay as they are; changes are those since the last row of metrics, 200 "
-    "updates before. The share of terminal transitions is that of the buffer."
+    "On the first transitions drawn, which stay as they are; Q has changed since the last row of metrics, 200 updates "
+    "before, of which each of two networks has half. The share of terminal transitions is that of the buffer."
 )
 Curve = Callable[[Sequence[Run]], tuple[Floats, Floats]]
 
@@ -126,22 +126,23 @@ def exploration(study: Study) -> Figure:
 
 
 def buffers(study: Study) -> Figure:
-    """Mean return against buffer size, with error bars over runs."""
+    """Return against buffer size, as the tables of settings have it."""
     panels = []
     for others in other_settings(study, CAPACITY):
         lines = []
         for method in study.methods:
             capacities, scores = along(study, CAPACITY, method, others)
             if capacities:
-                mean = np.array([each.mean() for each in scores])
-                sd = np.array([each.std(ddof=1) if len(each) > 1 else 0.0 for each in scores])
-                at, interval = np.array(capacities, np.float64), Interval(mean, mean - sd, mean + sd)
-                lines.append(Line(method, at, interval, dashed=method not in study.buffered))
-        panels.append(Panel(_without(study, CAPACITY, others), "capacity", "return", lines, marks=True, wide_x=True))
-    text = "Mean over runs of the return of the last 100 episodes; error bars: one standard deviation over runs."
+                at, ends = np.array(capacities, np.float64), np.array([iqm_of(each) for each in scores])
+                lines.append(Line(method, at, Interval(*ends.T), dashed=method not in study.buffered))
+        panels.append(Panel(_without(study, CAPACITY, others), "capacity", "return", lines, marks=True, sizes=True))
+    text = (
+        "Return of the last 100 episodes: interquartile mean over seeds and its 95 % bootstrap interval, as in the "
+        "table of settings (none for a single run). Sizes at equal distances, methods beside each other at each."
+    )
     if len(study.buffered) < len(study.methods):
         text += " Dashed: without a replay buffer, so that its runs are those of size 0 everywhere."
-    title, used = "Mean return against buffer size", counts(study.runs)
+    title, used = "Return against buffer size", counts(study.runs)
     return Figure("buffers", title, text, used, panels, same_y=study.one_scale)
 
 
@@ -200,7 +201,7 @@ def _against_capacity(study: Study, names: Mapping[str, str], settings: Sequence
                     at = np.array([c for c, _ in points], np.float64)
                     lines.append(Line(method, at, Interval(*map(np.array, ends))))
             title, share = _without(study, CAPACITY, others), name in SHARES
-            panels.append(Panel(title, "capacity", words, lines, marks=True, wide_x=True, share=share))
+            panels.append(Panel(title, "capacity", words, lines, marks=True, sizes=True, share=share))
     return panels
 
 

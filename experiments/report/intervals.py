@@ -1,27 +1,66 @@
-"""Statistics over runs with 95 % bootstrap intervals: those of rliable (Agarwal et al. 2021), all resamples at once.
+"""Statistics over runs with 95 % intervals: those of rliable (Agarwal et al. 2021), for as few seeds as studies have.
 
-The resamples are stratified: the runs of each task are drawn independently. The same runs give the same intervals.
+A mean over seeds has a t interval. Of other statistics whole seeds are resampled, since the runs of one seed at several
+settings are no independent ones, and the percentiles are widened for the number of seeds: plain ones cover 83 % with
+five seeds and 90 % with ten. Such an interval never leaves the range of the data, as that of t does at a game's cap.
+The same runs give the same intervals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
 
 from experiments.report.study import Floats
 
-REPS = 1000  # bootstrap samples
-BOUNDS = (2.5, 97.5)  # percentiles
+REPS = 2000  # bootstrap samples
+OUTSIDE = 0.025  # share of a distribution beyond each end of an interval
 
 
 class Interval(NamedTuple):
-    """Estimates with their 95 % bootstrap intervals; float64 arrays of one shape."""
+    """Estimates with their 95 % intervals; float64 arrays of one shape."""
 
     value: Floats
     low: Floats
     high: Floats
+
+
+class Estimate(NamedTuple):
+    """A statistic over seeds with its 95 % interval; nan if there are too few seeds."""
+
+    value: float
+    low: float
+    high: float
+
+
+def over_seeds(values: Sequence[float] | Floats) -> Estimate:
+    """The mean over seeds with its t interval."""
+    sample = np.asarray(values, np.float64)
+    if len(sample) < 2:
+        return Estimate(float(sample.mean()) if len(sample) else math.nan, math.nan, math.nan)
+    mean = float(sample.mean())
+    wide = float(_student(len(sample)) * sample.std(ddof=1)) / math.sqrt(len(sample))
+    return Estimate(mean, mean - wide, mean + wide)
+
+
+def tail(seeds: int) -> float:
+    """The share of bootstrap samples beyond each end of an interval: less than OUTSIDE for few seeds.
+
+    For a mean the percentiles are then as wide as the t interval (Hesterberg 2015, section 5.3).
+    """
+    if seeds < 2:
+        return OUTSIDE
+    return float(ndtr(-math.sqrt(seeds / (seeds - 1)) * _student(seeds)))
+
+
+def drawn_seeds(seeds: int, generator: np.random.Generator) -> NDArray[np.int64]:
+    """Bootstrap samples of seeds, int64 [REPS, seeds]."""
+    return generator.integers(0, seeds, (REPS, seeds))
 
 
 def iqm(scores: Floats) -> Floats:
@@ -32,48 +71,63 @@ def iqm(scores: Floats) -> Floats:
 
 def iqm_by_task(scores: Floats) -> Interval:
     """Interquartile mean over runs of each task, float64 [tasks]; scores float64 [runs, tasks]."""
-    return _interval(iqm(scores), iqm(_resampled(scores, _generator())))
+    return _interval(iqm(scores), iqm(_resampled(scores, _generator())), len(scores))
+
+
+def iqm_of(scores: Floats) -> Estimate:
+    """Interquartile mean over runs, float64 [runs], without an interval for one run."""
+    if len(scores) == 1:
+        return Estimate(float(scores[0]), math.nan, math.nan)
+    found = iqm_by_task(scores[:, None])
+    return Estimate(float(found.value[0]), float(found.low[0]), float(found.high[0]))
 
 
 def iqm_overall(scores: Floats) -> Interval:
-    """Interquartile mean over all runs and tasks, float64 [1]; scores float64 [runs, tasks]."""
-    return _interval(iqm(scores.reshape(-1, 1)), iqm(_resampled(scores, _generator()).reshape(REPS, -1, 1)))
+    """Interquartile mean over all runs and tasks, float64 [1]; scores float64 [seeds, tasks]."""
+    drawn = iqm(_resampled(scores, _generator()).reshape(REPS, -1, 1))
+    return _interval(iqm(scores.reshape(-1, 1)), drawn, len(scores))
 
 
 def improvement(x: Floats, y: Floats) -> Interval:
-    """Probability that a run of x is better than one of y, mean over tasks, float64 [1]; scores [runs, tasks]."""
-    generator, columns = _generator(), np.arange(x.shape[1])
-    drawn = [
-        _share_better(*(scores[generator.randint(0, len(scores), scores.shape), columns] for scores in (x, y)))
-        for _ in range(REPS)
-    ]
-    return _interval(np.array([_share_better(x, y)]), np.array(drawn)[:, None])
+    """Probability that a run of x is better than one of y, mean over tasks, float64 [1]; scores [seeds, tasks]."""
+    generator = _generator()
+    samples = zip(*(drawn_seeds(len(scores), generator) for scores in (x, y)), strict=True)
+    better = _better(x, y)  # of all pairs of seeds, once; a sample is a choice of them
+    drawn = [better[np.ix_(of_x, of_y)].mean() for of_x, of_y in samples]
+    return _interval(np.array([better.mean()]), np.array(drawn)[:, None], min(len(x), len(y)))
 
 
 def profiles(scores: Mapping[str, Floats], levels: Floats) -> dict[str, Interval]:
-    """Performance profiles: the share of runs above each level, float64 [levels]; scores [runs, tasks] by method."""
+    """Performance profiles: the share of runs above each level, float64 [levels]; scores [seeds, tasks] by method."""
     generator = _generator()
     return {
         name: _interval(
-            _share_above(each, levels), np.stack([_share_above(s, levels) for s in _resampled(each, generator)])
+            _share_above(each, levels),
+            np.stack([_share_above(s, levels) for s in _resampled(each, generator)]),
+            len(each),
         )
         for name, each in scores.items()
     }
 
 
-def _generator() -> np.random.RandomState:
-    return np.random.RandomState(0)  # the stream that rliable draws from
+def _student(seeds: int) -> float:
+    """The quantile of t that leaves OUTSIDE beyond it."""
+    return float(stdtrit(seeds - 1, 1 - OUTSIDE))
 
 
-def _resampled(scores: Floats, generator: np.random.RandomState) -> Floats:
-    """Bootstrap samples, float64 [REPS, runs, tasks], of scores [runs, tasks]."""
-    runs = generator.randint(0, len(scores), (REPS, *scores.shape))
-    return scores[runs, np.arange(scores.shape[1])]
+def _generator() -> np.random.Generator:
+    return np.random.default_rng(0)
 
 
-def _share_better(x: Floats, y: Floats) -> float:
+def _resampled(scores: Floats, generator: np.random.Generator) -> Floats:
+    """Bootstrap samples of whole seeds, float64 [REPS, seeds, tasks], of scores [seeds, tasks]."""
+    return scores[drawn_seeds(len(scores), generator)]
+
+
+def _better(x: Floats, y: Floats) -> Floats:
+    """The share of tasks in which each seed of x is better than each of y, float64 [seeds of x, seeds of y]."""
     difference = x[:, None] - y[None, :]
-    return float(((difference > 0) + 0.5 * (difference == 0)).mean())
+    return np.asarray(((difference > 0) + 0.5 * (difference == 0)).mean(axis=2))
 
 
 def _share_above(scores: Floats, levels: Floats) -> Floats:
@@ -81,7 +135,7 @@ def _share_above(scores: Floats, levels: Floats) -> Floats:
     return above / scores.size
 
 
-def _interval(value: Floats, drawn: Floats) -> Interval:
+def _interval(value: Floats, drawn: Floats, seeds: int) -> Interval:
     """value: float64 [values]. drawn: that of each bootstrap sample, float64 [REPS, values]."""
-    low, high = np.percentile(drawn, BOUNDS, axis=0)
+    low, high = np.quantile(drawn, [tail(seeds), 1 - tail(seeds)], axis=0)
     return Interval(value, low, high)

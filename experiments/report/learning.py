@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import gymnasium
@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 
 from common.returns import RETURN_WINDOW, running_mean
-from experiments.report.intervals import REPS
 from experiments.report.study import Floats, Run, Study
 
 SHORT = 20  # episodes in the running mean that decides whether a run is healthy or has collapsed
@@ -30,14 +29,6 @@ class Course(NamedTuple):
     share_above: float
     collapses: int
     healthy_steps: float
-
-
-class Estimate(NamedTuple):
-    """A mean over seeds with its 95 % bootstrap interval; nan if there are too few seeds."""
-
-    value: float
-    low: float
-    high: float
 
 
 def reward_threshold(environment: str) -> float | None:
@@ -88,16 +79,6 @@ def squared_gap_of_means(run: Run) -> float:
     """The squared difference of the two networks' mean Q-values, each over the last 100 episodes."""
     one, other = (float(values[-RETURN_WINDOW:].mean()) for values in (run.q1_means, run.q2_means))
     return (one - other) ** 2
-
-
-def over_seeds(values: Sequence[float] | Floats) -> Estimate:
-    """The mean over seeds, and its interval by resampling them."""
-    sample = np.asarray(values, np.float64)
-    if len(sample) < 2:
-        return Estimate(float(sample.mean()) if len(sample) else math.nan, math.nan, math.nan)
-    drawn = np.random.default_rng(0).integers(0, len(sample), (REPS, len(sample)))
-    low, high = np.quantile(sample[drawn].mean(axis=1), [0.025, 0.975])
-    return Estimate(float(sample.mean()), float(low), float(high))
 
 
 def by_seed(study: Study, measure: Callable[[Run], float]) -> pd.DataFrame:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.returns import RETURN_WINDOW
-from experiments.report.intervals import REPS
-from experiments.report.study import LATER, Q_SHARE, Floats, Run, Study
+from experiments.report.intervals import drawn_seeds, tail
+from experiments.report.study import CHURN, LATER, Q_SHARE, Floats, Run, Study
 
 ENOUGH = 0.95  # share of the return at the largest capacity that counts as unbroken learning
 POINTS = 120  # of a curve
@@ -20,7 +20,7 @@ DIAGNOSTICS = ("sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsam
 class Breaking(NamedTuple):
     """The breaking point: the smallest capacity with at least 95 % of the return at the largest.
 
-    low, high: 95 % bootstrap interval of `capacity` over runs; equal to it if there is only one run.
+    low, high: 95 % bootstrap interval of `capacity` over seeds; equal to it if there is only one run.
     gaps: a larger capacity is below 95 % again, so the returns are not monotonic.
     """
 
@@ -33,6 +33,11 @@ class Breaking(NamedTuple):
 def score(run: Run) -> float:
     """Mean return of the last 100 episodes, the paper's measure."""
     return float(run.returns[-RETURN_WINDOW:].mean())
+
+
+def shorter_runs(study: Study) -> int:
+    """The number of runs with fewer episodes than `score` takes: of these it is the mean return of the whole run."""
+    return sum(len(run.returns) < RETURN_WINDOW for run in study.runs)
 
 
 def spread(run: Run) -> float:
@@ -53,7 +58,7 @@ def diagnostic(run: Run, name: str) -> float:
 
 def diagnostics_of(study: Study) -> list[str]:
     """The diagnostics of a study: those of every version, and of the later ones those that a run has."""
-    later = (name for name in (*LATER, Q_SHARE) if any(len(rows_with(run, name)[1]) for run in study.runs))
+    later = (name for name in (*LATER, CHURN, Q_SHARE) if any(len(rows_with(run, name)[1]) for run in study.runs))
     return [*DIAGNOSTICS, *later]
 
 
@@ -118,28 +123,40 @@ def breaking_point(capacities: NDArray[np.int64], scores: Sequence[Floats]) -> B
     """
     enough = _is_enough(np.array([each.mean() for each in scores]))
     first = int(enough.argmax())
-    generator = np.random.default_rng(0)
-    samples = [each[generator.integers(0, len(each), (REPS, len(each)))].mean(axis=1) for each in scores]
-    drawn = capacities[_is_enough(np.stack(samples, axis=1)).argmax(axis=1)]
-    low, high = np.quantile(drawn, [0.025, 0.975], method="nearest")
+    drawn = capacities[_is_enough(_resampled_means(scores)).argmax(axis=1)]
+    low, high = _bounds(drawn, scores)
     return Breaking(int(capacities[first]), int(low), int(high), not enough[first:].all())
 
 
 def first_enough(
     capacities: NDArray[np.int64], scores: Sequence[Floats], best: float
 ) -> tuple[int | None, int | None, int | None]:
-    """The smallest capacity whose mean over runs is at least 95 % of `best`, and its 95 % bootstrap interval over runs.
+    """The smallest capacity whose mean over runs is at least 95 % of `best`, and its 95 % interval over seeds.
 
     The capacity is None if none is enough; a bound is None if that holds in the bootstrap.
     """
-    generator = np.random.default_rng(0)
-    samples = [each[generator.integers(0, len(each), (REPS, len(each)))].mean(axis=1) for each in scores]
-    means = np.vstack([[each.mean() for each in scores], np.stack(samples, axis=1)])
+    means = np.vstack([[each.mean() for each in scores], _resampled_means(scores)])
     enough = means >= best - (1 - ENOUGH) * abs(best)
     found = np.where(enough.any(axis=1), capacities[enough.argmax(axis=1)], np.inf)
-    bounds = (found[0], *np.quantile(found[1:], [0.025, 0.975], method="nearest"))
+    bounds = (found[0], *_bounds(found[1:], scores))
     first, low, high = (int(value) if np.isfinite(value) else None for value in bounds)
     return first, low, high
+
+
+def _resampled_means(scores: Sequence[Floats]) -> Floats:
+    """The mean at each capacity in each bootstrap sample, float64 [REPS, capacities], of whole seeds.
+
+    If some capacities have more runs than others, those of each are drawn by themselves.
+    """
+    generator = np.random.default_rng(0)
+    drawn = {len(each): drawn_seeds(len(each), generator) for each in scores}
+    return np.stack([each[drawn[len(each)]].mean(axis=1) for each in scores], axis=1)
+
+
+def _bounds(drawn: NDArray[Any], scores: Sequence[Floats]) -> tuple[Any, Any]:
+    outside = tail(min(map(len, scores)))
+    low, high = np.quantile(drawn, [outside, 1 - outside], method="nearest")
+    return low, high
 
 
 def _is_enough(means: Floats) -> NDArray[np.bool_]:

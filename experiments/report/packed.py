@@ -6,6 +6,8 @@ column of `episodes.csv` and `metrics.jsonl`, named like `episodes.csv/return`. 
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,8 @@ TYPE: Mapping[str, Callable[[Sequence[Sequence[Any]]], tuple[pa.DataType, Callab
 }
 JSON = {b"holds": b"json"}
 SMALLEST = 22  # zstd's level
+# No result: what the machine was doing, and long lists. A thinned file lacks them.
+LEFT_OUT = ("time", "updates_per_s", "env_steps_per_s", "loss", "sample_age_histogram", "reuse_histogram")
 
 
 class PackedStudy:
@@ -93,8 +97,11 @@ class PackedStudy:
         return self._table[column][self._rows[run]]
 
 
-def pack(folder: Path, path: Path) -> str:
+def pack(folder: Path, path: Path, rows: int | None = None) -> str:
     """Write the runs of a folder, and its sweep.toml, into one file; return a description of the result.
+
+    rows: of metrics.jsonl to keep of each run, as `thinned` chooses them; None keeps all. Everything else is kept as it
+    is.
 
     An empty file is restored as an empty file, and so is a run's missing table.
 
@@ -106,6 +113,9 @@ def pack(folder: Path, path: Path) -> str:
     if not runs:
         raise UsageError(f"{folder}: no folder with runs to pack")
     files = {run: {file: _file(folder / run / file) for file in FILES} for run in runs}
+    if rows is not None:
+        for run, texts in files.items():
+            texts[METRICS] = _thinned(folder / run / METRICS, texts[METRICS], rows)
     fields: list[tuple[pa.Field, pa.Array]] = [(pa.field("run", pa.string()), pa.array(runs, pa.string()))]
     for file in TEXTS:
         fields.append((pa.field(file, pa.string()), pa.array([files[run][file] for run in runs], pa.string())))
@@ -145,6 +155,25 @@ def unpack(path: Path, folder: Path) -> str:
     except OSError as error:
         raise UsageError(f"--unpack {folder}: {error.strerror}") from error
     return f"{folder}: {len(packed.names)} runs"
+
+
+def thinned(text: str, rows: int) -> str:
+    """Some lines of metrics.jsonl: at most `rows` at equal distances, the last one included, and those that warn.
+
+    These have a mean |Q| above its bound. The columns LEFT_OUT are left out.
+    """
+    lines = [json.loads(line) for line in text.splitlines()]
+    kept = set(range(len(lines) - 1, -1, -max(1, math.ceil(len(lines) / rows))))
+    kept |= {number for number, row in enumerate(lines) if row.get("q_abs_mean", 0) > row.get("q_bound", math.inf)}
+    short = ({name: value for name, value in lines[n].items() if name not in LEFT_OUT} for n in sorted(kept))
+    return "".join(json.dumps(row) + "\n" for row in short)
+
+
+def _thinned(path: Path, text: str | None, rows: int) -> str | None:
+    try:
+        return text and thinned(text, rows)
+    except ValueError as error:
+        raise RunError(f"{path}: a torn line; is the run still writing? {error}") from error
 
 
 def _check(packed: PackedStudy, folder: Path, files: Mapping[str, Mapping[str, str | None]]) -> None:

@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from common.settings.methods import METHODS
 from experiments.report.intervals import Interval
@@ -32,7 +32,7 @@ HEIGHT = 1.9  # inches, of a panel
 DPI = 170
 TICK = 0.24  # inches, of a line of a label on the y axis
 LONG_TICK = 24  # letters in such a line
-DECADE = 10
+BESIDE = 0.5  # of the distance of two sizes, taken by the methods at one
 STYLE: dict[Any, Any] = {
     "font.size": 8, "axes.titlesize": 8, "axes.labelsize": 8, "xtick.labelsize": 7, "ytick.labelsize": 7,
     "legend.fontsize": 8, "legend.frameon": False, "axes.spines.top": False, "axes.spines.right": False,
@@ -59,9 +59,9 @@ class Line:
 class Panel:
     """One pair of axes.
 
-    marks: draw markers and error bars instead of bands. share: y ranges from 0 to 1. wide_x: use a logarithmic x axis
-    if the numbers span more than a decade. ticks: labels of the positions 0, 1, ... of x, which is drawn downwards,
-    and y to the right. reference: a value of y to compare with.
+    marks: draw markers and error bars instead of bands. share: y ranges from 0 to 1. sizes: the values of x are sizes
+    of the buffer, drawn at equal distances, and the lines beside each other at each. ticks: labels of the positions 0,
+    1, ... of x, which is drawn downwards, and y to the right. reference: a value of y to compare with.
     """
 
     title: str
@@ -69,7 +69,7 @@ class Panel:
     y: str
     lines: Sequence[Line]
     marks: bool = False
-    wide_x: bool = False
+    sizes: bool = False
     log_y: bool = False
     share: bool = False
     ticks: Sequence[str] = ()
@@ -125,10 +125,10 @@ def draw(figure: Figure, path: Path) -> None:
         colours: dict[str, str] = {}
         handles: dict[str, Line2D] = {}
         for place, (axes, panel) in enumerate(zip(grid.flat, figure.panels, strict=False)):
-            for line in panel.lines:
+            for line, x in zip(panel.lines, _places(panel), strict=True):
                 others = [] if panel.ticks else list(colours.values())  # a tick names its line
                 colour = colours.setdefault(line.label, _colour(line.label, others))
-                _draw_line(axes, panel, line, colour)
+                _draw_line(axes, panel, line, x, colour)
                 if not line.faint:
                     handles.setdefault(line.label, _handle(panel, line, colour))
             _finish_panel(axes, panel, columns)
@@ -149,23 +149,37 @@ def draw(figure: Figure, path: Path) -> None:
         FigureCanvasPdf(canvas).print_pdf(path.with_suffix(".pdf"), metadata={"CreationDate": None})  # type: ignore[no-untyped-call]
 
 
-def _draw_line(axes: Axes, panel: Panel, line: Line, colour: str) -> None:
+def _places(panel: Panel) -> list[Floats]:
+    """Where the points of each line are drawn along x."""
+    if not panel.sizes:
+        return [line.x for line in panel.lines]
+    sizes = sorted({float(x) for line in panel.lines for x in line.x})
+    apart = [number for number, line in enumerate(panel.lines) if not line.dashed]
+    middle, step = (len(apart) - 1) / 2, BESIDE / max(1, len(apart) - 1)
+    return [
+        np.searchsorted(sizes, line.x).astype(np.float64)
+        + (0.0 if line.dashed else (apart.index(number) - middle) * step)
+        for number, line in enumerate(panel.lines)
+    ]
+
+
+def _draw_line(axes: Axes, panel: Panel, line: Line, x: Floats, colour: str) -> None:
     value, low, high = line.y
     if line.faint:
-        axes.plot(value, line.x, "o", color=colour, alpha=0.4, markersize=3, markeredgewidth=0, zorder=3)
+        axes.plot(value, x, "o", color=colour, alpha=0.4, markersize=3, markeredgewidth=0, zorder=3)
     elif line.dashed:
-        axes.plot(line.x, value, "o--", color=colour, markevery=line.x == 0)
-        axes.fill_between(line.x, low, high, color=colour, alpha=0.1, linewidth=0)
+        axes.plot(x, value, "o--", color=colour, markevery=line.x == 0)
+        axes.fill_between(x, low, high, color=colour, alpha=0.1, linewidth=0)
     elif panel.marks:
         bounds = np.nan_to_num(np.stack([(value - low).clip(0), (high - value).clip(0)]))
         style = "o" if panel.ticks else "o-"
         if panel.ticks:
-            axes.errorbar(value, line.x, xerr=bounds, fmt=style, capsize=2, color=colour, elinewidth=1)
+            axes.errorbar(value, x, xerr=bounds, fmt=style, capsize=2, color=colour, elinewidth=1)
         else:
-            axes.errorbar(line.x, value, yerr=bounds, fmt=style, capsize=2, color=colour, elinewidth=0.8)
+            axes.errorbar(x, value, yerr=bounds, fmt=style, capsize=2, color=colour, elinewidth=0.8)
     else:
-        axes.plot(line.x, value, color=colour)
-        axes.fill_between(line.x, low, high, color=colour, alpha=0.15, linewidth=0)
+        axes.plot(x, value, color=colour)
+        axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
 
 
 def _handle(panel: Panel, line: Line, colour: str) -> Line2D:
@@ -179,8 +193,8 @@ def _finish_panel(axes: Axes, panel: Panel, columns: int) -> None:
     axes.set_title("\n".join(textwrap.wrap(panel.title, 100 // columns)))
     axes.xaxis.set_major_locator(MaxNLocator(4 if columns == COLUMNS else 6))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
-    if panel.wide_x:
-        _spread_x(axes, panel, columns)
+    if panel.sizes:
+        _name_sizes(axes, panel, columns)
     if panel.ticks:
         axes.set_yticks(range(len(panel.ticks)), list(map(_wrapped, panel.ticks)))
         axes.set_ylim(len(panel.ticks) - 0.5, -0.5)
@@ -214,19 +228,11 @@ def _colour(label: str, taken: Sequence[str]) -> str:
     return own or OTHERS[sum(colour in OTHERS for colour in taken) % len(OTHERS)]
 
 
-def _spread_x(axes: Axes, panel: Panel, columns: int) -> None:
-    """Use a logarithmic axis if it is worth it, with the values themselves as ticks."""
-    values = sorted({float(x) for line in panel.lines for x in line.x})
-    sizes = [value for value in values if value]
-    if not sizes or sizes[-1] < DECADE * sizes[0]:
-        return
-    if len(sizes) == len(values):
-        axes.set_xscale("log")
-    else:
-        axes.set_xscale("symlog", linthresh=sizes[0], linscale=0.5)  # 0 has no place on a logarithmic axis
-    axes.autoscale_view()  # or the labels would be placed by the limits before the scale was set
-    axes.set_xticks(values, _labels(axes, values, columns))
-    axes.xaxis.set_minor_locator(NullLocator())
+def _name_sizes(axes: Axes, panel: Panel, columns: int) -> None:
+    """Name the sizes at their places."""
+    sizes = sorted({float(x) for line in panel.lines for x in line.x})
+    axes.set_xlim(-0.6, len(sizes) - 0.4)
+    axes.set_xticks(range(len(sizes)), _labels(axes, sizes, columns))
 
 
 def _labels(axes: Axes, values: Sequence[float], columns: int) -> list[str]:
@@ -236,7 +242,7 @@ def _labels(axes: Axes, values: Sequence[float], columns: int) -> list[str]:
     labels = list(map(_short, values))
     kept: list[tuple[float, int]] = []
     for number in (len(values) - 1, *range(len(values) - 1)):
-        place, length = float(scale.transform((values[number], 1.0))[0]), len(labels[number])
+        place, length = float(scale.transform((number, 1.0))[0]), len(labels[number])
         if any(abs(place - other) < letter * (length + letters + 2) / 2 for other, letters in kept):
             labels[number] = ""
         else:

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from experiments.report.comparisons import comparison_tables
-from experiments.report.intervals import improvement, iqm_by_task, iqm_overall
-from experiments.report.measures import breaking_point, diagnostic, diagnostics_of, score, spread
+from experiments.report.intervals import improvement, iqm_of, iqm_overall
+from experiments.report.measures import breaking_point, diagnostic, diagnostics_of, score, shorter_runs, spread
 from experiments.report.paper import table_1
 from experiments.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
 from experiments.report.study import Floats, Run, Setting, Study
@@ -50,8 +50,8 @@ def paper_table(study: Study) -> ResultTable:
     ]
     at = label(study, study.reference)
     note = (
-        "Return of the last 100 training episodes. mean, sd over runs: of the runs' means; sd of 100 episodes: "
-        "within a run, then mean over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval."
+        f"{_last_episodes(study)} mean, sd over runs: of the runs' means; sd of 100 episodes: within a run, then mean "
+        "over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval over seeds."
         + (f" Runs at {at}, the values nearest to the preset's." if at else "")
     )
     beside = {"paper mean": ["paper sd"], **OVER_RUNS}
@@ -66,8 +66,8 @@ def settings_table(study: Study) -> ResultTable:
         *("runs", "seeds"),
     ]
     note = (
-        "Return of the last 100 training episodes. mean, sd over runs: of the runs' means; sd of 100 episodes: within "
-        "a run, then mean over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval."
+        f"{_last_episodes(study)} mean, sd over runs: of the runs' means; sd of 100 episodes: within a run, then mean "
+        "over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval over seeds."
     )
     return ResultTable("settings", "Every setting", columns, rows, note, OVER_RUNS)
 
@@ -100,7 +100,7 @@ def breaking_table(study: Study) -> ResultTable:
     columns = [*names, "method", "breaking point", "low", "high", "gaps", "largest", "return there", "runs each"]
     note = (
         "Breaking point: the smallest capacity with at least 95 % of the return at the largest, by the mean over runs; "
-        "low and high: its 95 % bootstrap interval over runs. gaps: some larger capacity falls below 95 %. Where the "
+        "low and high: its 95 % bootstrap interval over seeds. gaps: some larger capacity falls below 95 %. Where the "
         "return at the largest is poor, nothing was learnt that could break. Empty: no run at the largest."
     )
     beside = {"breaking point": ["low", "high"]}
@@ -156,14 +156,21 @@ def _groups(study: Study) -> Iterator[tuple[str, Setting, list[Run]]]:
                 yield method, setting, runs
 
 
+def _last_episodes(study: Study) -> str:
+    """What is averaged: all episodes of a run that has no hundred."""
+    short = shorter_runs(study)
+    whole = f" (of {short} of the {len(study.runs)} runs all of their episodes, fewer than 100)" if short else ""
+    return f"Return of the last 100 training episodes{whole}."
+
+
 def _over_runs(runs: Sequence[Run]) -> list[Value]:
     """Compute mean, sd over runs, sd within a run, IQM, low, high, runs, seeds."""
-    scores = np.array([[score(run)] for run in runs])
-    interval = iqm_by_task(scores)
+    scores = np.array([score(run) for run in runs])
     sd = float(scores.std(ddof=1)) if len(runs) > 1 else None
     within = float(np.mean([spread(run) for run in runs]))
-    bounds = [float(interval.low[0]), float(interval.high[0])] if len(runs) > 1 else [None, None]
-    return [float(scores.mean()), sd, within, float(interval.value[0]), *bounds, len(runs), seeds_of(runs)]
+    middle, *bounds = iqm_of(scores)
+    ends = bounds if len(runs) > 1 else [None, None]
+    return [float(scores.mean()), sd, within, middle, *ends, len(runs), seeds_of(runs)]
 
 
 def _breaking(capacities: list[int], scores: list[Floats], largest: int) -> list[Value]:
@@ -184,5 +191,5 @@ def _lengths(runs: Sequence[Run]) -> list[Value]:
 def _matrix_note(study: Study) -> str:
     return (
         f"Over those of the {len(study.settings)} settings that every method has been run at, and the seeds that a "
-        "method has at all of them, with 95 % stratified bootstrap intervals (void for one seed)."
+        "method has at all of them, with 95 % bootstrap intervals over seeds (void for one seed)."
     )

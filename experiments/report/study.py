@@ -15,6 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
+from common.returns import METRICS_EVERY
 from common.settings.config import OF_MACHINE, RunConfig, value_of
 from common.settings.methods import METHODS
 from common.settings.tables import identity, load_tables, resolve
@@ -32,6 +33,7 @@ SERIES = ("env_step", "q_gap", "sample_age_mean", "sample_age_p95", "reuse_mean"
 # Missing in runs of earlier versions.
 LATER = ("archive_td_error", "archive_drift", "policy_churn", "dormant_share", "effective_rank", "terminal_share")
 Q_SIZE, Q_BOUND, Q_SHARE = "q_abs_mean", "q_bound", "q_share"
+CHURN = "churn_per_100"
 NOT_AXES = {"run", "method", "seed"}
 PRESET = "cartpole"
 
@@ -42,7 +44,8 @@ class Run:
 
     end_steps: float64 [episodes], environment steps when each episode ended. returns, s, q1_means, q2_means: float64
     [episodes], of the columns `return`, `s`, `q1_mean` and `q2_mean`. metrics: float64 [rows] of each name of SERIES,
-    of LATER, and of "q_share", mean |Q| as a share of its bound; nan where a row lacks it.
+    of LATER, of "q_share", mean |Q| as a share of its bound, and of "churn_per_100", the share of greedy actions that
+    100 updates of a network change; nan where a row lacks it.
     above_bound: number of rows of metrics.jsonl whose mean |Q| exceeds its bound, `q_bound`. evaluated: float64
     [2, evaluations], environment steps and mean returns of greedy play.
     """
@@ -229,6 +232,7 @@ def _read(source: Source, run: str, path: Path) -> Run:
     size, bound = metrics.pop(Q_SIZE), metrics.pop(Q_BOUND)
     with np.errstate(divide="ignore", invalid="ignore"):  # without rewards the bound is 0
         metrics[Q_SHARE] = size / bound
+    metrics[CHURN] = metrics["policy_churn"] * 100 / (METRICS_EVERY / (2 if config.two_networks else 1))
     return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()), evaluated)
 
 

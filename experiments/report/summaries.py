@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.report.intervals import Interval, improvement, iqm_by_task, iqm_overall, profiles
+from experiments.report.intervals import Interval, improvement, iqm_of, iqm_overall, profiles
 from experiments.report.measures import score
 from experiments.report.plots import Figure, Line, Panel
 from experiments.report.slices import counts, label, matrices, pairs
@@ -36,7 +36,7 @@ def final_returns(study: Study) -> Figure:
                     found.setdefault(method, {})[study.methods.index(method) if alone else number] = scores
         ends: dict[str, dict[int, tuple[float, float, float]]] = {}
         for method, at in found.items():
-            ends[method] = {tick: _interval(scores) for tick, scores in at.items()}
+            ends[method] = {tick: iqm_of(scores) for tick, scores in at.items()}
         shifts = {} if alone else dodge(list(found))
         dots = [
             Line(
@@ -51,7 +51,7 @@ def final_returns(study: Study) -> Figure:
             Panel(env, "", "return of the last 100 episodes", [*dots, *tick_lines(ends, shifts)], True, ticks=ticks)
         )
     text = (
-        "Small dots: single runs; large ones: their interquartile mean, with its 95 % bootstrap interval over runs "
+        "Small dots: single runs; large ones: their interquartile mean, with its 95 % bootstrap interval over seeds "
         "(none for a single run)."
     )
     return Figure("final_returns", "Return of the last 100 episodes", text, counts(study.runs), panels)
@@ -70,7 +70,7 @@ def aggregates(study: Study) -> list[Figure]:
     every = np.concatenate([matrix.ravel() for matrix in scores.values()]) if scores else np.zeros(1)
     levels = np.linspace(every.min() - 1e-9, every.max(), 61)
     shares = [Line(name, levels, interval) for name, interval in profiles(scores, levels).items()] if scores else []
-    interval = " over the settings that all methods share; 95 % stratified bootstrap intervals."
+    interval = " over the settings that all methods share; 95 % bootstrap intervals over seeds."
     names = [line.label for line in better]
     return [
         Figure(
@@ -103,13 +103,6 @@ def tick_lines(points: Points, shifts: Mapping[str, float]) -> list[Line]:
         Line(name, np.array([tick + shifts.get(name, 0.0) for tick in at]), Interval(*np.array(list(at.values())).T))
         for name, at in points.items()
     ]
-
-
-def _interval(scores: Floats) -> tuple[float, float, float]:
-    if len(scores) == 1:
-        return float(scores[0]), np.nan, np.nan
-    found = iqm_by_task(scores[:, None])
-    return float(found.value[0]), float(found.low[0]), float(found.high[0])
 
 
 def _bare(values: Floats) -> Interval:
