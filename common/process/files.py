@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Self
 
 from common.errors import RunError
+from common.process.locks import check_held
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)  # error numbers
 PIECE = 1 << 24  # bytes read at once
@@ -22,6 +23,7 @@ class SyncedFile:
     """
 
     def __init__(self, path: Path) -> None:
+        check_held()
         self._file = path.open("wb", buffering=0)
         self.size = 0
         self.checksum = 0
@@ -68,6 +70,7 @@ class LineFile:
 
     def append(self, data: bytes) -> None:
         """Append the bytes of one line or record."""
+        check_held()
         self._late += data
         try:
             self.finish()
