@@ -16,6 +16,7 @@ from common.envs.make import env_spec
 from common.errors import UsageError
 from common.networks.network import FlatNetwork
 from common.process.summaries import read_summary
+from common.process.untrusted import check_links
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
 from common.settings.tables import load_tables, resolve
@@ -80,12 +81,13 @@ class SavedPolicy:
 
 
 class SavedRun:
-    """The files of one run; raises UsageError if the folder holds none."""
+    """The files of one run. Raises UsageError if the folder holds none, RunError if a link leads out of it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         if not (path / "config.toml").is_file():
             raise UsageError(f"{path}: holds no run")
+        check_links(path)
 
     def __repr__(self) -> str:
         return f"<run {str(self.path)!r}: {self.config.env.id}, {self.config.method}, seed {self.config.seed}>"

@@ -24,6 +24,7 @@ from types import TracebackType
 from typing import Self
 
 from common.errors import RunError
+from common.process.untrusted import check_links
 
 INHERITED = "COOP_LOCKS"  # comma-separated descriptors of locks that a process inherits from its supervisor
 HOLDER_BYTES = 512  # more than any holder's line
@@ -183,6 +184,7 @@ class RunLock:
         self._locks: list[FileLock] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            check_links(folder)
             for role in roles:
                 self._take(folder, role, program)
         except OSError as error:

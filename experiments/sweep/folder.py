@@ -15,6 +15,7 @@ from typing import Literal
 from common.errors import UsageError
 from common.process.locks import Held, RunLock
 from common.process.summaries import read_summary
+from common.process.untrusted import check_links
 from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, resolve, to_toml
 from experiments.sweep.grid import Cell, Grid
@@ -50,6 +51,7 @@ class CellFolder:
 
     def check(self) -> None:
         """Raise UsageError if the folder holds a run of another config."""
+        check_links(self.path)
         held = self.path / "config.toml"
         text = held.read_text(encoding="utf-8") if held.exists() else ""
         try:
