@@ -12,6 +12,7 @@ import torch
 
 from common.envs.make import env_spec
 from common.errors import RunError, UsageError
+from common.imports import hand_over
 from common.messaging.messages.sample import DrawRequest
 from common.process.run_ids import read_run_id
 from common.process.summaries import read_summary
@@ -59,6 +60,7 @@ def reexecute(run_dir: Path) -> Outcome:
             parameters, optimizers or random state differ in any bit.
     """
     check_links(run_dir)
+    hand_over(run_dir)
     config = resolve(load_tables(None, run_dir / "config.toml"))
     final, folder, run_id = newest_epoch(run_dir), run_dir / "journal", read_run_id(run_dir)
     if final is None or not journal_files(folder):

@@ -13,6 +13,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from common.errors import RunError, UsageError
+from common.imports import permit
 from common.process import cli
 from common.process.extras import check_extra
 from common.process.flags import HttpAddress
@@ -77,6 +78,8 @@ class RunOptions(RunConfig):
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
     """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
+    allow_import: tuple[str, ...] = ()
+    """Modules, such as my_envs, that may be imported even if they lie in the folder of a resumed run or beside it."""
     wandb: bool = False
     """Mirror TensorBoard's scalars to Weights & Biases, whose own variables (WANDB_MODE, WANDB_PROJECT) apply."""
 
@@ -154,6 +157,8 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     parsed = cli.parse(extended, program, description, default, args, COMMON)
     options: OptionsT = replace(parsed, own=getattr(parsed, table_of(parsed.method), None))
     given = cli.given_flags(args)
+    named = {"env.id": options.env.id, "network.kind": options.network.kind}
+    permit([*options.allow_import, *(value for name, value in named.items() if name in given)])
     if "learner.swap_every" in given and not options.two_networks and options.learner.target_update_every is None:
         note_renamed({"--learner.swap-every": f"--learner.target-update-every for {options.method}"})
     for line in without_effect(options, given, lockstep=lockstep):

@@ -89,6 +89,8 @@ class LocalProcesses:
     def _command(self, folder: CellFolder) -> list[str]:
         # --resume also at the first start, so that a restarted run continues from its newest checkpoint.
         flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}", "--resume"]
+        modules = [path.partition(":")[0] for path in folder.cell.config.imports.values()]
+        flags += ["--allow-import", *modules] if modules else []
         if self._grid.mode == "distributed":
             return command("coop-local", *flags, f"--actors={self._grid.actors}")
         return command("coop-lockstep", *flags)
