@@ -18,6 +18,7 @@ from common.imports import permit
 from common.process.lifecycle import Stop
 from common.process.processes import ChildProcess, command
 from common.process.summaries import read_summary
+from common.process.untrusted import check_links
 from common.settings.config import RunConfig, check_distributed
 from common.settings.effects import without_effect
 from common.settings.options import RunOptions
@@ -233,6 +234,7 @@ def _named(settings: Mapping[str, Any]) -> list[str]:
 
 
 def _topology(config: RunConfig, directory: Path, actors: int, resume: bool, named: list[str]) -> _Topology:
+    check_links(directory)
     logs = directory / "logs"
     try:
         logs.mkdir(parents=True, exist_ok=True)

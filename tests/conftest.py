@@ -25,7 +25,7 @@ from common.types import EnvSpec
 os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"
 
 # What a user has trained is noted in the user's home; the tests' own is elsewhere.
-os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="coop-tests-")
+os.environ["XDG_STATE_HOME"] = str(Path(tempfile.gettempdir()) / f"coop-tests-{os.getpid()}")
 
 # With their default threads, several processes starve each other.
 use_threads(1)

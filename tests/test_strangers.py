@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import sys
 import zipfile
@@ -335,3 +336,50 @@ def test_a_text_is_measured_before_it_is_read(trained: Path, tmp_path: Path, mon
     with pytest.raises(RunError, match="allowed: at most"):
         source.text("one", "episodes.csv")
     assert msgpack.packb(json.loads((run / "summary.json").read_text()))
+
+
+def test_neither_a_pipe_nor_a_device_is_opened(trained: Path, tmp_path: Path) -> None:
+    run = a_copy(trained, tmp_path / "theirs")
+    for place in ("config.toml", "episodes.csv"):
+        (run / place).unlink()
+        os.mkfifo(run / place)
+        for look in (check_links, coop.load):
+            with pytest.raises((RunError, UsageError), match=r"neither a file nor a folder|holds no run"):
+                look(run)
+        with pytest.raises(RunError, match="neither a file nor a folder"):
+            coop.train(resume=True, run_dir=run)
+
+
+def test_a_report_is_not_written_through_links(trained: Path, tmp_path: Path) -> None:
+    a_copy(trained, tmp_path / "theirs" / "run")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "theirs" / "report").symlink_to(tmp_path / "mine")
+    done = run_command("coop-report", tmp_path / "theirs")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "report: a link, to " in done.stderr
+    (tmp_path / "theirs" / "report").unlink()
+    (tmp_path / "theirs" / "report").mkdir()
+    (tmp_path / "theirs" / "report" / "index.html").symlink_to(tmp_path / "mine" / "page")
+    done = run_command("coop-report", tmp_path / "theirs")
+    assert "index.html: a link, to " in done.stderr
+    assert list((tmp_path / "mine").iterdir()) == []
+
+
+ROLES = ["coop-actor", "coop-replay", "coop-watch", "coop-limits", "coop-eval", "coop-learner", "coop-local"]
+
+
+@pytest.mark.parametrize("command", [*ROLES, "coop-lockstep"])
+@pytest.mark.parametrize("name", ["../x", "a*"])
+def test_a_run_s_name_on_the_wire(command: str, name: str, tmp_path: Path) -> None:
+    done = run_command(command, f"--run={name}", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "run" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_network_is_no_larger_than_a_message(trained: Path, tmp_path: Path) -> None:
+    run = a_copy(trained, tmp_path / "theirs")
+    text = (run / "config.toml").read_text()
+    (run / "config.toml").write_text(re.sub(r"hidden = \[[^]]*\]", "hidden = [1048576, 1048576]", text))
+    with pytest.raises(UsageError, match=r"network\.hidden = .*parameters; allowed: at most"):
+        coop.load(run).policy()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import unicodedata
 import zipfile
 from collections import OrderedDict
@@ -21,7 +22,8 @@ from common.errors import RunError, UsageError
 from common.types import Array
 
 MAX_NAME_BYTES = 100
-MAX_TEXT = 1 << 30  # bytes of a text file that is read at once; of summary.json, config.toml and the like far fewer
+MAX_TEXT = 1 << 30  # bytes of a text file that is read at once
+MAX_SETTINGS = 1 << 24  # bytes of one that holds settings
 _PATTERN = frozenset("*?[")
 # What the product writes in a run's folder; the rest of the folder is its user's.
 _FILES = (
@@ -38,6 +40,15 @@ _MADE = {
     ("_codecs", "encode"),
 }
 MAX_ENTRIES = 1 << 20  # of an archive
+
+
+RUN = r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,63}$"  # what a run is called on the wire; always a name of a folder too
+
+
+def check_run(name: str) -> None:
+    """Raise UsageError for a name that no run has on the wire, by which its processes find each other."""
+    if re.fullmatch(RUN, name) is None:
+        raise UsageError(f"--run {name[:MAX_NAME_BYTES]!r}: allowed: {RUN.strip('^$')}")
 
 
 def check_run_name(name: str, source: str) -> str:
@@ -72,10 +83,10 @@ def _is_control(category: str) -> bool:
 
 
 def check_links(folder: Path) -> None:
-    """Refuse a run's folder in which a file of the product is a link that leads out of the folder.
+    """Refuse a run's folder in which a file of the product is a link that leads out of the folder, a pipe or a device.
 
     Raises:
-        RunError: names the link.
+        RunError: names it.
     """
     if not folder.is_dir():
         return
@@ -83,6 +94,8 @@ def check_links(folder: Path) -> None:
     for path in _own(folder):
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
             raise RunError(f"{path}: a link that leads out of the run, to {path.readlink()}; not followed")
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise RunError(f"{path}: neither a file nor a folder; not opened")
 
 
 def _own(folder: Path) -> Iterator[Path]:
@@ -98,6 +111,13 @@ def _own(folder: Path) -> Iterator[Path]:
                 folders[:] = [each for each in folders if each.isdecimal()]  # the others are its user's
             else:
                 yield from (Path(at, each) for each in (*folders, *files))
+
+
+def refuse_links(*paths: Path) -> None:
+    """Refuse links where files are about to be written in a folder that may be somebody else's; raises UsageError."""
+    for path in paths:
+        if path.is_symlink():
+            raise UsageError(f"{path}: a link, to {path.readlink()}; nothing is written through it")
 
 
 def no_links(path: str, flags: int) -> int:

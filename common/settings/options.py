@@ -19,6 +19,7 @@ from common.process.extras import check_extra
 from common.process.flags import HttpAddress
 from common.process.notices import note_renamed, warn
 from common.process.run_ids import has_run_id, read_run_id
+from common.process.untrusted import check_run
 from common.settings.config import RunConfig
 from common.settings.effects import without_effect
 from common.settings.methods import METHODS, table_of
@@ -60,6 +61,10 @@ class RoleOptions:
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
     """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for a name that no run has."""
+        check_run(self.run)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,6 @@ TYPE: Mapping[str, Callable[[Sequence[Sequence[Any]]], tuple[pa.DataType, Callab
 JSON = {b"holds": b"json"}
 SMALLEST = 22  # zstd's level
 MAX_STUDY = 1 << 30  # bytes of a study in memory
-MAX_SWEEP = 1 << 24  # bytes of sweep.toml
 
 
 class PackedStudy:

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from common.process.untrusted import check_links, read_text
-from experiments.report.packed import EPISODES, MAX_SWEEP, SWEEP, PackedStudy, run_names
+from common.process.untrusted import MAX_SETTINGS, check_links, read_text
+from experiments.report.packed import EPISODES, SWEEP, PackedStudy, run_names
 
 
 class Source(Protocol):
@@ -43,7 +43,7 @@ class FolderSource:
         check_links(folder)
         for run in self.names:
             check_links(folder / run)
-        self.sweep = read_text(folder / SWEEP, MAX_SWEEP) if (folder / SWEEP).exists() else None
+        self.sweep = read_text(folder / SWEEP, MAX_SETTINGS) if (folder / SWEEP).exists() else None
 
     def text(self, run: str, file: str) -> str | None:
         """See `Source`."""
