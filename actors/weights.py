@@ -83,8 +83,8 @@ class WeightsFollower:
     def _load(self, message: Message) -> None:
         try:
             weights = Weights.decode(message, self._size)
-        except BadMessage:
-            self._node.count_bad()
+        except BadMessage as error:
+            self._node.count_bad(self._node.key("weights"), error)
             return
         self._policy.networks[weights.network - 1].load(weights.flat)
         self._held[weights.network - 1] = weights.version
@@ -92,8 +92,8 @@ class WeightsFollower:
     def _follow(self, message: Message) -> None:
         try:
             role = Role.decode(message)
-        except BadMessage:
-            self._node.count_bad()
+        except BadMessage as error:
+            self._node.count_bad(self._node.key("role"), error)
             return
         self._told = list(role.versions)
         self.progress = role.updates, role.env_step

@@ -87,4 +87,4 @@ def loaded(part: Any, field: str) -> Any:  # noqa: ANN401 (whatever a package gi
     Raises:
         UsageError: it cannot be imported; names the `field`.
     """
-    return import_object(part, field) if isinstance(part, str) else part
+    return import_object(part, field, installed=True) if isinstance(part, str) else part

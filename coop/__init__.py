@@ -11,6 +11,7 @@ docs/python.md has more examples.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 from common.errors import CoopError, RunError, UsageError
@@ -40,9 +41,17 @@ __all__ = [
 ]
 
 
-def load(run_dir: str | Path) -> SavedRun:
-    """The run in a folder, whether it has ended or not; raises UsageError if there is none."""
-    return SavedRun(Path(run_dir))
+def load(run_dir: str | Path, *, allow_import: Collection[str] = ()) -> SavedRun:
+    """The run in a folder, whether it has ended or not.
+
+    allow_import: modules of its environment or network that may be imported even if they lie in the run's folder or
+    beside it. Others come from the installed packages, `sys.path` or the working directory.
+
+    Raises:
+        UsageError: there is no run.
+        RunError: a link leads out of the folder.
+    """
+    return SavedRun(Path(run_dir), allow_import)
 
 
 def register_method(method: Method) -> None:

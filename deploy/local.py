@@ -64,11 +64,12 @@ class Topology:
         files = [f"--run-dir={directory}", "--resume", *common]
         learning = [f"--config={resolved}", "--listen", self.endpoint, *files]
         learning += [flag for flag in ("--restart", "--wandb") if getattr(options, flag[2:])]
+        modules = [path.partition(":")[0] for path in config.imports.values()]
+        learning += ["--allow-import", *modules] if modules else []
         learning += [f"--prometheus={options.prometheus}"] if options.prometheus else []
         serving = [*joining, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}", "--resume"]
         self.learner = ChildProcess("learner", command("coop-learner", *learning), logs / "learner.log", locks)
         self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]
-        modules = [path.partition(":")[0] for path in config.imports.values()]
         playing = [*joining, "--allow-import", *modules] if modules else joining
         self._others += [
             ChildProcess(f"actor process {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")

@@ -16,6 +16,7 @@ from common.messaging.transport import new_incarnation
 from common.process.cli import parse
 from common.process.flags import HttpAddress
 from common.process.lifecycle import Stop, run_main
+from common.process.untrusted import check_run
 from deploy.screen import RunScreen
 from deploy.status import Display, RunStatus, live_page
 
@@ -42,6 +43,10 @@ class WatchOptions:
     """Show the screen as a web page too: PORT, on loopback, or HOST:PORT."""
     json: bool = False
     """With --once: print one JSON object instead of the screen; docs/watching.md lists its fields."""
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for a name that no run has."""
+        check_run(self.run)
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from common.errors import UsageError
+from common.imports import permit
 from common.process import cli
 from common.process.lifecycle import run_main
 from common.settings.options import RoleOptions
@@ -27,7 +28,7 @@ EPSILONS = (0.0, 0.05)
 HEAD = "checkpoint  network  epsilon  episodes       mean        95% interval        sd    least     most"
 _NETWORKS: dict[str, Literal["mean", 1, 2]] = {"1": 1, "2": 2, "mean": "mean"}
 _OF_FOLDERS = {"seed", "networks", "video"}
-_OF_LIVE_RUNS = {"every", "every_steps", "join_timeout", "patience", "zenoh_config", "shared_memory", "allow_import"}
+_OF_LIVE_RUNS = {"every", "every_steps", "join_timeout", "patience", "zenoh_config", "shared_memory"}
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ class EvalOptions(RoleOptions):
     every_steps: int | None = None
     """Environment steps between the evaluations of a live run."""
     allow_import: tuple[str, ...] = ()
-    """Modules, such as my_envs, that this process may import if a live run's environment or network is theirs."""
+    """Modules, such as my_envs, that may be imported: for a live run's environment or network, or for a folder's even
+    if they lie in it or beside it."""
 
 
 def main() -> None:
@@ -66,6 +68,7 @@ def _run() -> None:
     given = cli.given_flags(sys.argv[1:])
     live = bool({"run", "connect"} & given)
     _check(options, given, live)
+    permit(options.allow_import)
     # Imported only after the flags have been checked: torch takes seconds.
     if live:
         from experiments.evaluator import Plan, evaluate_run  # noqa: PLC0415

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from common.imports import permit
 from common.process.cli import parse
 from common.process.lifecycle import run_main
 
@@ -21,6 +22,8 @@ class ExportOptions:
     """Folder of a run, with its config.toml and checkpoints."""
     out: Path
     """Folder for the files: new, empty, or with an earlier export, which is replaced."""
+    allow_import: tuple[str, ...] = ()
+    """Modules, such as my_envs, that may be imported even if they lie in the run's folder or beside it."""
 
 
 def main() -> None:
@@ -33,6 +36,7 @@ def _run() -> None:
     options = parse(ExportOptions, "coop-export", about)
     from experiments.export import export  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
+    permit(options.allow_import)
     done = export(options.run_dir, options.out)
     print(f"checkpoint {done.epoch} in {options.run_dir}, network {done.acting} acts: {', '.join(done.names)}")
     if done.without_onnx:

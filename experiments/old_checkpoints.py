@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
-import numpy as np
 
+from common.process.files import PIECE
+from common.process.untrusted import load_array
 from replay.table.table import Table
 
 ACTIONS = "played.npy"
@@ -23,7 +24,7 @@ def load(
     epoch: Path, state: dict[str, Any], table: Table, replay_actions: Callable[[list[int]], None]
 ) -> dict[str, Any]:
     """Fill a new table, and convert the state to today's learner.pt; the old format has no wall time."""
-    arrays = {path.stem: np.load(path) for path in (epoch / "replay").glob("*.npy")}
+    arrays = {path.stem: load_array(path, PIECE) for path in (epoch / "replay").glob("*.npy")}
     replay_actions(arrays.pop(Path(ACTIONS).stem).tolist())
     meta = msgpack.unpackb((epoch / "replay" / "state.msgpack").read_bytes(), strict_map_key=False)["table"]
     table.load_state(meta, arrays)

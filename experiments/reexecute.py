@@ -12,10 +12,12 @@ import torch
 
 from common.envs.make import env_spec
 from common.errors import RunError, UsageError
+from common.imports import hand_over
 from common.messaging.messages.sample import DrawRequest
 from common.process.run_ids import read_run_id
 from common.process.summaries import read_summary
 from common.process.threads import use_threads
+from common.process.untrusted import check_links
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
@@ -57,6 +59,8 @@ def reexecute(run_dir: Path) -> Outcome:
         RunError: the journal is incomplete, contains a segment twice or disagrees with the summary's transitions, or
             parameters, optimizers or random state differ in any bit.
     """
+    check_links(run_dir)
+    hand_over(run_dir)
     config = resolve(load_tables(None, run_dir / "config.toml"))
     final, folder, run_id = newest_epoch(run_dir), run_dir / "journal", read_run_id(run_dir)
     if final is None or not journal_files(folder):

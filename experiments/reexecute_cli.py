@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from common.imports import permit
 from common.process import cli
 from common.process.lifecycle import run_main
 
@@ -19,6 +20,8 @@ class ReexecuteOptions:
 
     run_dir: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN_DIR")]
     """Folder of a finished run with a journal (--replay.journal; with --replay.journal-keep from its beginning)."""
+    allow_import: tuple[str, ...] = ()
+    """Modules, such as my_envs, that may be imported even if they lie in the run's folder or beside it."""
 
 
 def main() -> None:
@@ -30,6 +33,7 @@ def _run() -> None:
     options = cli.parse(ReexecuteOptions, "coop-reexecute", "Train a run's learner again from the run's journal.")
     from experiments.reexecute import reexecute  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
+    permit(options.allow_import)
     outcome = reexecute(options.run_dir)
     print(
         f"updates {outcome.began:,} to {outcome.updates:,} on {outcome.transitions:,} transitions, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,8 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from common.envs.make import env_spec
 from common.errors import UsageError
+from common.imports import hand_over, permit
 from common.networks.network import FlatNetwork
 from common.process.summaries import read_summary
+from common.process.untrusted import check_links
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
 from common.settings.tables import load_tables, resolve
@@ -97,12 +100,16 @@ class SavedPolicy:
 
 
 class SavedRun:
-    """The files of one run; raises UsageError if the folder holds none."""
+    """The files of one run. Raises UsageError if the folder holds none, RunError if a link leads out of it."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, allow_import: Collection[str] = ()) -> None:
+        """allow_import: modules that may be imported even if they lie in the run's folder or beside it."""
         self.path = path
+        hand_over(path)
+        permit(allow_import)
         if not (path / "config.toml").is_file():
             raise UsageError(f"{path}: holds no run")
+        check_links(path)
 
     def __repr__(self) -> str:
         return f"<run {str(self.path)!r}: {self.config.env.id}, {self.config.method}, seed {self.config.seed}>"

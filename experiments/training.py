@@ -7,17 +7,18 @@ import json
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from common.errors import CoopError, RunError, UsageError
-from common.imports import describe
+from common.imports import describe, permit
 from common.process.lifecycle import Stop
 from common.process.processes import ChildProcess, command
 from common.process.summaries import read_summary
+from common.process.untrusted import check_links
 from common.settings.config import RunConfig, check_distributed
 from common.settings.effects import without_effect
 from common.settings.options import RunOptions
@@ -134,6 +135,7 @@ def train(
     distributed: bool = False,
     actors: int = 1,
     resume: bool = False,
+    allow_import: Collection[str] = (),
     **settings: Any,  # noqa: ANN401 (the fields of a run, each checked)
 ) -> TrainingRun:
     """Start a run and return at once.
@@ -147,12 +149,16 @@ def train(
             run is one of `coop-lockstep`, in a thread of this process.
         actors: actor processes of a distributed run.
         resume: continue the run in `run_dir`; start it if there is none yet.
+        allow_import: modules of a resumed run's environment or network that may be imported even if they lie in its
+            folder or beside it; those that `settings` name need not be listed.
         settings: fields of a run; a table as a mapping: `seed=1, total_steps=20_000, replay={"capacity": 500}`.
 
     Raises:
         UsageError: a setting is invalid, or `run_dir` holds a run already.
         RunError: `run_dir` is in use.
     """
+    named = [*allow_import, *_named(settings)]
+    permit(named)
     options = _options(preset, method, config, run_dir, resume, settings)
     run_config = options.run_config()
     for line in without_effect(run_config, {".".join(path) for path, _ in leaves(settings)}, lockstep=not distributed):
@@ -166,7 +172,7 @@ def train(
     if actors < 1:
         raise UsageError(f"actors = {actors}: must be at least 1")
     check_distributed(run_config)
-    topology = _topology(run_config, options.directory(), actors, resume)
+    topology = _topology(run_config, options.directory(), actors, resume, named)
     return TrainingRun(run_config, topology.directory, topology.play)
 
 
@@ -223,7 +229,15 @@ class _Topology:
             raise RunError(self._process.why())
 
 
-def _topology(config: RunConfig, directory: Path, actors: int, resume: bool) -> _Topology:
+def _named(settings: Mapping[str, Any]) -> list[str]:
+    """The modules that the settings of a call name."""
+    tables = ((settings.get("env"), "id"), (settings.get("network"), "kind"))
+    values = [table.get(name) for table, name in tables if isinstance(table, Mapping)]
+    return [value.partition(":")[0] for value in values if isinstance(value, str) and ":" in value]
+
+
+def _topology(config: RunConfig, directory: Path, actors: int, resume: bool, named: list[str]) -> _Topology:
+    check_links(directory)
     logs = directory / "logs"
     try:
         logs.mkdir(parents=True, exist_ok=True)
@@ -232,4 +246,5 @@ def _topology(config: RunConfig, directory: Path, actors: int, resume: bool) -> 
     except OSError as error:
         raise RunError(f"run directory {directory}: {error.strerror or error}") from error
     flags = [f"--config={file}", f"--run-dir={directory}", f"--actors={actors}", *(["--resume"] if resume else [])]
+    flags += ["--allow-import", *named] if named else []
     return _Topology(ChildProcess("coop-local", command("coop-local", *flags), logs / "coop-local.log"), directory)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from common.errors import UsageError
+from common.process.untrusted import check_links
 from learner.protocol import Agent
 from learner.records.epochs import load_learner, newest_epoch
 
@@ -18,6 +19,7 @@ def load_initial_networks(agent: Agent) -> None:
     folder = agent.config.learner.initial_networks
     if not folder:
         return
+    check_links(Path(folder))
     setting, epoch = f"learner.initial_networks = {folder!r}", newest_epoch(Path(folder))
     if epoch is None:
         raise UsageError(f"{setting}: holds no complete checkpoint of a run")

@@ -57,7 +57,8 @@ class MemberTracker:
     def leaving(self, incarnation: int) -> None:
         """Note that a process is about to end properly."""
         with self._lock:
-            self._leaving.add(incarnation)
+            if incarnation in self._joined:  # of others nothing is kept, whoever announces them
+                self._leaving.add(incarnation)
 
     def token(self, incarnation: int, there: bool, now: float) -> None:
         """Note that a process's liveliness token has appeared or disappeared."""

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from common.errors import BadMessage
-from common.messaging.keys import status_key
+from common.messaging.keys import incarnation_of, status_key
 from common.messaging.members import Origin
 from common.messaging.messages.status import (
     MAX_MEMBERS,
@@ -123,15 +123,15 @@ class StatusReporter:
         if message is not None:
             try:
                 self._replay_status = ReplayStatus.decode(message)
-            except BadMessage:
-                self._node.count_bad()
+            except BadMessage as error:
+                self._node.count_bad(status_key(self._node, "replay"), error)
 
     def _on_actor(self, sample: Any) -> None:  # noqa: ANN401 (zenoh's sample)
         try:
-            incarnation = int(str(sample.key_expr).rsplit("/", 1)[1], 16)
+            incarnation = incarnation_of(str(sample.key_expr))
             status = ActorStatus.decode(self._node.read(sample.payload))
-        except (BadMessage, ValueError):
-            self._node.count_bad()
+        except BadMessage as error:
+            self._node.count_bad(status_key(self._node, "actor"), error)
             return
         self._join_service.members.report(incarnation, status)
 

@@ -13,6 +13,7 @@ from common.messaging.session import open_session
 from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from common.process import cli
 from common.process.lifecycle import Stop, run_main
+from common.process.untrusted import check_run
 from common.settings.options import RoleOptions
 
 
@@ -24,6 +25,10 @@ class LimitsOptions(RoleOptions):
     """New ratio of updates per environment step, from now on; unchanged if not given."""
     tolerance: float | None = None
     """New tolerance in environment steps between acting and learning; unchanged if not given."""
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for a name that no run has."""
+        check_run(self.run)
 
 
 def main() -> None:

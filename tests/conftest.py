@@ -2,8 +2,10 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -21,6 +23,9 @@ from common.types import EnvSpec
 
 # torch.compile's own processes would outlive the tests.
 os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"
+
+# What a user has trained is noted in the user's home; the tests' own is elsewhere.
+os.environ["XDG_STATE_HOME"] = str(Path(tempfile.gettempdir()) / f"coop-tests-{os.getpid()}")
 
 # With their default threads, several processes starve each other.
 use_threads(1)
@@ -117,6 +122,7 @@ def nothing_left_behind() -> Iterator[None]:
     """Fail the session where a process, thread or socket of a test outlives it."""
     before = _children(), _sockets(), set(threading.enumerate())
     yield
+    shutil.rmtree(os.environ["XDG_STATE_HOME"], ignore_errors=True)
     deadline = time.monotonic() + SETTLE
     while (left := _left(before)) and time.monotonic() < deadline:
         time.sleep(0.1)

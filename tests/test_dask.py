@@ -71,12 +71,13 @@ def test_a_run_goes_on_after_its_worker_and_stops_at_ctrl_c(cluster: subprocess.
 
     # The worker is free again: one cell ends well, the other one can't begin.
     (tmp_path / "g.toml").write_text(GRID.format(seeds=[0, 1], steps=200))
-    broken = tmp_path / "short" / "dqn-seed=1" / "lock"
+    broken = tmp_path / "short" / "dqn-seed=1" / ".learner.lock"
     broken.mkdir(parents=True)
     done = run_command("coop-sweep", *flags, tmp_path / "short", timeout=200)
     assert done.stderr == "coop-sweep: error: 1 of 2 cells failed; the same command tries them again\n"
     assert "\ndqn-seed=0: return " in done.stdout
-    assert f"failed: dqn-seed=1: {broken}: Is a directory, on {socket.gethostname()}\n" in done.stdout
+    why = f"run directory {broken.parent}: Is a directory, on {socket.gethostname()}"
+    assert f"failed: dqn-seed=1: {why}\n" in done.stdout
 
     done = nobody.end(200)
     assert (done.returncode, done.stdout, done.stderr) == (

@@ -211,14 +211,14 @@ def test_a_failing_cell_does_not_stop_the_rest_and_one_that_another_process_runs
     taken.mkdir()
     command = [str(SCRIPTS / "coop-sweep"), str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--jobs", "2"]
     with (
-        (taken / "lock").open("w") as lock,
+        (taken / ".learner.lock").open("w") as lock,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
     ):
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert process.stdout is not None
         line = next(line for line in process.stdout if line.startswith("dqn-seed=0: "))
         assert line.startswith("dqn-seed=0: FAILED, dqn-seed=0 ended (exit status 1): coop-lockstep: error: run dir")
-        assert [path.name for path in taken.iterdir()] == ["lock"]
+        assert [path.name for path in taken.iterdir()] == [".learner.lock"]
         lock.close()
         out, err = process.communicate(timeout=250)
     assert process.returncode == 1

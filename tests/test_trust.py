@@ -3,10 +3,11 @@
 import json
 import re
 import shutil
+import socket
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -17,14 +18,14 @@ from common.messaging.keys import evaluations_key, join_key, replay_key
 from common.messaging.members import ROUTE
 from common.messaging.messages.epoch import Snapshot
 from common.messaging.messages.evaluate import Evaluated, EvaluationRow
-from common.messaging.messages.join import Join
+from common.messaging.messages.join import Join, Leave
 from common.messaging.messages.limits import Limit
 from common.messaging.messages.sample import DrawRequest
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current
 from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Node, new_incarnation
+from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from common.process.processes import ChildProcess, command, free_endpoint
 
 MAKE_KEYS = Path(__file__).parents[1] / "deploy" / "zenoh" / "make_keys.sh"
@@ -195,3 +196,105 @@ def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys
             payloads.append(sample.payload.to_bytes())
         assert payloads
         assert b"forged" not in payloads
+
+
+IDLE = 500
+
+
+@contextmanager
+def idle(at: str, count: int = IDLE) -> Iterator[list[socket.socket]]:
+    """Connections that say nothing."""
+    place = "127.0.0.1", int(at.rpartition(":")[2])
+    with ExitStack() as stack:
+        yield [stack.enter_context(socket.create_connection(place)) for _ in range(count)]
+
+
+def seconds_to_join(run: tuple[str, str], config: Path | None) -> float:
+    began = time.monotonic()
+    with joined(run, config) as actor:
+        while time.monotonic() - began < 60:
+            with suppress(NoAnswer):
+                assert actor.ask(join_key(actor, "actor"), Join("actor", 1, []).encode(RUN)).kind == "joined"
+                until(lambda: actor.presence.members("replay"))
+                break
+        return time.monotonic() - began
+
+
+def test_idle_connections_keep_nobody_out(run: tuple[str, str], keys: Path) -> None:
+    """Neither while they are there, nor when their handshakes have taken too long, nor when they go."""
+    with joined(run, keys / "replay.json5", "watch") as inside:
+        with ExitStack() as stack:
+            for at in run:
+                stack.enter_context(idle(at))
+            assert seconds_to_join(run, keys / "actor.json5") < 5
+            time.sleep(11)  # Zenoh gives a handshake 10 s
+            assert seconds_to_join(run, keys / "actor.json5") < 5
+            wait_for_more(inside)
+        assert seconds_to_join(run, keys / "actor.json5") < 5
+        wait_for_more(inside)
+
+
+@pytest.mark.parametrize("protocol", ["tls", "tcp"])
+def test_a_listener_hears_only_of_those_who_speak(protocol: str, keys: Path) -> None:
+    at = free_endpoint(f"{protocol}/127.0.0.1:0")
+    configs = (keys / "learner.json5", keys / "actor.json5") if protocol == "tls" else (None, None)
+    with Node(open_session((at,), (), configs[0]), RUN, "learner", new_incarnation()) as learner:
+        before = len(list(Path("/proc/self/fd").iterdir()))
+        with idle(at, 100) as silent:
+            time.sleep(0.2)
+            assert len(list(Path("/proc/self/fd").iterdir())) - before == 100, "these ends of the connections alone"
+            with joined((at, at), configs[1]) as actor:
+                until(lambda: actor.presence.members("learner") and learner.presence.members("actor"))
+                for _ in range(20):  # both ways, also once the filter of its listener is gone
+                    actor.announce(actor.key("metrics", "actor", "1"), bytearray(1 << 20))
+                    time.sleep(0.02)
+            silent[0].sendall(b"GET / HTTP/1.0\r\n\r\n")
+            until(lambda: len(list(Path("/proc/self/fd").iterdir())) - before >= 100)
+        until(lambda: not learner.presence.members("actor"))
+
+
+def test_an_actor_s_certificate_can_t_take_another_s_place(run: tuple[str, str], keys: Path) -> None:
+    """Neither by the identity of learner or replay service, nor by a message in their name."""
+    with joined(run, keys / "replay.json5", "watch") as inside, joined(run, keys / "actor.json5") as actor:
+        until(lambda: len(actor.session.info.peers_zid()) == 2)
+        replay = next(iter(inside.presence.members("replay")))
+        for zid in map(str, actor.session.info.peers_zid()):
+            config = zenoh.Config.from_file(str(keys / "actor.json5"))
+            config.insert_json5("id", json.dumps(zid))
+            config.insert_json5("connect/endpoints", json.dumps(run))
+            config.insert_json5("scouting/multicast/enabled", "false")
+            config.insert_json5("listen/endpoints", "[]")
+            with zenoh.open(config) as spoofed:
+                key = actor.key("alive", "replay", replay)
+                token = spoofed.liveliness().declare_token(key)
+                spoofed.put(actor.key("stop"), bytes(EndOfRun.because("forged").encode(RUN)))
+                time.sleep(1)
+                token.undeclare()
+        with pytest.raises(Refused, match="not an actor's"):
+            actor.ask(join_key(actor, "actor"), Leave(int(replay, 16)).encode(RUN))
+        for _ in range(3):
+            with pytest.raises(NoAnswer):
+                actor.ask(join_key(actor, "replay"), Leave(int(replay, 16)).encode(RUN))
+        wait_for_more(inside)
+        assert inside.presence.members("replay") == {replay}
+
+
+def test_malformed_messages_of_an_actor_are_refused_counted_and_named(run: tuple[str, str], keys: Path) -> None:
+    folder = keys.parent
+    with joined(run, keys / "replay.json5", "watch") as inside, joined(run, keys / "actor.json5") as actor:
+        before = stats(inside).bad_messages
+        for payload in (b"", b"\x00" * 64, bytes(DrawRequest(1, 0, 0, 32, 0).encode(RUN)), bytes(1 << 22)):
+            with pytest.raises(Refused):
+                actor.ask(replay_key(actor, "insert"), bytearray(payload))
+        assert stats(inside).bad_messages == before + 4
+        token = actor.session.liveliness().declare_token(actor.key("alive", "actor", "no-number"))
+        for _ in range(30):
+            actor.announce(actor.key("metrics", "actor", "\u202enobody"), bytearray(b"junk"))
+        until(lambda: "alive/actor: key: 'no-number' is no incarnation" in (folder / "learner.log").read_text())
+        token.undeclare()
+        wait_for_more(inside)
+    assert f"refused a message at coop/{RUN}/replay/0/insert: " in (folder / "replay.log").read_text()
+    log = (folder / "learner.log").read_text()
+    assert "error of this program" not in log
+    assert log.count(f"refused a message at coop/{RUN}/metrics/actor/*: key: ") == 1, "one line for many"
+    assert "\u202e" not in log

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Protocol
 
+from common.errors import BadMessage
+
+_INCARNATION = re.compile("0|[1-9a-f][0-9a-f]{0,15}")  # hexadecimal, as `Node` writes it
 REPLAY_SHARD = "0"
 
 
@@ -52,3 +56,11 @@ def stop_key(node: KeySpace) -> str:
 def status_key(node: KeySpace, role: str, incarnation: str = "*") -> str:
     """Key of a process's status for displays; of all processes of the role if no incarnation is given."""
     return node.key("metrics", role, incarnation)
+
+
+def incarnation_of(key: str) -> int:
+    """The incarnation that ends the key of a token or a status; raises BadMessage if none does."""
+    last = key.rpartition("/")[2]
+    if _INCARNATION.fullmatch(last) is None:
+        raise BadMessage("key", f"{last[:32]!r} is no incarnation")
+    return int(last, 16)

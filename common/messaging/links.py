@@ -1,14 +1,19 @@
-"""A session's links: where it listens, how many it may have, how it closes; a dead one must not block the others.
+"""A session's links: where it listens, how many it may have, how it closes; no other one must block them.
 
 Zenoh sets SO_LINGER to 10 s on its sockets. If a peer freezes or its cable is cut while data is unsent, Zenoh's closing
 thread blocks for that long, and since all links share this thread, no other peer can send or receive meanwhile. Zenoh
 has no setting for it, so this module switches lingering off on each new link's socket. Zenoh does not tell which one
 that is, so all are looked at: once for all links that come within a moment, as a thousand actors may join at once.
+
+A TLS listener of Zenoh waits for 0.1 s after each handshake that fails, also by the silence of its client, and takes no
+other client meanwhile; it has no setting for that either. So the kernel keeps connections to itself until their clients
+have sent something (`wait_for_words`). Zenoh never learns of one that says nothing, nor of its end.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import resource
@@ -17,6 +22,7 @@ import stat
 import struct
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +32,25 @@ PATIENCE = 1.0  # seconds for threads to end once the last session is closed
 PAUSE = 0.2  # seconds between looks at this process's sockets, far less than a peer's lease
 _CALLBACKS = "(pyo3-closure)"  # ends the names of the threads in which Zenoh calls back
 _LINGER_OFF = struct.pack("ii", 0, 0)
+SILENCE = 3600  # seconds for which a connection may say nothing before the kernel hands it on all the same
+WAITING = 1 << 16  # connections that may wait so, as far as the system permits (net.core.somaxconn)
+_SO_ATTACH_FILTER, _SO_DETACH_FILTER = 26, 27
+# A filter of the listening socket's segments: it drops those that end a connection and carry nothing, which would also
+# hand the connection on. (code, jump if true, jump if false, operand) of classic BPF; byte 0 is the TCP header's first.
+_NO_SILENT_END = (
+    (0x30, 0, 0, 13),  # load the flags
+    (0x54, 0, 0, 1),  # FIN alone
+    (0x15, 7, 0, 0),  # not set: keep
+    (0x30, 0, 0, 12),  # load the header's length,
+    (0x74, 0, 0, 4),  # in words,
+    (0x64, 0, 0, 2),  # in bytes
+    (0x07, 0, 0, 0),
+    (0x80, 0, 0, 0),  # load the segment's length
+    (0x1C, 0, 0, 0),  # less the header's
+    (0x15, 1, 0, 0),  # nothing left: drop
+    (0x06, 0, 0, 0xFFFFFFFF),  # keep
+    (0x06, 0, 0, 0),  # drop
+)
 
 
 def described(session: zenoh.Session, mode: str = "peer") -> dict[str, Any]:
@@ -46,6 +71,31 @@ def permit_many() -> None:
     """Raise this process's limit of descriptors, of which each link takes one, as far as the system permits."""
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+
+
+class _Instruction(ctypes.Structure):
+    _fields_ = (("code", ctypes.c_ushort), ("yes", ctypes.c_ubyte), ("no", ctypes.c_ubyte), ("k", ctypes.c_uint))
+
+
+def wait_for_words(session: zenoh.Session, mode: str) -> None:
+    """Make the kernel keep new TCP connections to a session until their clients have sent something."""
+    ports = {int(at.rpartition(":")[2]) for at in described(session, mode).get("locators", ()) if _is_tcp(at)}
+    program = (_Instruction * len(_NO_SILENT_END))(*(_Instruction(*each) for each in _NO_SILENT_END))
+    packed = struct.pack("HP", len(program), ctypes.addressof(program))
+    for opened in _tcp_sockets():
+        with contextlib.suppress(OSError):  # a kernel without these
+            if _listens(opened) and opened.getsockname()[1] in ports:
+                opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
+                opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENCE)
+                opened.listen(WAITING)
+
+
+def _is_tcp(locator: str) -> bool:
+    return str(locator).partition("/")[0] in {"tcp", "tls"}
+
+
+def _listens(opened: socket.socket) -> bool:
+    return bool(opened.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
 
 
 class _Follower:
@@ -125,7 +175,16 @@ def _has_changed(listener: Any) -> bool:  # noqa: ANN401 (zenoh's)
 
 
 def _linger_off() -> None:
-    """Switch SO_LINGER off on every TCP socket of this process."""
+    """Switch SO_LINGER off on every TCP connection of this process, and the filter that it has from its listener."""
+    for opened in _tcp_sockets():
+        if not _listens(opened):
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_OFF)
+            with contextlib.suppress(OSError):  # it has none
+                opened.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+
+
+def _tcp_sockets() -> Iterator[socket.socket]:
+    """Every TCP socket of this process, each open until the next one is asked for."""
     for entry in Path("/proc/self/fd").iterdir():
         try:
             own = os.dup(int(entry.name))
@@ -136,4 +195,4 @@ def _linger_off() -> None:
             continue
         with socket.socket(fileno=own) as opened:
             if opened.type == socket.SOCK_STREAM and opened.family in (socket.AF_INET, socket.AF_INET6):
-                opened.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_OFF)
+                yield opened

@@ -11,7 +11,9 @@ from collections.abc import Callable
 
 import zenoh
 
+from common.errors import BadMessage
 from common.messaging.faults import Faults
+from common.messaging.keys import incarnation_of
 from common.messaging.members import ROLES, ROUTE
 
 LEASE = 1.5  # seconds of silence after which a link is given up and the learner's last answer expires
@@ -23,9 +25,18 @@ class Presence:
     Args:
         prefix: key of the tokens, which is followed by ROLE/INCARNATION.
         faults: records bugs of this program in Zenoh's threads.
+        refuse: called with the key of a token that names no incarnation, and why it doesn't.
     """
 
-    def __init__(self, session: zenoh.Session, prefix: str, faults: Faults) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        prefix: str,
+        faults: Faults,
+        refuse: Callable[[str, BadMessage], None] = lambda key, error: None,
+    ) -> None:
+        self._refuse = refuse
+        self._prefix = prefix
         self._there: dict[str, set[str]] = {}  # incarnations by role
         self._gone: dict[str, float] = {}  # by role, when its last member disappeared
         self._lock = threading.Lock()
@@ -59,6 +70,11 @@ class Presence:
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         role, incarnation = str(sample.key_expr).split("/")[-2:]
+        try:
+            number = incarnation_of(str(sample.key_expr))
+        except BadMessage as error:
+            self._refuse(f"{self._prefix}/{role}", error)
+            return
         there = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
             incarnations = self._there.setdefault(role, set())
@@ -67,4 +83,4 @@ class Presence:
             else:
                 incarnations.discard(incarnation)
                 self._gone[role] = time.monotonic()
-        self._on_change(int(incarnation, 16), there)
+        self._on_change(number, there)

@@ -13,7 +13,7 @@ import zenoh
 from common.bounds import MAX_PAYLOAD
 from common.errors import RunError, UsageError
 from common.messaging.endpoints import check_endpoints, explain_listen_error, explain_shared_memory, first_line
-from common.messaging.links import never_linger, permit_many
+from common.messaging.links import never_linger, permit_many, wait_for_words
 from common.messaging.presence import LEASE
 from common.messaging.transport import NoAnswer
 
@@ -33,6 +33,8 @@ _QUIET = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "listen/exit_on_failure": True,
     "transport/unicast/max_sessions": MAX_LINKS,
+    "transport/unicast/accept_timeout": 5000,  # milliseconds to open a session once connected
+    "transport/unicast/accept_pending": 1024,  # sessions that are being opened; one more is refused
     "transport/link/tx/lease": round(1000 * LEASE),
     "transport/link/rx/max_message_size": MAX_PAYLOAD + (1 << 16),
     "transport/shared_memory/enabled": False,
@@ -85,6 +87,8 @@ def open_session(
             f"can't listen on {', '.join(listen) or 'any endpoint'}: {explain_listen_error(listen, error)}"
         ) from error
     never_linger(session)
+    if listen:
+        wait_for_words(session, mode)
     return session
 
 

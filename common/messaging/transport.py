@@ -25,9 +25,12 @@ from common.messaging.messages.status import Status
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.presence import Presence
 from common.messaging.wire import Message
+from common.process.console import say, stamped
 from common.process.lifecycle import Stop
 
 ASK_TIMEOUT = 5.0  # seconds
+MOST_REFUSALS = 8  # lines that say what is wrong with messages of one key
+LONGEST_REFUSAL = 200  # characters
 QUEUE = 1 << 14  # queries that wait for an answer: one more blocks Zenoh's thread, which receives everything else
 
 
@@ -91,11 +94,12 @@ class Node:
         self.bad_messages = 0
         self.faults = Faults()
         self._counting = threading.Lock()
+        self._refusals: dict[str, set[str]] = {}  # fields named in lines so far, by key
         self._name = f"{role}/{incarnation:x}"
         self._threads: list[threading.Thread] = []
         self._closing = False
         self._status = session.declare_publisher(self.key("metrics", self._name))
-        self.presence = Presence(session, self.key("alive"), self.faults)
+        self.presence = Presence(session, self.key("alive"), self.faults, self.count_bad)
         self._token = session.liveliness().declare_token(self.key("alive", self._name))
 
     def key(self, *parts: str) -> str:
@@ -141,7 +145,7 @@ class Node:
                     reply = answer(self.read(query.payload))
                 except Exception as error:
                     if isinstance(error, BadMessage):
-                        self.count_bad()
+                        self.count_bad(key, error)
                     elif not isinstance(error, CoopError):
                         self.faults.note(f"serving {key}", error)
                     with contextlib.suppress(zenoh.ZError):
@@ -157,10 +161,20 @@ class Node:
             raise BadMessage("run", f"{message.run!r}; this is run {self.run!r}")
         return message
 
-    def count_bad(self) -> None:
-        """Count a refused message; thread-safe."""
+    def count_bad(self, place: str, error: BadMessage) -> None:
+        """Count a refused message, and say what is wrong with it, for each field once at each place; thread-safe.
+
+        place: the key that it came by.
+        """
         with self._counting:
             self.bad_messages += 1
+            told = self._refusals.setdefault(place, set())
+            if error.field in told or len(told) >= MOST_REFUSALS:
+                return
+            told.add(error.field)
+            last = "; further ones are only counted" if len(told) == MOST_REFUSALS else ""
+        text = str(error)[:LONGEST_REFUSAL].encode("unicode_escape").decode()  # it holds what the sender wrote
+        say(stamped(f"refused a message at {place}: {text}{last}"))
 
     def publish(self, key: str, payload: bytearray) -> None:
         """Broadcast a value of which only the latest matters; never blocks."""
@@ -184,8 +198,8 @@ class Node:
         def stopped(sample: zenoh.Sample) -> None:
             try:
                 stop.set(EndOfRun.decode(self.read(sample.payload)).reason)
-            except BadMessage:
-                self.count_bad()
+            except BadMessage as error:
+                self.count_bad(str(sample.key_expr), error)
 
         self.session.declare_subscriber(stop_key(self), self.faults.guarded("reading the stop", stopped))
 
@@ -219,8 +233,8 @@ class Latest:
             return None
         try:
             return self._node.read(sample.payload)
-        except BadMessage:
-            self._node.count_bad()
+        except BadMessage as error:
+            self._node.count_bad(str(sample.key_expr), error)
             return None
 
 

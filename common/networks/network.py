@@ -53,6 +53,12 @@ def build_network(kind: str, spec: EnvSpec, hidden: Sequence[int], seed: int) ->
 
 
 def _mlp(spec: EnvSpec, hidden: Sequence[int]) -> nn.Sequential:
+    parameters = sum(math.prod(shape) for _, shape in mlp_layout(spec, hidden))
+    if 4 * parameters > MAX_PAYLOAD:
+        raise UsageError(
+            f"network.hidden = {list(hidden)}: {parameters:,} parameters; allowed: at most {MAX_PAYLOAD // 4:,}, "
+            "what a message carries"
+        )
     layers: OrderedDict[str, nn.Module] = OrderedDict()
     if len(spec.input_shape) > 1:
         layers["flatten"] = nn.Flatten()

@@ -10,6 +10,8 @@ from types import TracebackType
 from typing import Self
 
 from common.errors import RunError
+from common.process.locks import check_held
+from common.process.untrusted import no_links
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)  # error numbers
 PIECE = 1 << 24  # bytes read at once
@@ -22,7 +24,8 @@ class SyncedFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("wb", buffering=0)
+        check_held()
+        self._file = open(path, "wb", buffering=0, opener=no_links)  # noqa: SIM115 (Path.open takes no opener)
         self.size = 0
         self.checksum = 0
 
@@ -60,7 +63,8 @@ class LineFile:
     def __init__(self, path: Path, *, go_on: bool) -> None:
         self.problem = ""
         self._late = b""
-        self._file = path.open("ab" if go_on else "wb", buffering=0)
+        mode = "ab" if go_on else "wb"
+        self._file = open(path, mode, buffering=0, opener=no_links)  # noqa: SIM115 (Path.open takes no opener)
 
     def write(self, text: str) -> None:
         """Append text that ends with a newline."""
@@ -68,6 +72,7 @@ class LineFile:
 
     def append(self, data: bytes) -> None:
         """Append the bytes of one line or record."""
+        check_held()
         self._late += data
         try:
             self.finish()

@@ -23,6 +23,7 @@ from common.bounds import (
     MAX_TOLERANCE,
 )
 from common.errors import UsageError
+from common.process.untrusted import RUN
 from common.settings.environment import EnvSettings
 from common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
 from common.settings.methods import METHODS
@@ -199,7 +200,7 @@ class RunConfig:
     """Everything that defines a run; the same fields in TOML files and as flags."""
 
     __pydantic_config__ = _STRICT
-    run: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")] = "coop"
+    run: Annotated[str, Field(pattern=RUN)] = "coop"
     """Name of the run: roles with the same name find each other."""
     method: MethodName = "coop"
     """Training method."""

@@ -13,11 +13,13 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from common.errors import RunError, UsageError
+from common.imports import permit
 from common.process import cli
 from common.process.extras import check_extra
 from common.process.flags import HttpAddress
 from common.process.notices import note_renamed, warn
 from common.process.run_ids import has_run_id, read_run_id
+from common.process.untrusted import check_run
 from common.settings.config import RunConfig
 from common.settings.effects import without_effect
 from common.settings.methods import METHODS, table_of
@@ -60,6 +62,10 @@ class RoleOptions:
     shared_memory: bool = False
     """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
 
+    def __post_init__(self) -> None:
+        """Raise UsageError for a name that no run has."""
+        check_run(self.run)
+
 
 @dataclass(frozen=True)
 class RunOptions(RunConfig):
@@ -77,6 +83,8 @@ class RunOptions(RunConfig):
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
     """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
+    allow_import: tuple[str, ...] = ()
+    """Modules, such as my_envs, that may be imported even if they lie in the folder of a resumed run or beside it."""
     wandb: bool = False
     """Mirror TensorBoard's scalars to Weights & Biases, whose own variables (WANDB_MODE, WANDB_PROJECT) apply."""
 
@@ -154,6 +162,8 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     parsed = cli.parse(extended, program, description, default, args, COMMON)
     options: OptionsT = replace(parsed, own=getattr(parsed, table_of(parsed.method), None))
     given = cli.given_flags(args)
+    named = {"env.id": options.env.id, "network.kind": options.network.kind}
+    permit([*options.allow_import, *(value for name, value in named.items() if name in given)])
     if "learner.swap_every" in given and not options.two_networks and options.learner.target_update_every is None:
         note_renamed({"--learner.swap-every": f"--learner.target-update-every for {options.method}"})
     for line in without_effect(options, given, lockstep=lockstep):

@@ -8,9 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from common.errors import UsageError
+from common.imports import hand_over
 from common.process.notices import warn
+from common.process.untrusted import check_links
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve, shortened
+
+_OF_RUNS = ("run-id", "checkpoints", "episodes.csv")  # beside a config.toml
 
 
 def base_config(args: Sequence[str] | None = None) -> RunConfig:
@@ -46,6 +50,12 @@ def chosen_config(
     Raises:
         UsageError: an unknown preset or method, or a bad file.
     """
+    if resumed:
+        check_links(resumed)
+        if (resumed / "config.toml").exists():
+            hand_over(resumed)
+    if file and any((file.parent / name).exists() for name in _OF_RUNS):
+        hand_over(file.parent)
     saved = resumed and not (preset or file) and resumed / "config.toml"
     if saved and saved.exists():
         file = saved

@@ -12,7 +12,8 @@ from typing import Any
 import pydantic
 import tomli_w
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
+from common.process.untrusted import MAX_SETTINGS, read_text
 from common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from common.settings.methods import METHODS
 from common.settings.overrides import merged, of_method
@@ -38,8 +39,10 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
     """
     if path is not None:
         try:
-            return tomllib.loads(path.read_text(encoding="utf-8-sig"))  # some editors begin files with a mark
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            return tomllib.loads(
+                read_text(path, MAX_SETTINGS).removeprefix("\ufeff")
+            )  # some editors begin files with a mark
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RunError, RecursionError) as error:
             raise UsageError(f"--config {path}: {error}") from error
     if preset not in preset_names():
         raise UsageError(f"preset = {preset!r}: {not_among(preset_names(), str(preset))}")

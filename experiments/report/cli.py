@@ -13,6 +13,7 @@ from tyro.conf import Positional
 from common.errors import RunError, UsageError
 from common.process.cli import parse
 from common.process.lifecycle import run_main
+from common.process.untrusted import refuse_links
 
 
 @dataclass(frozen=True)
@@ -67,5 +68,7 @@ def _run() -> None:
         from experiments.report.writer import write_report  # noqa: PLC0415
 
         beside = runs if runs.is_dir() else runs.with_suffix("")
+        if options.out is None:
+            refuse_links(beside / "report")
         index, told = write_report(runs, options.out or beside / "report", options.baseline)
         print(*told, index, sep="\n")

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from common.errors import RunError, UsageError
 from common.process.files import write_atomic
+from common.process.untrusted import check_links, check_run_name
 from experiments.report.columns import (
     Columns,
     csv_columns,
@@ -42,18 +44,23 @@ JSON = {b"holds": b"json"}
 SMALLEST = 22  # zstd's level
 # No result: what the machine was doing, and long lists. A thinned file lacks them.
 LEFT_OUT = ("time", "updates_per_s", "env_steps_per_s", "loss", "sample_age_histogram", "reuse_histogram")
+MAX_STUDY = 1 << 30  # bytes of a study in memory
 
 
 class PackedStudy:
-    """Reads a packed study. Raises UsageError if the file is none."""
+    """Reads a packed study, whoever packed it. Raises UsageError if the file is none, or a run's name is none."""
 
     def __init__(self, path: Path) -> None:
         try:
-            self._table = pq.read_table(path)
-            self.names: list[str] = self._table["run"].to_pylist()
-        except (OSError, KeyError, pa.ArrowException) as error:
+            self._table = _read_bounded(path)
+            self.names = [str(name) for name in self._table["run"].to_pylist()]
+        except (OSError, KeyError, pa.ArrowException, ValueError) as error:
             raise UsageError(f"{path}: not a packed study: {str(error).splitlines()[0]}") from error
+        for name in self.names:
+            check_run_name(name, str(path))
         self._rows = {name: row for row, name in enumerate(self.names)}
+        if len(self._rows) < len(self.names):
+            raise UsageError(f"{path}: not a packed study: two runs have one name")
         sweep = (self._table.schema.metadata or {}).get(SWEEP.encode())
         self.sweep = None if sweep is None else sweep.decode()
 
@@ -109,9 +116,11 @@ def pack(folder: Path, path: Path, rows: int | None = None) -> str:
         RunError: a file is torn, or cannot be restored byte for byte.
         UsageError: the folder holds no run, or the file cannot be written.
     """
-    runs = sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
+    runs = run_names(folder)
     if not runs:
         raise UsageError(f"{folder}: no folder with runs to pack")
+    for run in runs:
+        check_links(folder / run)
     files = {run: {file: _file(folder / run / file) for file in FILES} for run in runs}
     if rows is not None:
         for run, texts in files.items():
@@ -174,6 +183,45 @@ def _thinned(path: Path, text: str | None, rows: int) -> str | None:
         return text and thinned(text, rows)
     except ValueError as error:
         raise RunError(f"{path}: a torn line; is the run still writing? {error}") from error
+
+
+def run_names(folder: Path) -> list[str]:
+    """The names of the runs in a folder, in order, without hidden folders; raises UsageError as `check_run_name`."""
+    found = (path.parent.name for path in folder.glob(f"*/{CONFIG}"))
+    return sorted(check_run_name(name, str(folder)) for name in found if not name.startswith("."))
+
+
+def _read_bounded(path: Path) -> pa.Table:
+    """Read a table, texts as indices of their different values, and spread these only if the result is not too large.
+
+    Raises ValueError for a table that would take more than `MAX_STUDY` bytes, before it takes them.
+    """
+    with pq.ParquetFile(path, memory_map=False) as file:
+        meta, leaves = file.metadata, file.schema
+        columns = range(meta.num_columns)
+        values = sum(
+            meta.row_group(group).column(n).num_values for group in range(meta.num_row_groups) for n in columns
+        )
+        packed = sum(meta.row_group(group).total_byte_size for group in range(meta.num_row_groups))
+        if 8 * values + packed > MAX_STUDY:
+            raise ValueError(f"{values:,} values; a study has at most {MAX_STUDY // 8:,}")
+        texts = [leaves.column(n).path for n in columns if leaves.column(n).physical_type == "BYTE_ARRAY"]
+    table = pq.ParquetFile(path, read_dictionary=texts).read()
+    spread = sum(map(_spread, table.columns))
+    if spread > MAX_STUDY:
+        raise ValueError(f"{spread:,} bytes of text; a study has at most {MAX_STUDY:,}")
+    return table
+
+
+def _spread(column: pa.ChunkedArray) -> int:
+    """Bytes of a column's texts, each written out."""
+    total = 0
+    for chunk in column.chunks:
+        leaf = chunk.flatten() if pa.types.is_list(chunk.type) else chunk
+        if isinstance(leaf, pa.DictionaryArray):
+            each = pc.binary_length(leaf.dictionary).take(leaf.indices)
+            total += pc.sum(each).as_py() or 0
+    return total
 
 
 def _check(packed: PackedStudy, folder: Path, files: Mapping[str, Mapping[str, str | None]]) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from experiments.report.packed import CONFIG, EPISODES, SWEEP, PackedStudy
+from common.process.untrusted import MAX_SETTINGS, check_links, read_text
+from experiments.report.packed import EPISODES, SWEEP, PackedStudy, run_names
 
 
 class Source(Protocol):
@@ -37,24 +39,32 @@ class FolderSource:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self.names = sorted(path.parent.name for path in folder.glob(f"*/{CONFIG}"))
-        self.sweep = (folder / SWEEP).read_text(encoding="utf-8") if (folder / SWEEP).exists() else None
+        self.names = run_names(folder)
+        check_links(folder)
+        for run in self.names:
+            check_links(folder / run)
+        self.sweep = read_text(folder / SWEEP, MAX_SETTINGS) if (folder / SWEEP).exists() else None
 
     def text(self, run: str, file: str) -> str | None:
         """See `Source`."""
         try:
-            return (self._folder / run / file).read_text(encoding="utf-8")
+            return read_text(self._folder / run / file)
         except FileNotFoundError:
             return None
 
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
         """See `Source`."""
-        with (self._folder / run / file).open(encoding="utf-8") as lines:
-            rows = list(csv.DictReader(lines) if file == EPISODES else map(json.loads, lines))
+        lines = io.StringIO(read_text(self._folder / run / file))
+        rows = list(csv.DictReader(lines) if file == EPISODES else map(json.loads, lines))
         found = {name: [row[name] for row in rows] for name in wanted}
         return found | {name: [row.get(name) for row in rows] for name in optional}
 
 
 def open_source(path: Path) -> Source:
-    """Open a folder of runs or a packed study; raises UsageError if the file is none."""
+    """Open a folder of runs or a packed study.
+
+    Raises:
+        UsageError: the file is none, or a run has a name that is none.
+        RunError: a link leads out of a run.
+    """
     return FolderSource(path) if path.is_dir() else PackedStudy(path)

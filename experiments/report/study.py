@@ -240,7 +240,7 @@ def read_config(source: Source, run: str, path: Path) -> RunConfig:
     """The config of a run of the study at `path`; raises RunError."""
     try:
         return resolve(tomllib.loads(source.text(run, CONFIG) or ""))
-    except (OSError, ValueError, UsageError) as error:
+    except (OSError, ValueError, UsageError, RecursionError) as error:
         raise RunError(f"{path / run}: a run whose config can't be read: {error!r}") from error
 
 

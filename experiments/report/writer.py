@@ -12,6 +12,7 @@ import numpy as np
 
 from common.errors import RunError, UsageError
 from common.process.notices import warn
+from common.process.untrusted import refuse_links
 from experiments.report.answer import answer
 from experiments.report.baseline import baseline_figure, baseline_table, find_baseline
 from experiments.report.figures import figures
@@ -42,6 +43,7 @@ def draw_curves(runs: Path, out: Path) -> list[Path]:
             raise RunError(f"{runs / run}: {EPISODES} can't be read: {error!r}") from error
         if len(returns):
             path = out / run / "learning_curve.png"
+            refuse_links(path.parent, path)
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 drawn.append(draw_curve(steps, returns, f"{config.env.id}, {config.method}, seed {config.seed}", path))
@@ -73,6 +75,7 @@ def write_report(runs: Path, out: Path, baseline: str | None = None) -> tuple[Pa
     told = answer(study, results)
     try:
         out.mkdir(parents=True, exist_ok=True)
+        refuse_links(*out.iterdir())
         drawn = [(figure, out / f"{figure.name}.png") for figure in made]
         _draw_all(drawn)
         for figure in made:

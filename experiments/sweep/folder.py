@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import os
+import secrets
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from common.errors import UsageError
-from common.process.locks import FileLock
+from common.process.locks import Held, RunLock
 from common.process.summaries import read_summary
+from common.process.untrusted import check_links
 from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, resolve, to_toml
 from experiments.sweep.grid import Cell, Grid
@@ -50,6 +51,7 @@ class CellFolder:
 
     def check(self) -> None:
         """Raise UsageError if the folder holds a run of another config."""
+        check_links(self.path)
         held = self.path / "config.toml"
         text = held.read_text(encoding="utf-8") if held.exists() else ""
         try:
@@ -71,17 +73,12 @@ class CellFolder:
         """How its run ended, from summary.json; empty if that does not exist."""
         return str(read_summary(self.path).get("exit", ""))
 
-    @contextlib.contextmanager
-    def locked(self) -> Iterator[int | None]:
-        """Hold the cell's lock; None if another process has it. A child that inherits the descriptor keeps it."""
-        self.path.mkdir(exist_ok=True)
+    def lock(self) -> RunLock | None:
+        """The locks of the cell's run; None if another process has them. A child that inherits them keeps them."""
         try:
-            lock = FileLock(self.path / "lock")
-        except BlockingIOError:
-            yield None
-            return
-        with lock:
-            yield lock.descriptor
+            return RunLock(self.path, "coop-sweep", ("learner", "replay"))
+        except Held:
+            return None
 
     def prepare(self) -> None:
         """Write the config from which the run starts or continues."""
@@ -118,7 +115,7 @@ def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for cell in cells:
             cell.check()
-        part = folder / f"sweep.toml.{os.getpid()}"  # the tasks of a job array write it concurrently
+        part = folder / f"sweep.toml.{secrets.token_hex(8)}"  # several sweeps may write it at once, from any host
         part.write_text(grid.to_toml(), encoding="utf-8")
         part.replace(folder / "sweep.toml")
     except OSError as error:

@@ -18,6 +18,7 @@ from pydantic import ConfigDict, Field
 
 from common.envs.make import env_spec
 from common.errors import UsageError
+from common.process.untrusted import check_run_name
 from common.settings.config import RunConfig, check_distributed
 from common.settings.environment import EnvSettings
 from common.settings.fields import Count, Positive
@@ -160,7 +161,8 @@ def _choices(file: GridFile) -> Iterator[Choice]:
                 continue  # it has no replay buffer: one cell for all settings of the others'
             chosen = {path: value for path, value in chosen.items() if path[0] != "replay"}
         parts = [f"{names[path]}={_word(value)}" for path, value in chosen.items()]
-        yield Choice("-".join([method, *parts, f"seed={seed}"]), method, seed, chosen)
+        name = check_run_name("-".join([method, *parts, f"seed={seed}"]), "a cell")
+        yield Choice(name, method, seed, chosen)
 
 
 def _cells(file: GridFile, choices: Iterable[Choice]) -> tuple[Cell, ...]:

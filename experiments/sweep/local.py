@@ -6,6 +6,7 @@ import os
 import time
 from pathlib import Path
 
+from common.process.locks import RunLock
 from common.process.processes import ChildProcess, command
 from experiments.sweep.folder import CellFolder, Ending
 from experiments.sweep.grid import GridFile
@@ -15,7 +16,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 
 class LocalProcesses:
-    """An executor. A cell's process holds its lock as long as it lives, even if the sweep has been killed.
+    """An executor. A cell's process shares the run's locks with the sweep, and keeps them if the sweep is killed.
 
     Args:
         jobs: number of cells to run concurrently; the number of cores if None.
@@ -27,6 +28,7 @@ class LocalProcesses:
         self._jobs = jobs or len(os.sched_getaffinity(0))
         self._directory = directory
         self._processes: dict[str, ChildProcess] = {}
+        self._locks: dict[str, RunLock] = {}
 
     def slots(self) -> int:
         """See `Executor`."""
@@ -35,14 +37,21 @@ class LocalProcesses:
     def start(self, folder: CellFolder) -> bool:
         """See `Executor`."""
         name = folder.cell.name
-        with folder.locked() as lock:
-            if lock is None or folder.ending() is not None:
+        lock = folder.lock()
+        if lock is None:
+            return False
+        try:
+            if folder.ending() is not None:
+                lock.release()
                 return False
             folder.prepare()
-            log, locks = folder.path / "run.log", (lock,)
-            process = ChildProcess(name, self._command(folder), log, locks, ONE_THREAD, self._directory)
+            log, command = folder.path / "run.log", self._command(folder)
+            process = ChildProcess(name, command, log, lock.descriptors, ONE_THREAD, self._directory)
             process.start()
-        self._processes[name] = process
+        except BaseException:
+            lock.release()
+            raise
+        self._processes[name], self._locks[name] = process, lock
         return True
 
     def ending(self, folder: CellFolder) -> Ending | None:
@@ -51,7 +60,7 @@ class LocalProcesses:
         status = process.exit_status()
         if status is None:
             return None
-        del self._processes[folder.cell.name]
+        self._ended(folder.cell.name)
         ending = folder.ending()
         if ending is None or (ending.kind == "finished" and status):
             why = process.why() if status else f"stopped early: {folder.outcome() or 'no summary.json'}"
@@ -65,15 +74,23 @@ class LocalProcesses:
         deadline = time.monotonic() + seconds
         for process in self._processes.values():
             process.end(max(0.0, deadline - time.monotonic()))
-        self._processes.clear()
+        for name in list(self._processes):
+            self._ended(name)
 
     def news(self) -> list[str]:
         """See `Executor`; nothing happens to this machine."""
         return []
 
+    def _ended(self, name: str) -> None:
+        """Release a cell's locks; those of a run that was killed are its own children's, if some outlive it."""
+        lock, status = self._locks.pop(name), self._processes.pop(name).exit_status()
+        lock.release() if status is not None and status >= 0 else lock.hand_over()
+
     def _command(self, folder: CellFolder) -> list[str]:
         # --resume also at the first start, so that a restarted run continues from its newest checkpoint.
         flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}", "--resume"]
+        modules = [path.partition(":")[0] for path in folder.cell.config.imports.values()]
+        flags += ["--allow-import", *modules] if modules else []
         if self._grid.mode == "distributed":
             return command("coop-local", *flags, f"--actors={self._grid.actors}")
         return command("coop-lockstep", *flags)

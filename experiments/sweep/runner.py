@@ -6,6 +6,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 
+from common.errors import RunError
 from experiments.sweep.executor import Executor
 from experiments.sweep.folder import CellFolder, Ending, Progress
 
@@ -143,6 +144,8 @@ class Runner:
                 started = self._executor.start(folder)
             except OSError as error:
                 return f"{error.filename or folder.path}: {error.strerror}"
+            except RunError as error:
+                return str(error)
             if started:
                 self.running.append(Running(folder, progress.step, progress))
             else:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from common.process.files import measure, write_atomic
+from common.process.untrusted import check_torch_file
 
 DONE = "DONE"
 LEARNER = "learner.pt"
@@ -74,7 +75,13 @@ def rewind(run_dir: Path, number: int) -> dict[str, Any] | None:
 
 
 def load_learner(path: Path) -> dict[str, Any]:
-    """Read learner.pt from an epoch's folder, without executing any code in it."""
+    """Read learner.pt from an epoch's folder, without executing any code in it.
+
+    Raises:
+        OSError: it cannot be read.
+        RunError: it is no whole checkpoint, or declares more than it holds.
+    """
+    check_torch_file(path / LEARNER)
     state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
     return state
 

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from common.errors import RunError
-from common.imports import describe
+from common.imports import describe, remember
 from common.messaging.messages.evaluate import EvaluationRow
 from common.process.console import say
 from common.process.files import LineFile, truncate, write_atomic
@@ -183,4 +183,6 @@ def claim_run_directory(path: Path, config: RunConfig) -> int:
         write_atomic(path / "config.toml", to_toml(config).encode())  # first: an id alone is a replay service's folder
     except OSError as error:
         raise RunError(f"run directory {path}: {error.strerror or error}") from error
-    return draw_run_id(path)
+    run_id = draw_run_id(path)
+    remember(path)
+    return run_id

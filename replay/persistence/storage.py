@@ -24,6 +24,7 @@ from common.messaging.messages.sample import BatchReader, EpisodeRecord, encode_
 from common.messaging.wire import Message
 from common.process.files import PIECE, SyncedFile, measure, sync_folder, write_atomic
 from common.process.run_ids import check_owner
+from common.process.untrusted import load_array
 from common.types import Array, EpisodeEnd
 from replay.core import CoreSnapshot, ReplayCore
 
@@ -160,8 +161,10 @@ def _read_array(path: Path, written: tuple[int, int]) -> Array:
         raise TornSnapshot(f"{path}: {error.strerror or error}") from error
     if found != written:
         raise TornSnapshot(f"{path}: size and checksum {found} instead of {written}")
-    array: Array = np.load(path, mmap_mode="r" if found[0] > PIECE else None)
-    return array
+    try:
+        return load_array(path, PIECE)
+    except (OSError, ValueError) as error:
+        raise TornSnapshot(f"{path}: {error}") from error
 
 
 def _header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:

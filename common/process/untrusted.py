@@ -1,0 +1,200 @@
+"""Bounds on files from elsewhere: names of runs, links, and how much memory a file may ask for.
+
+A run, a study or a checkpoint of somebody else is data. What it names stays within its folder, and what it declares is
+compared with the bytes that are there before memory is taken for it.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import unicodedata
+import zipfile
+from collections import OrderedDict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from common.errors import RunError, UsageError
+from common.types import Array
+
+MAX_NAME_BYTES = 100
+MAX_TEXT = 1 << 30  # bytes of a text file that is read at once
+MAX_SETTINGS = 1 << 24  # bytes of one that holds settings
+_PATTERN = frozenset("*?[")
+# What the product writes in a run's folder; the rest of the folder is its user's.
+_FILES = (
+    "config.toml", "episodes.csv", "metrics.jsonl", "evaluations.csv", "summary.json", "run-id", "roster.json",
+    "learning_curve.png", "run.log", ".learner.lock", ".replay.lock",
+)  # fmt: skip
+_FOLDERS = ("checkpoints", "journal", "videos", "logs", "tb", "archive")
+_SIZES = {  # bytes of an item of PyTorch's storages
+    "Double": 8, "Float": 4, "Half": 2, "BFloat16": 2, "Long": 8, "Int": 4, "Short": 2, "Char": 1, "Byte": 1, "Bool": 1,
+}  # fmt: skip
+_MADE = {
+    *(("torch._utils", name) for name in ("_rebuild_tensor_v2", "_rebuild_parameter")),
+    *(("torch", name) for name in ("Size", "device", "float32", "float64", "bfloat16", "int64", "uint8", "bool")),
+    ("_codecs", "encode"),
+}
+MAX_ENTRIES = 1 << 20  # of an archive
+
+
+RUN = r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,63}$"  # what a run is called on the wire; always a name of a folder too
+
+
+def check_run(name: str) -> None:
+    """Raise UsageError for a name that no run has on the wire, by which its processes find each other."""
+    if re.fullmatch(RUN, name) is None:
+        raise UsageError(f"--run {name[:MAX_NAME_BYTES]!r}: allowed: {RUN.strip('^$')}")
+
+
+def check_run_name(name: str, source: str) -> str:
+    """The name of a run's folder, if it is one: a single folder's name that no shell, pattern or terminal misreads.
+
+    source: where the name is from, for the message.
+
+    Raises:
+        UsageError: it is none; says why.
+    """
+    problem = _problem(name)
+    if problem is not None:
+        raise UsageError(f"{source}: run name {name[:MAX_NAME_BYTES]!r}: {problem}")
+    return name
+
+
+def _problem(name: str) -> str | None:
+    problems = {
+        "is empty": not name,
+        f"has more than {MAX_NAME_BYTES} bytes": len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES,
+        "holds a path separator; it must be one folder's name": "/" in name or "\\" in name,
+        f"begins with {name[:1]!r}": name[:1] in {"-", "."},
+        "holds one of * ? [": bool(_PATTERN & {*name}),
+        "holds a control character": any(_is_control(unicodedata.category(letter)) for letter in name),
+    }
+    return next((problem for problem, found in problems.items() if found), None)
+
+
+def _is_control(category: str) -> bool:
+    """Whether letters of a Unicode category have no shape, turn the direction of text, or end a line."""
+    return category[0] == "C" or category in {"Zl", "Zp"}
+
+
+def check_links(folder: Path) -> None:
+    """Refuse a run's folder in which a file of the product is a link that leads out of the folder, a pipe or a device.
+
+    Raises:
+        RunError: names it.
+    """
+    if not folder.is_dir():
+        return
+    inside = folder.resolve()
+    for path in _own(folder):
+        if path.is_symlink() and not path.resolve().is_relative_to(inside):
+            raise RunError(f"{path}: a link that leads out of the run, to {path.readlink()}; not followed")
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise RunError(f"{path}: neither a file nor a folder; not opened")
+
+
+def _own(folder: Path) -> Iterator[Path]:
+    """The files and folders of a run that the product reads or writes, links not followed."""
+    for name in _FILES:
+        yield folder / name
+        yield folder / f"{name}.part"
+    for name in _FOLDERS:
+        yield folder / name
+        for at, folders, files in os.walk(folder / name):
+            if name == "checkpoints" and Path(at) == folder / name:
+                yield from (Path(at, each) for each in folders if each.isdecimal())
+                folders[:] = [each for each in folders if each.isdecimal()]  # the others are its user's
+            else:
+                yield from (Path(at, each) for each in (*folders, *files))
+
+
+def refuse_links(*paths: Path) -> None:
+    """Refuse links where files are about to be written in a folder that may be somebody else's; raises UsageError."""
+    for path in paths:
+        if path.is_symlink():
+            raise UsageError(f"{path}: a link, to {path.readlink()}; nothing is written through it")
+
+
+def no_links(path: str, flags: int) -> int:
+    """For `open(opener=...)`: refuses a link as the file itself, so that no other file is written in its place."""
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
+def read_text(path: Path, most: int = MAX_TEXT) -> str:
+    """The text of a file; raises OSError, and RunError for a file of more than `most` bytes, before it is read."""
+    size = path.stat().st_size
+    if size > most:
+        raise RunError(f"{path}: has {size:,} bytes; allowed: at most {most:,}")
+    return path.read_text(encoding="utf-8")
+
+
+def load_array(path: Path, small: int) -> Array:
+    """Read a .npy file; one of more than `small` bytes stays on the disk. Raises OSError, and ValueError for no array.
+
+    The file is mapped even if it is small: that compares the shape in its header with the bytes that follow.
+    """
+    array: Array = np.load(path, mmap_mode="r", allow_pickle=False)
+    return array if path.stat().st_size > small else np.array(array)
+
+
+def check_torch_file(path: Path) -> None:
+    """Check a file of `torch.save` before PyTorch reads it: nothing in it is larger than the file.
+
+    Raises:
+        OSError: it cannot be read.
+        RunError: it is no such file, or it declares more than it holds.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = {entry.filename: entry for entry in archive.infolist()}
+            size = path.stat().st_size
+            if any(entry.compress_type != zipfile.ZIP_STORED or entry.file_size > size for entry in entries.values()):
+                raise ValueError("an entry is compressed, or larger than the file")
+            if len(entries) > MAX_ENTRIES:
+                raise ValueError(f"{len(entries):,} entries")
+            (name,) = (each for each in entries if each.endswith("/data.pkl"))
+            root = name.removesuffix("data.pkl")
+            with archive.open(name) as file:
+                _Described(file, {key.removeprefix(root): entry.file_size for key, entry in entries.items()}).load()
+    except OSError:
+        raise
+    except Exception as error:  # whatever a made-up pickle makes of the reader
+        raise RunError(f"{path}: can't be read: {' '.join(f'{type(error).__name__}: {error}'.split())}") from error
+
+
+class _Described(pickle._Unpickler):  # in Python: it takes no memory in advance
+    """Reads what a checkpoint says of its arrays, and makes none; knows no more names than our checkpoints hold."""
+
+    dispatch: ClassVar = {
+        code: method
+        for code, method in pickle._Unpickler.dispatch.items()
+        if code not in {pickle.BYTEARRAY8[0], pickle.NEXT_BUFFER[0], pickle.LONG4[0], pickle.INST[0], pickle.OBJ[0]}
+    }
+
+    def __init__(self, file: Any, sizes: dict[str, int]) -> None:  # noqa: ANN401 (a file in an archive)
+        super().__init__(file)
+        self._sizes = sizes
+
+    def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401 (a name's stand-in)
+        if (module, name) == ("collections", "OrderedDict"):
+            return OrderedDict
+        if module == "torch" and name.removesuffix("Storage") in _SIZES:
+            return name.removesuffix("Storage")
+        if (module, name) in _MADE:
+            return _nothing
+        raise ValueError(f"names {module}.{name}")
+
+    def persistent_load(self, pid: Any) -> None:  # noqa: ANN401 (whatever the file holds)
+        kind, storage, key, _, items = pid
+        held = self._sizes.get(f"data/{key}")
+        if kind != "storage" or items < 0 or held != items * _SIZES[storage]:
+            raise ValueError(f"array {key!r}: {items:,} items, {held} bytes")
+
+
+def _nothing(*_: Any) -> None:  # noqa: ANN401 (the arguments that make a tensor or the like)
+    return None

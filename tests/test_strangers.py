@@ -1,0 +1,385 @@
+"""Runs, studies and checkpoints of somebody else are data: names, links, modules, and the memory that they ask for."""
+
+import json
+import os
+import re
+import shutil
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from commands import run_command
+
+import coop
+from common.errors import RunError, UsageError
+from common.imports import hand_over, import_module, permit, remember
+from common.process import untrusted
+from common.process.files import LineFile, write_atomic
+from common.process.untrusted import check_links, check_run_name, check_torch_file, load_array
+from experiments.report import packed
+from experiments.report.packed import PackedStudy, unpack
+from experiments.report.sources import open_source
+from experiments.sweep.grid import parse_grid
+
+pytestmark = pytest.mark.timeout(300)
+
+BAD_NAMES = [
+    "", ".", "..", "../out", "/abs", "a/b", "a\\b", "-rf", ".hidden", "a*", "a?", "a[0]", "a\nb", "a\x1b[2J",
+    "a\u202eb", "a\u2028b", "x" * 101, "é" * 51, "\ud800",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_names_that_are_none(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="run name"):
+        check_run_name(name, "here")
+    if "\ud800" in name:
+        return
+    table = pa.table({"run": ["good", name], "config.toml": ["", ""]})
+    pq.write_table(table, tmp_path / "study.parquet")
+    (tmp_path / "here").mkdir()
+    with pytest.raises(UsageError, match="run name"):
+        unpack(tmp_path / "study.parquet", tmp_path / "here" / "out")
+    assert not (tmp_path / "here" / "out").exists(), "names are checked before the first file is written"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "study.parquet"]
+
+
+@pytest.mark.parametrize("name", ["coop-seed=0,replay.capacity=100", "dqn-ratio=0.25-seed=0", "x" * 100, "a b", "été"])
+def test_names_that_are_some(name: str) -> None:
+    assert check_run_name(name, "here") == name
+
+
+@pytest.mark.parametrize("names", [["a", "a"], [None, "b"]])
+def test_a_packed_study_names_each_run_once(names: list[str | None], tmp_path: Path) -> None:
+    pq.write_table(pa.table({"run": names, "config.toml": ["", ""]}), tmp_path / "study.parquet")
+    if None in names:
+        assert PackedStudy(tmp_path / "study.parquet").names == ["None", "b"]
+        return
+    with pytest.raises(UsageError, match="two runs have one name"):
+        PackedStudy(tmp_path / "study.parquet")
+
+
+def test_a_grid_s_cells_are_folders_of_the_sweep() -> None:
+    for key in ("../../out", "a/b", "x*"):
+        text = f'methods = ["dqn"]\n[vary]\n"{key}" = [1, 2]\n'
+        with pytest.raises(UsageError, match="a cell: run name"):
+            parse_grid(text, "g.toml", check=False)
+
+
+def test_a_folder_of_runs_is_read_by_its_names(tmp_path: Path) -> None:
+    for name in ("good", ".hidden", "bad[1]"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.toml").write_text("seed = 0\n")
+    with pytest.raises(UsageError, match=r"run name 'bad\[1\]'"):
+        open_source(tmp_path)
+    shutil.rmtree(tmp_path / "bad[1]")
+    assert open_source(tmp_path).names == ["good"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small run of a built-in environment."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    coop.train(method="dqn", total_steps=200, replay={"learning_starts": 20}, run_dir=folder).wait()
+    return folder
+
+
+def a_copy(trained: Path, to: Path) -> Path:
+    shutil.copytree(trained, to)
+    return to
+
+
+def linked(path: Path, to: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    path.symlink_to(to)
+
+
+INSIDE = [
+    *("episodes.csv", "config.toml.part", "summary.json.part", "run-id"),
+    *("checkpoints", "videos", "checkpoints/N/learner.pt", "checkpoints/N/replay"),
+]
+
+
+@pytest.mark.parametrize("place", INSIDE)
+def test_no_link_leads_out_of_a_run(trained: Path, tmp_path: Path, place: str) -> None:
+    run = a_copy(trained, tmp_path / "theirs")
+    (newest,) = (run / "checkpoints").iterdir()
+    place = place.replace("N", newest.name)
+    mine = tmp_path / "mine"
+    mine.mkdir() if (run / place).is_dir() or place == "videos" else mine.write_text("precious")
+    linked(run / place, mine)
+    for look in (check_links, coop.load):
+        with pytest.raises(RunError, match="a link that leads out of the run"):
+            look(run)
+    with pytest.raises(RunError, match="a link that leads out of the run"):
+        coop.train(resume=True, run_dir=run, total_steps=300)
+    with pytest.raises(RunError, match="a link that leads out of the run"):
+        open_source(tmp_path)
+    assert list(mine.iterdir()) == [] if mine.is_dir() else mine.read_text() == "precious"
+
+
+def test_links_within_a_run_and_a_user_s_own_are_left_alone(trained: Path, tmp_path: Path) -> None:
+    run = a_copy(trained, tmp_path / "theirs")
+    (run / "notes").symlink_to(tmp_path)
+    (run / "checkpoints" / "best").symlink_to(run / "checkpoints")
+    (tmp_path / "alias").symlink_to(run)
+    check_links(tmp_path / "alias")
+
+
+def test_no_file_is_written_through_a_link(tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.write_text("precious")
+    (tmp_path / "x.part").symlink_to(mine)
+    (tmp_path / "lines").symlink_to(mine)
+    with pytest.raises(OSError, match="symbolic links"):
+        write_atomic(tmp_path / "x", b"theirs")
+    with pytest.raises(OSError, match="symbolic links"):
+        LineFile(tmp_path / "lines", go_on=False)
+    assert mine.read_text() == "precious"
+
+
+EVIL = """
+import gymnasium
+from pathlib import Path
+Path({!r}).write_text("ran")
+gymnasium.register("Evil-v0", entry_point="gymnasium.envs.classic_control:CartPoleEnv")
+"""
+READERS: list[Callable[[str], list[str]]] = [
+    lambda run: ["coop-eval", run, "--episodes", "1"],
+    lambda run: ["coop-export", run, "--out", "exported"],
+    lambda run: ["coop-lockstep", "--resume", "--run-dir", run, "--total-steps", "300"],
+    lambda run: ["coop-eval", run, "--video", "film.gif"],
+]
+
+
+def stranger(trained: Path, place: Path, module: str) -> tuple[Path, Path]:
+    """A run whose settings name a module; returns its folder, and the file that the module writes when it runs."""
+    run, sign = a_copy(trained, place / "run"), place / "sign"
+    text = (run / "config.toml").read_text().replace('id = "CartPole-v0"', f'id = "{module}:Evil-v0"')
+    assert f"{module}:Evil-v0" in text
+    (run / "config.toml").write_text(text)
+    return run, sign
+
+
+@pytest.mark.parametrize("where", ["inside", "beside", "as a package"])
+def test_a_module_that_came_with_a_run_is_not_imported(trained: Path, tmp_path: Path, where: str) -> None:
+    """Not even where its user stands in the run's folder, or in the folder that holds it."""
+    run, sign = stranger(trained, tmp_path, "evil_env")
+    place = {
+        "inside": run / "evil_env.py",
+        "beside": tmp_path / "evil_env.py",
+        "as a package": tmp_path / "evil_env" / "__init__.py",
+    }[where]
+    place.parent.mkdir(exist_ok=True)
+    place.write_text(EVIL.format(str(sign)))
+    for stand, name in ((run, "."), (tmp_path, "run")):
+        for command in READERS:
+            done = run_command(*command(name), cwd=stand)
+            assert done.returncode == 2, done.stdout + done.stderr
+            assert "evil_env" in done.stderr
+            assert done.stderr.count("\n") == 1
+            assert not sign.exists(), done.stderr
+    stand = place.parent if where != "as a package" else tmp_path
+    name = "." if where == "inside" else "run"
+    done = run_command("coop-eval", name, "--episodes", "1", "--allow-import", "evil_env", cwd=stand)
+    assert done.returncode == 0, done.stderr
+    assert f"env.id: imports evil_env from {place}\n" in done.stderr
+    assert sign.exists()
+
+
+def test_a_user_s_own_module_is_imported_and_named(trained: Path, tmp_path: Path) -> None:
+    (tmp_path / "theirs").mkdir()
+    run, sign = stranger(trained, tmp_path / "theirs", "own_env")
+    for own, stand, path in (("project", True, ""), ("library", False, "library")):
+        (tmp_path / own).mkdir()
+        (tmp_path / own / "own_env.py").write_text(EVIL.format(str(sign)))
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path / path)} if path else dict(os.environ)
+        cwd = tmp_path / own if stand else tmp_path
+        done = run_command("coop-eval", run, "--episodes", "1", cwd=cwd, environment=environment)
+        if not path:  # the forked command has its path already
+            assert done.returncode == 0, done.stderr
+            assert f"env.id: imports own_env from {tmp_path / own / 'own_env.py'}\n" in done.stderr
+
+
+def test_reading_records_runs_nothing(trained: Path, tmp_path: Path) -> None:
+    run, sign = stranger(trained, tmp_path, "evil_records")
+    for place in (run / "evil_records.py", tmp_path / "evil_records.py"):
+        place.write_text(EVIL.format(str(sign)))
+    for stand, runs in ((tmp_path, "."), (run, "..")):
+        for command in (
+            ["coop-report", runs, "--out", tmp_path / "report"],
+            ["coop-report", runs, "--curves", tmp_path / "curves"],
+            ["coop-report", runs, "--pack", tmp_path / "study.parquet"],
+            ["coop-report", tmp_path / "study.parquet", "--out", tmp_path / "report"],
+        ):
+            done = run_command(*map(str, command), cwd=stand)
+            assert done.returncode == 0, done.stderr
+            assert not sign.exists()
+    done = run_command("coop-report", "study.parquet", "--unpack", "again", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    loaded = coop.load(run)
+    assert len(loaded.episodes)
+    assert loaded.summary
+    assert "evil_records" in repr(loaded)
+    assert not sign.exists()
+
+
+def test_one_s_own_run_is_known_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module that a run was trained with may lie beside it, as long as it is that file and that run."""
+    monkeypatch.setattr("common.imports._handed_over", [])
+    monkeypatch.setattr("common.imports._named", set())
+    monkeypatch.setattr("common.imports._files", {})
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    here = tmp_path / "here"
+    run = here / "run"
+    run.mkdir(parents=True)
+    (run / "run-id").write_text("77\n")
+    (here / "my_trained.py").write_text("")
+    monkeypatch.chdir(here)
+    hand_over(run)
+    with pytest.raises(UsageError, match=r"my_trained\.py came with the run"):
+        import_module("my_trained", "env.id")
+    assert str(here) not in sys.path
+    permit(["my_trained:Room"])
+    import_module("my_trained", "env.id")
+    remember(run)
+    monkeypatch.setattr("common.imports._named", set())
+    del sys.modules["my_trained"]
+    import_module("my_trained", "env.id")
+    del sys.modules["my_trained"]
+    (run / "run-id").write_text("78\n")
+    with pytest.raises(UsageError, match="came with the run"):
+        import_module("my_trained", "env.id")
+    (run / "run-id").write_text("77\n")
+    shutil.move(here, tmp_path / "there")
+    monkeypatch.chdir(tmp_path / "there")
+    hand_over(tmp_path / "there" / "run")
+    with pytest.raises(UsageError, match="came with the run"):
+        import_module("my_trained", "env.id")
+
+
+def test_a_checkpoint_asks_for_no_more_than_it_holds(tmp_path: Path) -> None:
+    path = tmp_path / "learner.pt"
+    torch.save({"networks": [torch.zeros(1 << 16)], "rest": (1, 2.5, None, "x", True)}, path)
+    check_torch_file(path)
+    with zipfile.ZipFile(path) as whole:
+        entries = {entry.filename: whole.read(entry) for entry in whole.infolist()}
+
+    def rewritten(how: int, **changes: bytes) -> None:
+        with zipfile.ZipFile(path, "w", how) as archive:
+            for name, content in entries.items():
+                archive.writestr(name, changes.get(name.rpartition("/")[2], content))
+
+    rewritten(zipfile.ZIP_DEFLATED)
+    with pytest.raises(RunError, match="compressed"):
+        check_torch_file(path)
+    rewritten(zipfile.ZIP_STORED, **{"0": b"short"})
+    with pytest.raises(RunError, match="array '0': 65,536 items, 5 bytes"):
+        check_torch_file(path)
+    for attack in (
+        b"\x80\x02cbuiltins\nbytearray\nK\x05\x85R.",
+        b"\x80\x05\x96\xff\xff\xff\xff\xff\x00\x00\x00.",
+        b"\x80\x02",
+    ):
+        rewritten(zipfile.ZIP_STORED, **{"data.pkl": attack})
+        with pytest.raises(RunError, match="can't be read"):
+            check_torch_file(path)
+    path.write_bytes(b"PK no archive")
+    with pytest.raises(RunError, match="can't be read"):
+        check_torch_file(path)
+
+
+def test_an_array_is_no_larger_than_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    for array in (np.arange(6.0).reshape(2, 3), np.zeros((0, 4)), np.zeros(())):
+        np.save(path, array)
+        assert np.array_equal(load_array(path, 1 << 20), array)
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40,)})
+        file.write(bytes(64))
+    with pytest.raises(ValueError, match="greater than file size"):
+        load_array(path, 1 << 20)
+
+
+def test_a_study_is_measured_before_it_is_spread_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "study.parquet"
+    lists = pa.array([[0.0] * 200_000], pa.list_(pa.float64()))
+    pq.write_table(pa.table({"run": ["a"], "episodes.csv/return": lists}), path, compression="zstd")
+    PackedStudy(path)
+    monkeypatch.setattr(packed, "MAX_STUDY", 1 << 20)
+    assert path.stat().st_size < 10_000
+    with pytest.raises(UsageError, match=r"not a packed study: 200,001 values"):
+        PackedStudy(path)
+    texts = pa.array([["x" * 100_000] * 1_000], pa.list_(pa.string()))
+    pq.write_table(pa.table({"run": ["a"], "episodes.csv/actor": texts}), path, compression="zstd")
+    assert path.stat().st_size < 10_000
+    with pytest.raises(UsageError, match=r"not a packed study: 100,000,00\d bytes of text"):
+        PackedStudy(path)
+
+
+def test_a_text_is_measured_before_it_is_read(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = a_copy(trained, tmp_path / "runs" / "one")
+    monkeypatch.setattr(untrusted.read_text, "__defaults__", (1 << 20,))
+    with (run / "episodes.csv").open("r+b") as file:
+        file.truncate(1 << 40)  # takes no space: such a file comes out of a small archive
+    source = open_source(tmp_path / "runs")
+    with pytest.raises(RunError, match="allowed: at most"):
+        source.text("one", "episodes.csv")
+    assert msgpack.packb(json.loads((run / "summary.json").read_text()))
+
+
+def test_neither_a_pipe_nor_a_device_is_opened(trained: Path, tmp_path: Path) -> None:
+    run = a_copy(trained, tmp_path / "theirs")
+    for place in ("config.toml", "episodes.csv"):
+        (run / place).unlink()
+        os.mkfifo(run / place)
+        for look in (check_links, coop.load):
+            with pytest.raises((RunError, UsageError), match=r"neither a file nor a folder|holds no run"):
+                look(run)
+        with pytest.raises(RunError, match="neither a file nor a folder"):
+            coop.train(resume=True, run_dir=run)
+
+
+def test_a_report_is_not_written_through_links(trained: Path, tmp_path: Path) -> None:
+    a_copy(trained, tmp_path / "theirs" / "run")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "theirs" / "report").symlink_to(tmp_path / "mine")
+    done = run_command("coop-report", tmp_path / "theirs")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "report: a link, to " in done.stderr
+    (tmp_path / "theirs" / "report").unlink()
+    (tmp_path / "theirs" / "report").mkdir()
+    (tmp_path / "theirs" / "report" / "index.html").symlink_to(tmp_path / "mine" / "page")
+    done = run_command("coop-report", tmp_path / "theirs")
+    assert "index.html: a link, to " in done.stderr
+    assert list((tmp_path / "mine").iterdir()) == []
+
+
+ROLES = ["coop-actor", "coop-replay", "coop-watch", "coop-limits", "coop-eval", "coop-learner", "coop-local"]
+
+
+@pytest.mark.parametrize("command", [*ROLES, "coop-lockstep"])
+@pytest.mark.parametrize("name", ["../x", "a*"])
+def test_a_run_s_name_on_the_wire(command: str, name: str, tmp_path: Path) -> None:
+    done = run_command(command, f"--run={name}", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "run" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_network_is_no_larger_than_a_message(trained: Path, tmp_path: Path) -> None:
+    run = a_copy(trained, tmp_path / "theirs")
+    text = (run / "config.toml").read_text()
+    (run / "config.toml").write_text(re.sub(r"hidden = \[[^]]*\]", "hidden = [1048576, 1048576]", text))
+    with pytest.raises(UsageError, match=r"network\.hidden = .*parameters; allowed: at most"):
+        coop.load(run).policy()
