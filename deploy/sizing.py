@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from common.errors import UsageError
-from common.settings.capacity import ROW_BYTES, estimated_bytes, frame_bytes
+from common.settings.capacity import NAME_BYTES, ROW_BYTES, estimated_bytes, frame_bytes
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS
 from common.types import EnvSpec
@@ -131,7 +131,8 @@ def size(
     traffic = _traffic(config, spec, parameters, actors)
     update = costs.update(config.method) / learner_speedup
     links = LINK_BYTES * actors
-    table = estimated_bytes(spec, min(config.replay.capacity, config.total_steps))
+    held = min(config.replay.capacity, config.total_steps)
+    table, mirror = estimated_bytes(spec, held), 0 if config.learner.mirror == "off" else held * (frame_bytes(spec) + 8)
     return Sizing(
         (
             Part(
@@ -143,7 +144,7 @@ def size(
                 "a lower --replay.ratio with a larger --learner.batch-size",
             ),
             Part(
-                *("learner", 1, LEARNER_BYTES + 4 * parameters * COPIES + links, 1000 / (ratio * update)),
+                *("learner", 1, LEARNER_BYTES + mirror + 4 * parameters * COPIES + links, 1000 / (ratio * update)),
                 "a faster learner, or a lower --replay.ratio; more actors gain nothing",
             ),
             Part(
@@ -167,12 +168,18 @@ def enough_actors(sizing: Sizing) -> int:
 
 
 def _traffic(config: RunConfig, spec: EnvSpec, parameters: int, actors: int) -> Traffic:
-    """Bytes per environment step; a transition in a batch brings stack + 1 frames, one in a segment brings one."""
+    """Bytes per environment step; a transition in a batch refers to stack + 1 frames, one in a segment brings one.
+
+    With the learner's mirror, batches bring each frame once, and otherwise only its name.
+    """
     row, frame = ROW_BYTES + 8 * spec.stack, frame_bytes(spec)
     width = 2 if config.network.dtype == "bfloat16" else 4
     learner, ratio = config.learner, config.replay.ratio
+    drawn = ratio * learner.batch_size * (spec.stack + 1)  # frames
+    mirrored = config.learner.mirror != "off"
+    frames = min(drawn, 1) * frame + drawn * NAME_BYTES if mirrored else drawn * frame
     return Traffic(
         inserts=frame + row + HEADER_BYTES / config.actor.segment_steps,
-        draws=ratio * (learner.batch_size * ((spec.stack + 1) * frame + row) + HEADER_BYTES),
+        draws=frames + ratio * (learner.batch_size * row + HEADER_BYTES),
         weights=ratio / learner.publish_every * width * parameters * actors,
     )

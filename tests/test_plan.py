@@ -36,7 +36,7 @@ def test_each_part_can_be_the_bottleneck() -> None:
     assert breakout(1, ratio=0.001).bottleneck.name == "actors"
     assert breakout(1, ratio=0.001).speed == pytest.approx(1000 / COSTS["breakout"].step)
     assert breakout(10_000, ratio=1e-6, gbits=1000).bottleneck.name == "replay service"
-    assert breakout(10_000, learner_speedup=1e6, gbits=1).bottleneck.name == "learner's link"
+    assert breakout(10_000, learner_speedup=1e6, gbits=0.1).bottleneck.name == "learner's link"
     assert breakout(10_000, ratio=1e-6, gbits=1).bottleneck.name == "replay's link"
 
 
@@ -49,7 +49,9 @@ def test_weights_that_do_not_fit_are_dropped_and_limit_nothing() -> None:
 def test_what_a_step_sends() -> None:
     traffic, double = breakout(8).traffic, breakout(16).traffic
     assert traffic.inserts == pytest.approx(7056 + 74, rel=0.02)
-    assert traffic.draws == pytest.approx(0.25 * 32 * 5 * 7056, rel=0.02)
+    named = 0.25 * (32 * (5 * 16 + 62) + 300)
+    assert traffic.draws == pytest.approx(7056 + named), "each frame once, and the names of 160 in each batch"
+    assert breakout(8, ratio=0.001).traffic.draws == pytest.approx(0.001 * 32 * 5 * 7056, rel=0.02), "few are drawn"
     assert traffic.weights == pytest.approx(0.25 / 50 * 4 * NATURE * 8)
     assert (double.inserts, double.draws) == (traffic.inserts, traffic.draws)
     assert double.weights == 2 * traffic.weights
@@ -59,7 +61,8 @@ def test_memory_grows_by_links() -> None:
     few, many = breakout(10), breakout(1010)
     for place in (1, 2):
         assert many.parts[place].memory - few.parts[place].memory == 1000 * LINK_BYTES
-    assert few.parts[1].memory == pytest.approx(1_000_000 * 7_129, rel=0.05)
+    assert few.parts[1].memory == pytest.approx(1_000_000 * 7_137, rel=0.05)
+    assert few.parts[2].memory == pytest.approx(1_000_000 * 7_064, rel=0.1), "the mirror"
 
 
 def test_the_page(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,13 +10,16 @@ import numpy as np
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
+from common.process.memory import job_memory
 from common.settings.config import RunConfig
 from common.settings.policies import EVICTIONS
 from common.types import EnvSpec
 
-# actions, rewards, terminated, span, param_version, ids, reuse; three counters of the frame's slot.
-ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4 + 3 * 4
+ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4  # actions, rewards, terminated, span, param_version, ids, reuse
+SLOT_BYTES = 3 * 4 + 8  # counters of a frame's slot, and its number
 HEADER_BYTES = 1 << 20  # of a message, including the alignment of its arrays
+NAME_BYTES = 4 + 8 + 4  # slot, number and place of a frame in an answer to a draw
+MIRROR_SHARE = 0.25  # of the memory that the learner's job may use, for its mirror of the table's frames
 
 
 def frame_bytes(spec: EnvSpec) -> int:
@@ -26,7 +29,12 @@ def frame_bytes(spec: EnvSpec) -> int:
 
 def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
     """Bytes of a full table with one frame per transition, including the frames' counters; uniform sampling."""
-    return capacity * (frame_bytes(spec) + ROW_BYTES + 2 * 4 * spec.stack)
+    return capacity * (frame_bytes(spec) + SLOT_BYTES + ROW_BYTES + 2 * 4 * spec.stack)
+
+
+def mirror_slots(spec: EnvSpec) -> int:
+    """The most frames that the learner's mirror may hold: a frame and its number each."""
+    return min(2**31 - 1, int(MIRROR_SHARE * job_memory()) // (frame_bytes(spec) + 8))
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
@@ -53,7 +61,7 @@ def check_messages(config: RunConfig, spec: EnvSpec) -> None:
     """
     row = ROW_BYTES + 2 * 4 * spec.stack
     room = MAX_PAYLOAD - HEADER_BYTES
-    batch = room // ((spec.stack + 1) * frame_bytes(spec) + row)
+    batch = room // ((spec.stack + 1) * (frame_bytes(spec) + NAME_BYTES) + row)
     segment = (room - spec.stack * frame_bytes(spec)) // (2 * frame_bytes(spec) + row) - (config.replay.n_step - 1)
     allowed = {
         "learner.batch_size": (config.learner.batch_size, batch),

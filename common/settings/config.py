@@ -105,7 +105,9 @@ class LearnerSettings:
     threads: Positive = 1
     """CPU threads that PyTorch uses in the learner."""
     prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 4
-    """Number of sample requests in flight."""
+    """Batches that are asked for ahead."""
+    mirror: Literal["auto", "off"] = "auto"
+    """auto: keep copies of the table's frames, in at most a quarter of the memory, so that each is sent once."""
     publish_every: Positive = 10
     """Updates between broadcasts of the acting network; every swap is broadcast too."""
 

@@ -11,6 +11,7 @@ from common.settings.overrides import leaves
 from common.settings.tables import to_tables
 
 _FREE = (*OUTSIDE, "target_return")
+_OF_THE_MACHINE = (("learner", "mirror"),)  # training does not depend on it
 _TELLS_APART = (("run",), ("method",), ("seed",), ("env", "id"))
 _LIMITS = ("total_updates", "total_episodes")  # 0: none
 
@@ -46,7 +47,7 @@ def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
 
 
 def _may_change(path: tuple[str, ...], here: Any, there: Any) -> bool:  # noqa: ANN401 (values of any field)
-    if here == there or path[0] in _FREE:
+    if here == there or path[0] in _FREE or path in _OF_THE_MACHINE:
         return True
     if path == ("total_steps",):
         return bool(here > there)
