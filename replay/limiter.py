@@ -90,6 +90,8 @@ class RateLimiter:
 
     def admitted(self, inserted: int) -> int:
         """The number below which draws are admitted, and remain so while these settings hold, if the table has any."""
+        if inserted < self.start:
+            return 0
         most = self.draws_total
         if self.total is None or inserted < self.total:
             origin_inserted, origin_drawn = self.origin or (self.start, 0)

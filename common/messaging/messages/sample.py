@@ -116,7 +116,7 @@ class Draws(Struct, frozen=True):
     """
 
     table: Incarnation
-    memory: str
+    memory: Annotated[str, Meta(pattern=f"{ADDRESS}|^$")]
     admitted: Counter
     frames: Annotated[tuple[Annotated[int, Meta(ge=1)], ...], Meta(max_length=MAX_AHEAD)]
     draws: Annotated[tuple[Drawn, ...], Meta(min_length=1, max_length=MAX_AHEAD)]
