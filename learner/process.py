@@ -106,13 +106,13 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
 
 
 def _mirror(config: RunConfig, spec: EnvSpec, console: Console) -> FrameMirror | None:
-    """The mirror of the table's frames in this host's memory; None if it is off."""
+    """The mirror of the table's frames in this host's memory; None if it is off or there is no room."""
     if config.learner.mirror == "off":
         return None
-    mirror, most = FrameMirror(spec, mirror_slots(spec)), min(config.replay.capacity, config.total_steps)
-    if mirror.slots < most:
-        console.event(f"the mirror of the table has room for {mirror.slots:,} of {most:,} frames")
-    return mirror
+    slots, most = mirror_slots(config, spec), min(config.replay.capacity, config.total_steps)
+    if slots < most:
+        console.event(f"the mirror of the table has room for {slots:,} of {most:,} frames")
+    return FrameMirror(spec, slots) if slots else None
 
 
 def _exported(address: str, service: LearnerService) -> AbstractContextManager[object]:

@@ -37,12 +37,9 @@ class MirroredFrames:
         Returns:
             Indices of those to carry, ascending, intp [m].
         """
-        if request.mirror > self._mirror:
+        if request.mirror > self._mirror:  # the learner has emptied it
             self.clear()
             self._mirror = request.mirror
-        everything = np.arange(len(slots))
-        if request.mirror < self._mirror:  # a late request, from before the learner emptied its mirror
-            return everything
         within = slots < request.mirror_slots
         inside = slots[within]
         if len(inside) and (highest := inside.item(inside.argmax())) >= len(self._numbers):

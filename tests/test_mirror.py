@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +29,7 @@ from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
 from common.process.memory import GrowingRows, job_memory
-from common.settings.capacity import MIRROR_SHARE, mirror_slots
+from common.settings.capacity import MIRROR_SHARE, estimated_bytes, mirror_slots
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.settings.effects import without_effect
 from common.settings.resuming import check_resumed
@@ -100,9 +101,9 @@ class _Query:
     def __init__(self, network: _Network, payload: bytes, fault: str) -> None:
         self._network, self._payload, self._fault = network, payload, fault
         at_once = fault != "late" and fault != "lost request"
-        earlier = 0 if fault == "an earlier service" else -1
+        earlier = 0 if fault in EARLIER else -1
         self._answers = [network.answer(payload, earlier)] if at_once else []
-        if fault.startswith("twice"):
+        if fault.startswith("twice") or fault == "both services":
             self._answers.append(network.answer(payload))
 
     def wait(self) -> Message:
@@ -113,6 +114,7 @@ class _Query:
         return self._answers[-1 if self._fault == "twice, second" else 0]
 
 
+EARLIER = ("an earlier service", "both services")  # and its answer is the one that arrives
 FAULTS = ("none", "none", "none", "lost request", "lost answer", "late", "twice, first", "twice, second")
 
 
@@ -157,7 +159,7 @@ def test_no_fault_makes_a_batch_wrong_or_loses_one(data: st.DataObject, prefetch
     client = _client(network, learner, done, prefetch, slots)
 
     def fault() -> str:
-        earlier = ("an earlier service",) if len(network.services) > 1 else ()
+        earlier = EARLIER if len(network.services) > 1 else ()
         return data.draw(st.sampled_from((*FAULTS, *earlier)))
 
     network.draw_fault = fault
@@ -183,6 +185,41 @@ def test_no_fault_makes_a_batch_wrong_or_loses_one(data: st.DataObject, prefetch
             _batch(client)
     for _ in range(10):
         _assert_right(_batch(client))
+
+
+def test_two_services_that_answer_in_turn_confuse_nobody() -> None:
+    """The answers of each build on frames of its own that the learner has had to forget, or that it never got."""
+    core, tables = ReplayCore(CONFIG, NUMBERS), []
+    for sequence in range(6):
+        _insert(core, sequence)
+        if sequence > 3:
+            tables.append(_restored(core))  # with other frames in the same slots, under the same numbers
+    faults = cycle(("none", "both services", "none", "none", "an earlier service", "none", "none"))
+    network = _Network([_make_service(each) for each in tables], lambda: next(faults))
+    client = _client(network, 1, 0, 4, 1000)
+    for number in range(100):
+        while (got := client.next()) is None:
+            pass
+        assert got[1].sequence == number
+        _assert_right(got[0])
+
+
+def test_a_mirror_that_had_to_be_emptied_fills_without_further_questions() -> None:
+    core = ReplayCore(replace(CONFIG, replay=replace(CONFIG.replay, capacity=400)), NUMBERS)
+    for sequence in range(100):
+        _insert(core, sequence)
+    fault = "none"
+    network = _Network([_make_service(core), _make_service(core)], lambda: fault)  # one core, but two tables' names
+    client = _client(network, 1, 0, 1, 1000)
+    for _ in range(100):
+        _batch(client)
+    assert network.requests == 100
+    fault = "an earlier service"
+    _batch(client)
+    fault = "none"
+    for _ in range(100):
+        _assert_right(_batch(client))
+    assert network.requests <= 203
 
 
 def test_without_faults_each_frame_is_sent_once_to_each_learner() -> None:
@@ -392,6 +429,9 @@ def _sent(port: int) -> int:
     """Bytes that this process has sent from a TCP port and that have been acknowledged, by the kernel's count."""
     total = 0
     for entry in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):
+            if not str(entry.readlink()).startswith("socket:"):
+                continue
         with suppress(OSError), socket.fromfd(int(entry.name), socket.AF_INET, socket.SOCK_STREAM) as opened:
             if opened.getsockname()[1] == port and opened.getpeername():
                 info = opened.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
@@ -500,8 +540,15 @@ def test_the_memory_of_a_job(tmp_path: Path) -> None:
 
 def test_the_mirror_takes_a_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("common.settings.capacity.job_memory", lambda: 2**30)
-    atari = EnvSpec("Atari", (84, 84), "uint8", 4, 4)
-    assert mirror_slots(atari) * (84 * 84 + 8) <= MIRROR_SHARE * 2**30 < (mirror_slots(atari) + 1) * (84 * 84 + 8)
+    atari, each = EnvSpec("Atari", (84, 84), "uint8", 4, 4), 84 * 84 + 8
+
+    def slots(capacity: int, eviction: str = "fifo") -> int:
+        return mirror_slots(replace(CONFIG, replay=replace(CONFIG.replay, capacity=capacity, eviction=eviction)), atari)
+
+    assert slots(1000) * each <= MIRROR_SHARE * 2**30 < (slots(1000) + 1) * each
+    left = 2**30 - estimated_bytes(atari, 100_000)
+    assert slots(100_000) * each <= left / 2 < (slots(100_000) + 1) * each, "the table may be on this machine"
+    assert slots(100_000, "reservoir") == 0
 
 
 def test_rows_that_grow_keep_what_they_held() -> None:

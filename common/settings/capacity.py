@@ -19,7 +19,7 @@ ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4  # actions, rewards, terminated, span, par
 SLOT_BYTES = 3 * 4 + 8  # counters of a frame's slot, and its number
 HEADER_BYTES = 1 << 20  # of a message, including the alignment of its arrays
 NAME_BYTES = 4 + 8 + 4  # slot, number and place of a frame in an answer to a draw
-MIRROR_SHARE = 0.25  # of the memory that the learner's job may use, for its mirror of the table's frames
+MIRROR_SHARE = 0.25  # of the memory that the learner's job may use: the most for its mirror of the table's frames
 
 
 def frame_bytes(spec: EnvSpec) -> int:
@@ -32,25 +32,29 @@ def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
     return capacity * (frame_bytes(spec) + SLOT_BYTES + ROW_BYTES + 2 * 4 * spec.stack)
 
 
-def mirror_slots(spec: EnvSpec) -> int:
-    """The most frames that the learner's mirror may hold: a frame and its number each."""
-    return min(2**31 - 1, int(MIRROR_SHARE * job_memory()) // (frame_bytes(spec) + 8))
-
-
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Raise UsageError for a table that does not fit into this machine's memory.
-
-    Eviction policies that do not evict in order may keep stack + 1 frames per transition.
-    """
+    """Raise UsageError for a table that does not fit into this machine's memory."""
     capacity = config.replay.capacity
-    copies = 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
-    needed = estimated_bytes(spec, min(capacity, config.total_steps)) * copies
+    needed = _most_bytes(config, spec)
     present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > present:
         raise UsageError(
             f"replay.capacity = {capacity:,}: needs up to {needed / 2**30:.1f} GiB, this machine has "
             f"{present / 2**30:.1f} GiB"
         )
+
+
+def mirror_slots(config: RunConfig, spec: EnvSpec) -> int:
+    """The most frames that the learner's mirror may hold, as if the table were on this machine, too; 0 for no room."""
+    memory = job_memory()
+    room = min(MIRROR_SHARE * memory, (memory - _most_bytes(config, spec)) / 2)
+    return max(0, min(2**31 - 1, int(room) // (frame_bytes(spec) + 8)))  # each with its number
+
+
+def _most_bytes(config: RunConfig, spec: EnvSpec) -> int:
+    """Bytes of a run's full table; policies that do not evict in order may keep stack + 1 frames per transition."""
+    copies = 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
+    return estimated_bytes(spec, min(config.replay.capacity, config.total_steps)) * copies
 
 
 def check_messages(config: RunConfig, spec: EnvSpec) -> None:

@@ -81,7 +81,7 @@ def main(way: str) -> None:
         if way == "router":
             serve("router", "--connect", head, "--listen", gate)
         inserters = Inserters(stack, inserter, (gate,) if way == "router" else (head, replay), way)
-        mirror = None if way == "whole" else FrameMirror(ATARI, mirror_slots(ATARI))
+        mirror = None if way == "whole" else FrameMirror(ATARI, mirror_slots(CONFIG, ATARI))
         sampler = SampleClient(
             node, Stop(), incarnation, ATARI, BATCH, PREFETCH, shared_memory=way == "shm", mirror=mirror
         )
