@@ -82,9 +82,11 @@ def targets(node: Node, joined: Joined) -> list[Target]:
 
     result, video = EvaluationRow(0, 0, 1, 10, 1.0, 1.0, 0.0, 1.0), Video(1, 0, 0, np.frombuffer(GIF, np.uint8))
     draw = DrawRequest(1, 0, 0, batch_size, 0)
+    mirrored = msgspec.structs.replace(draw, mirror=1, mirror_slots=1000, draws=2)
     made: list[tuple[str, bytearray, str, Callable[[Message], Any]]] = [
         (replay_key(node, "insert"), encode_segment(RUN, segment), "replay", SegmentReader(spec)),
         (replay_key(node, "sample"), draw.encode(RUN), "replay", sample),
+        (replay_key(node, "sample"), mirrored.encode(RUN), "replay", sample),
         (replay_key(node, "limits"), Limit(1.0, 64.0).encode(RUN), "replay", limiting),
         (replay_key(node, "limits"), LimitsQuestion().encode(RUN), "replay", limiting),
         (replay_key(node, "stats"), StatsQuestion().encode(RUN), "replay", StatsQuestion.decode),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from common.errors import RunError, UsageError
 from common.messaging.links import locators
+from common.messaging.mirror import FrameMirror
 from common.messaging.sample_client import SampleClient
 from common.messaging.session import SHORT_QUEUE, open_session
 from common.messaging.transport import Node, new_incarnation
@@ -16,6 +17,7 @@ from common.process.health import answering
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
 from common.process.threads import use_threads
+from common.settings.capacity import mirror_slots
 from common.settings.config import RunConfig
 from common.settings.options import beginning
 from common.types import EnvSpec
@@ -88,6 +90,7 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
             agent.updates,
             episodes_received,
             shared_memory=options.shared_memory,
+            mirror=_mirror(config, spec, console),
         )
         checkpoints = Checkpoints(node, path, samples, epochs, console.event)
         sizes = None if state is None else state["sizes"]
@@ -100,6 +103,16 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         raise RunError(trainer.diverged)
     if stop.failed or summary.exit == stop.reason:  # otherwise the run was complete before the signal
         stop.leave()
+
+
+def _mirror(config: RunConfig, spec: EnvSpec, console: Console) -> FrameMirror | None:
+    """The mirror of the table's frames in this host's memory; None if it is off or there is no room."""
+    if config.learner.mirror == "off":
+        return None
+    slots, most = mirror_slots(config, spec), min(config.replay.capacity, config.total_steps)
+    if slots < most:
+        console.event(f"the mirror of the table has room for {slots:,} of {most:,} frames")
+    return FrameMirror(spec, slots) if slots else None
 
 
 def _exported(address: str, service: LearnerService) -> AbstractContextManager[object]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from common.errors import RunError
@@ -16,6 +17,7 @@ from common.types import Array, Batch, EnvSpec, Segment
 from replay.dedup import DuplicateFilter
 from replay.episodes import EpisodeLog
 from replay.limiter import RateLimiter
+from replay.mirrored import MirroredFrames
 from replay.recorder import NullRecorder, Recorder
 from replay.table.table import PinnedBatch, Table, TableSnapshot
 
@@ -62,6 +64,7 @@ class ReplayCore:
 
     batch_size: transitions of a draw. segment_steps: of a segment, at most.
     drawn: batches drawn, as the learner counts them: a learner restored from an epoch also resets this count.
+    mirrored: what the present learner's mirror holds.
     problem: why no segment can be inserted although the limiter admits it, in words; empty if there is no problem.
     """
 
@@ -78,6 +81,7 @@ class ReplayCore:
         self.segment_steps = config.actor.segment_steps
         self._total_steps = config.total_steps
         self.drawn = 0
+        self.mirrored = MirroredFrames()
         self.duplicates = 0
         self.problem = ""
         self.inserts_wait_for = ""
@@ -142,6 +146,28 @@ class ReplayCore:
         )
         self.table.insert(segment)
 
+    def draws(self, request: DrawRequest) -> list[Reply] | Wait:
+        """Draw the batches of a request, as many as are admitted; return the reason to wait if none is.
+
+        Raises:
+            RunError: another learner has superseded the one that asks.
+        """
+        replies: list[Reply] = []
+        episodes_from = request.episodes_from
+        for sequence in range(request.sequence, request.sequence + request.draws):
+            one = request
+            if replies:
+                one = msgspec.structs.replace(request, sequence=sequence, episodes_from=episodes_from, priorities=())
+            reply = self.draw(one)
+            if isinstance(reply, Wait):
+                return replies or reply
+            replies.append(reply)
+            _, drawn = reply
+            episodes_from = max(episodes_from, drawn.first_episode + len(drawn.episodes))
+            if len(drawn.episodes) == MAX_EPISODES:  # of which a message has no room for more
+                break
+        return replies
+
     def draw(self, request: DrawRequest) -> Reply | Wait:
         """Draw a batch, or repeat the one of an equal earlier request; return the reason to wait if none is admitted.
 
@@ -165,7 +191,7 @@ class ReplayCore:
         return reply
 
     def apply_draw(self, request: DrawRequest) -> Reply:
-        """Apply an admitted draw, a new one or one from a journal; raises as `draw`."""
+        """Apply an admitted draw, a new one or one from a journal, of the first of its batches; raises as `draw`."""
         self._follow(request)
         table = self.table
         if request.priorities:
@@ -248,6 +274,7 @@ class ReplayCore:
             if request.incarnation in self._learners:
                 raise RunError("another learner has taken over this run")
             self._learners = [*self._learners[-LEARNERS_KEPT:], request.incarnation]
+            self.mirrored.clear()
             self._forget(list(self._replies))
         if not known or request.base > self.drawn:
             self.drawn = request.base

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import ceil, isfinite
+from math import ceil, floor, isfinite
 from typing import Any
 
 from common.errors import UsageError
@@ -87,6 +87,17 @@ class RateLimiter:
         if updates > 0.5:
             return f"updates are {updates:,.0f} ahead of inserts"
         return f"the next update is due in {ceil(short):,} steps"
+
+    def admitted(self, inserted: int) -> int:
+        """The number below which draws are admitted, and remain so while these settings hold, if the table has any."""
+        if inserted < self.start:
+            return 0
+        most = self.draws_total
+        if self.total is None or inserted < self.total:
+            origin_inserted, origin_drawn = self.origin or (self.start, 0)
+            due = floor(origin_drawn + self.ratio * (inserted - origin_inserted + self.slack))
+            most = due if most is None else min(due, most)
+        return max(0, most or 0)
 
     def changed(
         self, inserted: int, drawn: int, *, ratio: float, tolerance: float | None = None, total: int | None = None

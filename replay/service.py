@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
+import numpy as np
+
 from common.errors import BadMessage, CoopError, RunError
 from common.messaging.keys import replay_key
 from common.messaging.members import ROUTE
@@ -20,14 +22,14 @@ from common.messaging.messages.answers import Ack, Retry
 from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.messages.insert import SegmentReader
 from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
-from common.messaging.messages.sample import DrawRequest, Memory, encode_batch, encode_slots
+from common.messaging.messages.sample import DrawRequest, Draws, Memory, encode_batch, encode_named
 from common.messaging.messages.stats import ReplayStats, StatsQuestion
 from common.messaging.messages.status import Ratio, ReplayStatus
-from common.messaging.transport import Node
+from common.messaging.transport import Node, new_incarnation
 from common.messaging.wire import Message
 from common.process.console import Console
 from common.process.lifecycle import Stop
-from replay.core import ReplayCore, Wait
+from replay.core import ReplayCore, Reply, Wait
 from replay.gate import HOLD, Gate
 from replay.persistence.epochs import ReplayEpochs
 
@@ -59,6 +61,7 @@ class ReplayService:
         self._draws = Gate(time.monotonic())
         self._leaving = False
         self._broken = ""  # why the core must no longer be used
+        self._table = new_incarnation()  # a process restored from a journal stores the frames in other slots
         self._batch = bytearray()  # the last answer; the next one reuses it: one thread answers, and sending copies
 
     def start(self) -> None:
@@ -161,14 +164,38 @@ class ReplayService:
         return outcome
 
     def _draw(self, request: DrawRequest) -> bytearray | Wait:
-        """Draw a batch as a message; frames that the learner cannot read are copied straight into it."""
-        reply = self._core.draw(request)
-        if isinstance(reply, Wait):
-            return reply
-        batch, drawn = reply
-        if request.memory and self._core.table.shared_memory:
-            return encode_slots(self._node.run, batch.frames.slots, batch.columns, drawn)
+        """Draw batches as a message; frames that the learner lacks are copied straight into it."""
+        replies = self._core.draws(request)
+        if isinstance(replies, Wait):
+            return replies
+        memory = self._core.table.shared_memory if request.memory else ""
+        if memory or request.mirror:
+            return self._named(request, replies, memory)
+        ((batch, drawn),) = replies
         return encode_batch(self._node.run, batch.frames, batch.columns, drawn, into=self._batch)
+
+    def _named(self, request: DrawRequest, replies: list[Reply], memory: str) -> bytearray:
+        """Answer with the slots of the batches' frames, and those frames that the learner lacks."""
+        core, start, carried = self._core, 0, []
+        for batch, drawn in replies:
+            if not memory:
+                pinned = batch.frames
+                lacks = core.mirrored.missing(request, drawn.sequence, pinned.slots, pinned.numbers)
+                carried.append(start + lacks)
+            start += len(batch.frames)
+        slots = np.concatenate([batch.frames.slots for batch, _ in replies])
+        indices = np.concatenate(carried) if carried else slots[:0]
+        draws = Draws(
+            table=self._table,
+            memory=memory,
+            admitted=core.limiter.admitted(core.table.inserted),
+            frames=tuple([len(batch.frames) for batch, _ in replies]),
+            draws=tuple([drawn for _, drawn in replies]),
+        )
+        frames = core.table.stored(slots)
+        columns = [batch.columns for batch, _ in replies]
+        lacking = core.table.stored(slots[indices])
+        return encode_named(self._node.run, draws, columns, slots, frames.numbers, indices, lacking, self._batch)
 
     def _admit(self, gate: Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
         """Try, and repeat whenever the core has changed, until the gate's deadline."""

@@ -37,6 +37,26 @@ def test_why_not_insert(limiter: RateLimiter, inserted: int, drawn: int, reason:
     assert limiter.why_not_insert(inserted, drawn) == reason
 
 
+@given(
+    ratio=st.sampled_from((0.125, 0.25, 1.0, 2.0, 8.0)),
+    tolerance=st.integers(0, 64),
+    inserted=st.integers(0, 300),
+    more=st.integers(0, 50),
+    changed=st.booleans(),
+    total=st.sampled_from((None, 200)),
+)
+def test_below_which_number_draws_are_admitted(
+    ratio: float, tolerance: int, inserted: int, more: int, changed: bool, total: int | None
+) -> None:
+    limiter = RateLimiter(ratio=ratio, start=40, tolerance=tolerance, total=total)
+    if changed:
+        limiter = limiter.changed(inserted, int(ratio * max(0, inserted - 40)), ratio=0.5)
+    admitted = limiter.admitted(inserted)
+    for drawn in range(max(0, admitted - 3), admitted + 3):
+        assert (limiter.why_not_sample(inserted, drawn, 10) is None) == (drawn < admitted)
+    assert limiter.admitted(inserted + more) >= admitted, "and it remains so"
+
+
 def test_what_displays_show_of_the_ratio() -> None:
     assert QUARTER.measured(100, 0) is None
     assert QUARTER.measured(QUARTER.start + 1, 2) == 2.0

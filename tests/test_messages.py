@@ -35,7 +35,16 @@ from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Vi
 from common.messaging.messages.insert import OPTIONAL, SegmentReader, encode_segment
 from common.messaging.messages.join import Join, Joined, Leave
 from common.messaging.messages.limits import Limit, Limits
-from common.messaging.messages.sample import BatchReader, Drawn, DrawRequest, EpisodeRecord, encode_batch
+from common.messaging.messages.sample import (
+    BatchReader,
+    Drawn,
+    DrawRequest,
+    Draws,
+    EpisodeRecord,
+    NamedBatchReader,
+    encode_batch,
+    encode_named,
+)
 from common.messaging.messages.stats import ReplayStats
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.messages.weights import Current, Role, Weights
@@ -71,6 +80,21 @@ def _encoded_batch() -> bytearray:
     return encode_batch("r", batch.frames, batch.columns, drawn)
 
 
+def _encoded_batches() -> bytearray:
+    """Two batches of eight, whose frames are named; the answer carries one frame of the first and two of the second."""
+    table = Table(SPEC, 100, rng=np.random.default_rng(0))
+    table.insert(make_segment(SPEC))
+    batches, slots = [table.sample_pinned(8) for _ in range(2)], np.arange(5)
+    frames = tuple(len(batch.frames) for batch in batches)
+    assert frames == (5, 5), "all that the table has"
+    drawn = Drawn(3, 4, 4, 0, 0, 0, ())
+    draws = Draws(9, "", 6, frames, (drawn, msgspec.structs.replace(drawn, sequence=4)))
+    columns, names = [batch.columns for batch in batches], np.concatenate((slots, slots))
+    return encode_named(
+        "r", draws, columns, names, names + 1, np.array([2, 5, 9]), table.stored(names[:3]), bytearray()
+    )
+
+
 READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "join": (JOIN.encode("r"), Join.decode),
     "joined": (JOINED.encode("r"), Joined.decode),
@@ -81,6 +105,7 @@ READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "error": (Error.of(BadMessage("f", "wrong")).encode("r"), Error.decode),
     "sample": (DrawRequest(1, 3, 2, 4, 5, ((7, 0.5),)).encode("r"), DrawRequest.decode),
     "batch": (_encoded_batch(), BatchReader(SPEC)),
+    "batches": (_encoded_batches(), NamedBatchReader(SPEC)),
     "weights": (Weights(2, 8, FLAT).encode("r"), partial(Weights.decode, parameters=3)),
     "role": (Role(2, (4, 5), 6).encode("r"), Role.decode),
     "stats": (STATS.encode("r"), ReplayStats.decode),
@@ -146,6 +171,19 @@ def test_arrays_come_back() -> None:
     assert drawn_back == drawn
     for name in ("frames", "obs_index", "next_index", "actions", "rewards", "weights", "ids", "age", "reuse"):
         np.testing.assert_array_equal(getattr(batch_back, name), getattr(batch.read(), name))
+
+
+def test_named_batches_come_back() -> None:
+    message = _valid("batches")
+    draws, batches = READERS["batches"][1](message)
+    assert (draws.table, draws.admitted, [drawn.sequence for drawn in draws.draws]) == (9, 6, [3, 4])
+    assert [batch.carried.tolist() for batch in batches] == [[2], [0, 4]]
+    np.testing.assert_array_equal(np.concatenate([batch.frames for batch in batches]), message.arrays["frames"])
+    for batch in batches:
+        assert (batch.slots.tolist(), batch.numbers.tolist()) == ([0, 1, 2, 3, 4], [1, 2, 3, 4, 5])
+    for name in ("obs_index", "next_index", "actions", "rewards", "weights", "ids", "age", "reuse"):
+        joined = np.concatenate([batch.columns[name] for batch in batches])
+        np.testing.assert_array_equal(joined, message.arrays[name])
 
 
 def _spec(**changes: object) -> dict[str, object]:
@@ -236,6 +274,17 @@ FIELDS = [
     ("sample", "sequence", 1),
     ("sample", "sequence", 2 + MAX_AHEAD),
     ("batch", "planned", -1),
+    ("sample", "mirror", -1),
+    ("sample", "mirror_slots", 2**31),
+    ("sample", "draws", 0),
+    ("sample", "draws", 2),  # without memory or mirror
+    ("batches", "table", -1),
+    ("batches", "memory", "/etc/passwd"),
+    ("batches", "admitted", -1),
+    ("batches", "frames", [10]),
+    ("batches", "frames", [5, 4]),
+    ("batches", "frames", [10, 0]),
+    ("batches", "draws", []),
     ("limit", "ratio", 0.0),
     ("limit", "ratio", math.nan),
     ("limit", "ratio", 1e7),
@@ -329,6 +378,19 @@ ARRAYS = [
     ("batch", "rewards", np.full(8, np.nan, np.float32), "rewards"),
     ("batch", "terminated", np.full(8, 3, np.uint8).view(np.bool_), "terminated"),
     ("batch", "weights", np.full(8, np.inf, np.float32), "weights"),
+    ("batches", "frames", np.full((3, 4), np.nan, np.float32), "frames"),
+    ("batches", "frames", np.zeros((2, 4), np.float32), "carried"),
+    ("batches", "slots", np.full(10, -1, np.int32), "slots"),
+    ("batches", "slots", np.zeros(9, np.int32), "numbers"),
+    ("batches", "numbers", np.zeros(10, np.int64), "numbers"),
+    ("batches", "carried", np.array([-1, 2, 3], np.int32), "carried"),
+    ("batches", "carried", np.array([1, 2, 10], np.int32), "carried"),
+    ("batches", "carried", np.array([1, 2, 2], np.int32), "carried"),
+    ("batches", "obs_index", np.full((16, 1), 5, np.int32), "obs_index"),
+    ("batches", "next_index", np.full((16, 1), -1, np.int32), "next_index"),
+    ("batches", "actions", np.full(16, 2, np.int32), "actions"),
+    ("batches", "actions", np.zeros(15, np.int32), "actions"),
+    ("batches", "weights", np.full(16, np.inf, np.float32), "weights"),
     ("weights", "flat", np.zeros(4, np.float32), "flat"),
     ("weights", "flat", np.zeros(3), "flat"),
 ]
@@ -397,10 +459,11 @@ def test_every_kind_refuses_what_is_missing_or_unknown(kind: str) -> None:
             read(_sent(message, arrays={key: value for key, value in message.arrays.items() if key != name}))
 
 
-@pytest.mark.parametrize("kind", ["insert", "batch"])
+@pytest.mark.parametrize("kind", ["insert", "batch", "batches"])
 def test_nothing_at_all_is_refused(kind: str) -> None:
     message = _valid(kind)
-    arrays = {name: array if name == "frames" else array[:0] for name, array in message.arrays.items()}
+    kept = {"frames", "slots", "numbers", "carried"}
+    arrays = {name: array if name in kept else array[:0] for name, array in message.arrays.items()}
     with pytest.raises(BadMessage) as caught:
         READERS[kind][1](_sent(message, arrays=arrays))
     assert caught.value.field == "arrays.actions"

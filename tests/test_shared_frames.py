@@ -16,7 +16,7 @@ from samples import await_service, make_segment
 from common.errors import BadMessage
 from common.messaging.keys import replay_key
 from common.messaging.messages.insert import encode_segment
-from common.messaging.messages.sample import BatchReader, DrawRequest, Memory
+from common.messaging.messages.sample import BatchReader, DrawRequest, Memory, NamedBatchReader
 from common.messaging.sample_client import SampleClient
 from common.messaging.session import open_session
 from common.messaging.shared_frames import SharedFrames
@@ -112,11 +112,13 @@ def test_a_message_carries_frames_or_slots_or_the_memory(nodes: tuple[Node, Node
     assert core.drawn == 0, "the learner asks again"
     by_link, by_slot = _draw(asker, 0, None), _draw(asker, 0, address)
     assert "slots" not in by_link.arrays
-    assert "frames" not in by_slot.arrays
-    read, shared = BatchReader(SPEC), SharedFrames(address, SPEC)
-    _assert_equal(read(by_slot, shared)[0], read(by_link, shared)[0])
-    with pytest.raises(BadMessage, match="slots"):
-        read(by_slot)
+    assert not len(by_slot.arrays["frames"])
+    draws, (named,) = NamedBatchReader(SPEC)(by_slot)
+    assert draws.memory == address
+    batch = Batch(frames=SharedFrames(address, SPEC).read(named.slots), **named.columns)
+    _assert_equal(batch, BatchReader(SPEC)(by_link)[0])
+    with pytest.raises(BadMessage, match="kind"):
+        BatchReader(SPEC)(by_slot)
     with pytest.raises(Refused, match="memory"):
         _draw(asker, 1, f"{address}/..")
 

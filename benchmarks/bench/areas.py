@@ -78,6 +78,7 @@ def _service() -> Iterator[Comparison]:
         "Reverb": Subject("service_reverb", venv="reverb", cores=0),
         **{f"coop {way}": Subject("service_coop", (way,), cores=0) for way in ways},
         **{f"{name} {way}": Subject("service_bare", (way, bare[name]), cores=0) for name, way in product(bare, ways)},
+        "coop tcp, no mirror": Subject("service_coop", ("whole",), cores=0),
         "coop router": Subject("service_coop", ("router",), cores=0),
     }
     yield Comparison("service", "replay service", subjects, "Reverb", seconds=3.0)
@@ -181,7 +182,8 @@ BATCHES, BESIDE = "batches/s alone", "batches/s beside inserts"
 RIVALS = ("Stable-Baselines3", "TorchRL")
 OTHERS = ("cpprb", "Stable-Baselines3", "TorchRL")
 TARGETS = (
-    Target("replay service", BESIDE, "coop tcp", ("Reverb",), 6.0),
+    Target("replay service", BESIDE, "coop tcp", ("Reverb",), 15.0),
+    Target("replay service", BESIDE, "coop tcp", ("coop tcp, no mirror",), 3.0),
     Target("replay service", BESIDE, "coop shm", ("Reverb",), 10.0),
     Target("replay service", "inserted/s alone", "coop tcp", ("Reverb",), 10.0),
     Target("replay service", BESIDE, "coop tcp", ("bare tcp",), 0.75),

@@ -1,4 +1,4 @@
-"""The client that draws: prefetched batches, whose frames it may read in the replay service's memory.
+"""The client that draws: prefetched batches, whose frames it may read in a mirror or in the replay service's memory.
 
 It has no thread of its own: Zenoh works in the background, and the caller processes the answers.
 """
@@ -6,6 +6,7 @@ It has no thread of its own: Zenoh works in the background, and the caller proce
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -15,22 +16,43 @@ from common.bounds import MAX_AHEAD
 from common.errors import BadMessage
 from common.messaging.keys import replay_key
 from common.messaging.messages.answers import Retry
-from common.messaging.messages.sample import BatchReader, Drawn, DrawRequest, Memory
+from common.messaging.messages.sample import (
+    NAMED,
+    BatchReader,
+    Drawn,
+    DrawRequest,
+    Memory,
+    NamedBatch,
+    NamedBatchReader,
+)
+from common.messaging.mirror import FrameMirror
 from common.messaging.repeating import BAD_ANSWER, NO_ANSWER, Backoff
 from common.messaging.shared_frames import SharedFrames
 from common.messaging.transport import NoAnswer, Node, Pending
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
+from common.settings.capacity import frame_bytes
 from common.types import Batch, EnvSpec
+
+TOGETHER = 1 << 24  # bytes of batches that are asked for in one request, unless it is a single one
+
+
+class _Asked(NamedTuple):
+    """A request in flight, for `draws` batches from number `first` on."""
+
+    first: int
+    draws: int
+    pending: Pending
 
 
 class SampleClient:
-    """Draws batches, with `prefetch` requests in flight.
+    """Draws batches, with `prefetch` of them asked for ahead, several in one request where none will have to wait.
 
     Args:
         first: number of the first batch, the learner's count of updates at the start.
         episodes: number of episodes that the learner has received before.
         shared_memory: read the frames in the replay service's memory if it is on this machine and shares them.
+        mirror: of the table's frames, so that each crosses once; None: each batch brings all its frames.
 
     Attributes:
         episodes: number of episodes received so far.
@@ -49,6 +71,7 @@ class SampleClient:
         episodes: int = 0,
         *,
         shared_memory: bool = False,
+        mirror: FrameMirror | None = None,
     ) -> None:
         self.episodes = episodes
         self.waiting = ""
@@ -57,17 +80,23 @@ class SampleClient:
         self._incarnation = incarnation
         self._batch_size = batch_size
         self._prefetch = prefetch
+        batch_bytes = batch_size * (spec.stack + 1) * frame_bytes(spec)
+        self._together = max(1, min(prefetch // 2, TOGETHER // batch_bytes))
         self._spec = spec
         self._read = BatchReader(spec)
+        self._read_named = NamedBatchReader(spec)
         self._shares = shared_memory
         self._shared: SharedFrames | None = None
+        self._mirror = mirror
         self._key = replay_key(node, "sample")
-        self._outstanding: deque[tuple[int, Pending]] = deque()
+        self._outstanding: deque[_Asked] = deque()
+        self._arrived: deque[tuple[Batch | NamedBatch, Drawn]] = deque()
+        self._admitted = 0  # draws of lower numbers need not wait
         self._next = first
         self._done = first
         self._pinned: int | None = None
         self._trained: list[tuple[int, float]] = []  # priorities that no request contains yet
-        self._carried: dict[int, tuple[tuple[int, float], ...]] = {}  # by number of the request that contains them
+        self._carried: dict[int, tuple[tuple[int, float], ...]] = {}  # by first number of the request with them
         self._backoff = Backoff()
 
     def pin(self) -> int:
@@ -89,46 +118,117 @@ class SampleClient:
         Raises:
             Refused: the replay service rejected a request as invalid, or now serves another learner.
         """
-        while len(self._outstanding) < self._prefetch and self._next < self._base + MAX_AHEAD:
-            self._carried[self._next], self._trained = tuple(self._trained), []
-            self._outstanding.append((self._next, self._request(self._next)))
-            self._next += 1
-        if not self._outstanding:
+        self._ask_ahead()
+        if not self._outstanding and not self._arrived:
             self.waiting = "the replay service has not begun its part of the epoch"
             self._backoff.pause(self._stop)
             return None
-        sequence, pending = self._outstanding[0]
         try:
-            message = pending.wait()
-            if message.kind == Memory.kind:
-                self._share(Memory.decode(message).address)
-                # All of them, in their order: the later ones have met the same answer, or will.
-                self._outstanding = deque((number, self._request(number)) for number, _ in self._outstanding)
-                return None
-            if message.kind != Retry.kind:
-                accepted = self._accept(message, sequence)
-                self._outstanding.popleft()
-                return accepted
-            self.waiting = Retry.decode(message).reason
+            if self._arrived or self._receive():
+                if (batch := self._frames_of(*self._arrived[0])) is not None:
+                    return batch, self._accept()
+                self._ask_again()  # and the answer will carry what the mirror lacks
+            return None
         except NoAnswer:
             self.waiting = NO_ANSWER
         except BadMessage as error:
             self.waiting = f"{BAD_ANSWER}: {error}"
         self._backoff.pause(self._stop)
-        self._outstanding[0] = (sequence, self._request(sequence))
+        self._ask_again()
         return None
 
     @property
     def _base(self) -> int:
         return self._done if self._pinned is None else self._pinned
 
-    def _request(self, sequence: int) -> Pending:
-        priorities = self._carried[sequence]
+    def _ask_ahead(self) -> None:
+        """Ask for the batches up to `prefetch`; for several that need not wait together, or not yet."""
+        while (room := min(self._done + self._prefetch, self._base + MAX_AHEAD) - self._next) > 0:
+            count = max(1, min(self._together, self._admitted - self._next))
+            if count > room and (self._outstanding or self._arrived):
+                return
+            count = min(count, room)
+            self._carried[self._next], self._trained = tuple(self._trained), []
+            self._outstanding.append(self._request(self._next, count))
+            self._next += count
+
+    def _request(self, first: int, count: int) -> _Asked:
         memory = self._shared.address if self._shared else "" if self._shares else None
+        mirror = self._mirror
         request = DrawRequest(
-            self._incarnation, sequence, self._base, self._batch_size, self.episodes, priorities, memory
+            self._incarnation,
+            first,
+            self._base,
+            self._batch_size,
+            self.episodes,
+            self._carried.get(first, ()),
+            memory,
+            0 if mirror is None else mirror.number,
+            0 if mirror is None else mirror.slots,
+            count,
         )
-        return self._node.begin(self._key, request.encode(self._node.run))
+        return _Asked(first, count, self._node.begin(self._key, request.encode(self._node.run)))
+
+    def _ask_again(self) -> None:
+        """Ask again for the batches that have arrived, or else for those that were to arrive first."""
+        if self._arrived:
+            self._outstanding.appendleft(self._request(self._done, len(self._arrived)))
+            self._arrived.clear()
+        else:
+            first, count, _ = self._outstanding[0]
+            self._outstanding[0] = self._request(first, count)
+
+    def _receive(self) -> bool:
+        """Wait for the first answer; False if it is no batch, and batches have been asked for again."""
+        first, count, pending = self._outstanding[0]
+        message = pending.wait()
+        if message.kind == Memory.kind:
+            self._share(Memory.decode(message).address)
+            # All of them, in their order: the later ones have met the same answer, or will.
+            self._outstanding = deque(self._request(first, count) for first, count, _ in self._outstanding)
+            return False
+        if message.kind == Retry.kind:
+            self.waiting = Retry.decode(message).reason
+            self._backoff.pause(self._stop)
+            self._ask_again()
+            return False
+        arrived: list[tuple[Batch | NamedBatch, Drawn]] = []
+        if message.kind == NAMED:
+            draws, batches = self._read_named(message)
+            self._admitted = draws.admitted
+            arrived += zip(batches, draws.draws, strict=True)
+            if not draws.memory:
+                self._mirrored(message, draws.table)
+        else:
+            arrived.append(self._read(message))
+        numbers = [drawn.sequence for _, drawn in arrived]
+        if numbers != list(range(first, first + len(numbers))) or len(numbers) > count:
+            raise BadMessage("fields.sequence", f"{numbers} instead of {count} from {first} on")
+        self._outstanding.popleft()
+        self._arrived.extend(arrived)
+        if len(arrived) < count:
+            self._outstanding.appendleft(self._request(first + len(arrived), count - len(arrived)))
+        return True
+
+    def _mirrored(self, message: Message, table: int) -> None:
+        """Write the frames that an answer carries to the mirror."""
+        if self._mirror is None:
+            raise BadMessage("fields.memory", "none, and there is no mirror")
+        carried = message.arrays["carried"]
+        slots, numbers = message.arrays["slots"][carried], message.arrays["numbers"][carried]
+        self._mirror.write(table, slots, numbers, message.arrays["frames"])
+
+    def _frames_of(self, batch: Batch | NamedBatch, drawn: Drawn) -> Batch | None:
+        """The batch with its frames; None if the mirror lacks some."""
+        if isinstance(batch, Batch):
+            return batch
+        if not batch.memory:
+            frames = None if self._mirror is None else self._mirror.read(batch)
+        elif self._shared is None or self._shared.address != batch.memory:
+            raise BadMessage("fields.memory", f"{batch.memory!r}, which this process does not read")
+        else:
+            frames = self._shared.read(batch.slots)
+        return None if frames is None else Batch(frames=frames, **batch.columns)
 
     def _share(self, address: str) -> None:
         """Read frames there from now on, or nowhere if this process does not reach them."""
@@ -138,15 +238,14 @@ class SampleClient:
             except OSError:
                 self._shared, self._shares = None, False
 
-    def _accept(self, message: Message, sequence: int) -> tuple[Batch, Drawn]:
-        batch, drawn = self._read(message, self._shared)
-        if drawn.sequence != sequence:
-            raise BadMessage("fields.sequence", f"{drawn.sequence} instead of {sequence}")
+    def _accept(self) -> Drawn:
+        """Note that the first batch has arrived; return what accompanies it, without episodes that have before."""
+        _, drawn = self._arrived.popleft()
         self._backoff.reset()
         self.waiting = ""
-        self._done = sequence + 1
-        del self._carried[sequence]
+        self._done = drawn.sequence + 1
+        self._carried.pop(drawn.sequence, None)
         first = max(self.episodes, drawn.first_episode)
         fresh = drawn.episodes[first - drawn.first_episode :]
         self.episodes = first + len(fresh)
-        return batch, msgspec.structs.replace(drawn, first_episode=first, episodes=fresh)
+        return msgspec.structs.replace(drawn, first_episode=first, episodes=fresh)

@@ -21,8 +21,8 @@ from common.bounds import MAX_PAYLOAD
 from common.errors import BadMessage
 from common.types import Array
 
-PROTOCOL = 7
-ON_DISK = frozenset({1, 2, 3, 4, 5, 6, 7})  # protocols whose segments and batches in journals and snapshots can be read
+PROTOCOL = 8
+ON_DISK = frozenset({1, 2, 3, 4, 5, 6, 7, 8})  # protocols whose segments and batches on disk can be read
 MAGIC = 0x434F4F50  # "COOP"
 ALIGNMENT = 64
 MAX_HEADER = 1 << 20

@@ -10,13 +10,16 @@ import numpy as np
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
+from common.process.memory import job_memory
 from common.settings.config import RunConfig
 from common.settings.policies import EVICTIONS
 from common.types import EnvSpec
 
-# actions, rewards, terminated, span, param_version, ids, reuse; three counters of the frame's slot.
-ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4 + 3 * 4
+ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4  # actions, rewards, terminated, span, param_version, ids, reuse
+SLOT_BYTES = 3 * 4 + 8  # counters of a frame's slot, and its number
 HEADER_BYTES = 1 << 20  # of a message, including the alignment of its arrays
+NAME_BYTES = 4 + 8 + 4  # slot, number and place of a frame in an answer to a draw
+MIRROR_SHARE = 0.25  # of the memory that the learner's job may use: the most for its mirror of the table's frames
 
 
 def frame_bytes(spec: EnvSpec) -> int:
@@ -26,23 +29,32 @@ def frame_bytes(spec: EnvSpec) -> int:
 
 def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
     """Bytes of a full table with one frame per transition, including the frames' counters; uniform sampling."""
-    return capacity * (frame_bytes(spec) + ROW_BYTES + 2 * 4 * spec.stack)
+    return capacity * (frame_bytes(spec) + SLOT_BYTES + ROW_BYTES + 2 * 4 * spec.stack)
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Raise UsageError for a table that does not fit into this machine's memory.
-
-    Eviction policies that do not evict in order may keep stack + 1 frames per transition.
-    """
+    """Raise UsageError for a table that does not fit into this machine's memory."""
     capacity = config.replay.capacity
-    copies = 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
-    needed = estimated_bytes(spec, min(capacity, config.total_steps)) * copies
+    needed = _most_bytes(config, spec)
     present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > present:
         raise UsageError(
             f"replay.capacity = {capacity:,}: needs up to {needed / 2**30:.1f} GiB, this machine has "
             f"{present / 2**30:.1f} GiB"
         )
+
+
+def mirror_slots(config: RunConfig, spec: EnvSpec) -> int:
+    """The most frames that the learner's mirror may hold, as if the table were on this machine, too; 0 for no room."""
+    memory = job_memory()
+    room = min(MIRROR_SHARE * memory, (memory - _most_bytes(config, spec)) / 2)
+    return max(0, min(2**31 - 1, int(room) // (frame_bytes(spec) + 8)))  # each with its number
+
+
+def _most_bytes(config: RunConfig, spec: EnvSpec) -> int:
+    """Bytes of a run's full table; policies that do not evict in order may keep stack + 1 frames per transition."""
+    copies = 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
+    return estimated_bytes(spec, min(config.replay.capacity, config.total_steps)) * copies
 
 
 def check_messages(config: RunConfig, spec: EnvSpec) -> None:
@@ -53,7 +65,7 @@ def check_messages(config: RunConfig, spec: EnvSpec) -> None:
     """
     row = ROW_BYTES + 2 * 4 * spec.stack
     room = MAX_PAYLOAD - HEADER_BYTES
-    batch = room // ((spec.stack + 1) * frame_bytes(spec) + row)
+    batch = room // ((spec.stack + 1) * (frame_bytes(spec) + NAME_BYTES) + row)
     segment = (room - spec.stack * frame_bytes(spec)) // (2 * frame_bytes(spec) + row) - (config.replay.n_step - 1)
     allowed = {
         "learner.batch_size": (config.learner.batch_size, batch),

@@ -31,7 +31,7 @@ from common.settings.names import EvictionName, MethodName, SamplingName
 from common.settings.policies import EVICTIONS, SAMPLERS
 
 OUTSIDE = ("checkpoint_every", "eval_every", "eval_episodes", "video_every")  # training does not depend on these
-OF_MACHINE = ("device", "threads")  # of `learner`: a run may move to another machine
+OF_MACHINE = ("device", "threads", "mirror")  # of `learner`: a run may move to another machine
 NETWORK_KINDS = ("mlp", "nature", "nips2013", "minatar")
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 
@@ -107,7 +107,9 @@ class LearnerSettings:
     threads: Positive = 1
     """CPU threads that PyTorch uses in the learner."""
     prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 4
-    """Number of sample requests in flight."""
+    """Batches that are asked for ahead."""
+    mirror: Literal["auto", "off"] = "auto"
+    """auto: keep copies of the table's frames, in at most a quarter of the memory, so that each is sent once."""
     publish_every: Positive = 10
     """Updates between broadcasts of the acting network; every swap is broadcast too."""
 

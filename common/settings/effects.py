@@ -75,6 +75,7 @@ _CONDITIONS = (
 _OF_PROCESSES = (
     "actor.segment_steps",
     "actor.window",
+    "learner.mirror",
     "learner.prefetch",
     "learner.publish_every",
     "replay.journal",

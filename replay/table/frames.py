@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import mmap
 from contextlib import suppress
 from types import TracebackType
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from common.process.memory import GrowingRows
 from common.process.shared_memory import SharedMemory
 from common.types import Array
 
@@ -38,20 +38,20 @@ class FrameStore:
         self.frame_shape = frame_shape
         self.dtype = np.dtype(frame_dtype)
         self.frame_bytes = math.prod(frame_shape) * self.dtype.itemsize
-        self._whole = np.dtype((np.void, self.frame_bytes))  # a frame as one item, which numpy copies fastest
         self._used = 0  # slots ever used; those above were never written
         self._free_count = 0
+        self._stored = 0  # frames ever stored
+        self._numbers = np.zeros(FIRST_SLOTS, np.int64)  # of the frame in each slot, in the order in which they came
         self._references = np.zeros(FIRST_SLOTS, np.int32)
         self._free = np.zeros(FIRST_SLOTS, np.int32)  # a stack of free slots below `_used`
         self._mark = np.zeros(FIRST_SLOTS, np.int32)  # scratch of `unique`
-        size = FIRST_SLOTS * self.frame_bytes
-        self.shared_memory = ""
-        self._memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        self.shared_memory, memory = "", None
         if shared_memory:
             with suppress(OSError):
-                self._shared = SharedMemory(size)  # which closes its file when it is collected
-                self._memory, self.shared_memory = self._shared.mapped, self._shared.address
-        self._rows = self._view(FIRST_SLOTS)
+                # Closes its file when it is collected.
+                self._shared = SharedMemory(FIRST_SLOTS * self.frame_bytes)
+                memory, self.shared_memory = self._shared.mapped, self._shared.address
+        self._rows = GrowingRows(self.frame_bytes, FIRST_SLOTS, memory)
 
     @property
     def held(self) -> int:
@@ -65,8 +65,8 @@ class FrameStore:
 
     @property
     def bytes_held(self) -> int:
-        """Bytes of the held frames and of the three counters of every slot ever used."""
-        return self.held * self.frame_bytes + self._used * 3 * self._references.itemsize
+        """Bytes of the held frames, and of the three counters and the frame's number of every slot ever used."""
+        return self.held * self.frame_bytes + self._used * (3 * self._references.itemsize + self._numbers.itemsize)
 
     def add(self, frames: Array, references: NDArray[np.intp]) -> Slots:
         """Store frames [n, *frame_shape] with references intp [n] (>= 1) each; return their slots, intp [n]."""
@@ -81,9 +81,15 @@ class FrameStore:
         if fresh:
             slots[recycled:] = np.arange(self._used, self._used + fresh)
             self._used += fresh
-        self._rows[slots] = self._items(frames)
+        self._rows.view[slots] = self._items(frames)
         self._references[slots] = references
+        self._numbers[slots] = np.arange(self._stored + 1, self._stored + count + 1)
+        self._stored += count
         return slots
+
+    def numbers(self, slots: Slots) -> NDArray[np.int64]:
+        """The numbers, from 1, of the frames in `slots`, int64 [n]: each frame that is stored gets the next one."""
+        return self._numbers[slots]
 
     def hold(self, slots: Slots, references: NDArray[np.intp] | int = 1) -> None:
         """Add references to distinct slots that are already held."""
@@ -113,8 +119,10 @@ class FrameStore:
     def read(self, slots: Slots, out: Array | None = None) -> Array:
         """Copy the frames in `slots`, [n, *frame_shape], to `out`, contiguous memory, or to a new array."""
         if out is None:
-            return self._rows.take(slots).view(self.dtype).reshape(len(slots), *self.frame_shape)
-        self._rows.take(slots, out=self._items(out), mode="clip")  # mode: without it numpy first copies to a buffer
+            return self._rows.view.take(slots).view(self.dtype).reshape(len(slots), *self.frame_shape)
+        self._rows.view.take(
+            slots, out=self._items(out), mode="clip"
+        )  # mode: without it numpy first copies to a buffer
         return out
 
     def pin(self, slots: Slots) -> PinnedFrames:
@@ -129,29 +137,24 @@ class FrameStore:
 
     def _items(self, frames: Array) -> NDArray[np.void]:
         """Frames [n, *frame_shape] as void [n], without a copy if they are contiguous."""
-        return np.ascontiguousarray(frames).reshape(-1).view(self._whole)
-
-    def _view(self, slots: int) -> NDArray[np.void]:
-        return np.frombuffer(self._memory, self._whole, slots)
+        return np.ascontiguousarray(frames).reshape(-1).view(self._rows.dtype)
 
     def _grow(self, needed: int) -> None:
         slots = max(needed, int(len(self._references) * GROWTH))
-        for name in ("_references", "_free", "_mark"):
-            larger = np.zeros(slots, np.int32)  # zeros are committed only when written
-            larger[: self._used] = getattr(self, name)[: self._used]
+        for name in ("_references", "_free", "_mark", "_numbers"):
+            array = getattr(self, name)
+            larger = np.zeros(slots, array.dtype)  # zeros are committed only when written
+            larger[: self._used] = array[: self._used]
             setattr(self, name, larger)
-        del self._rows  # a mapping cannot be moved while a view on it exists
-        self._memory.resize(slots * self.frame_bytes)
-        self._rows = self._view(slots)
+        self._rows.grow(slots)
 
 
-class PinnedFrames:
-    """Frames of a store that stay unchanged until `release`, whatever is evicted meanwhile; a `wire.Source`."""
+class StoredFrames:
+    """Frames of a store as a `wire.Source`; they must be held by others as long as it is used."""
 
     def __init__(self, store: FrameStore, slots: Slots) -> None:
         self._store = store
         self._slots = slots
-        store.hold(slots)
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -160,6 +163,11 @@ class PinnedFrames:
     def slots(self) -> Slots:
         """Where the frames lie: intp [n]."""
         return self._slots
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """The frames' numbers, int64 [n], see `FrameStore.numbers`."""
+        return self._store.numbers(self._slots)
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -173,16 +181,24 @@ class PinnedFrames:
 
     @property
     def nbytes(self) -> int:
-        """Of all pinned frames."""
+        """Of all these frames."""
         return len(self._slots) * self._store.frame_bytes
 
     def copy_to(self, out: Array) -> None:
-        """Copy all pinned frames to `out`, contiguous memory [n, *frame_shape]."""
+        """Copy all these frames to `out`, contiguous memory [n, *frame_shape]."""
         self._store.read(self._slots, out)
 
     def read(self, start: int = 0, stop: int | None = None) -> Array:
-        """Copy of the pinned frames start..stop (default: all): [stop - start, *frame_shape]."""
+        """Copy of the frames start..stop (default: all): [stop - start, *frame_shape]."""
         return self._store.read(self._slots[start:stop])
+
+
+class PinnedFrames(StoredFrames):
+    """Frames of a store that stay unchanged until `release`, whatever is evicted meanwhile."""
+
+    def __init__(self, store: FrameStore, slots: Slots) -> None:
+        super().__init__(store, slots)
+        store.hold(slots)
 
     def release(self) -> None:
         """Release the frames; a second call does nothing."""

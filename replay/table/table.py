@@ -13,7 +13,7 @@ from common.settings.policies import EVICTIONS, SAMPLERS
 from common.types import Array, Batch, EnvSpec, Segment
 from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
 from replay.table.columns import Columns
-from replay.table.frames import FrameStore, PinnedFrames, Slots
+from replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
 from replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
 from replay.table.streams import StreamTails
 
@@ -149,6 +149,10 @@ class Table:
         """Draw like `sample`, but leave the frames in the table."""
         slots, columns = self._draw(batch_size)
         return PinnedBatch(self._frames.pin(slots), columns)
+
+    def stored(self, slots: Slots) -> StoredFrames:
+        """The frames in these slots, intp [n], which must be pinned as long as it is used."""
+        return StoredFrames(self._frames, slots)
 
     def pin(self, batch: Batch) -> PinnedBatch:
         """Store the frames of a batch that was drawn before this table was restored."""

@@ -1,4 +1,7 @@
-"""A real `coop-replay` and its clients: service_coop.py tcp|shm|router (before the inserting ones)."""
+"""A real `coop-replay` and its clients: service_coop.py tcp|shm|whole|router (before the inserting ones).
+
+whole: over TCP without the learner's mirror, so that each batch brings all its frames.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from made_up import ATARI, segments
 from service_work import BATCH, CAPACITY, STEPS, Inserters, attend_service, insert_on_demand
 
 from common.messaging.insert_client import InsertClient
+from common.messaging.mirror import FrameMirror
 from common.messaging.route import open_client
 from common.messaging.sample_client import SampleClient
 from common.messaging.session import open_session
@@ -20,6 +24,7 @@ from common.messaging.transport import Node, new_incarnation
 from common.process.lifecycle import Stop
 from common.process.memory import keep_freed_memory
 from common.process.processes import ChildProcess, command, free_endpoint
+from common.settings.capacity import mirror_slots
 from common.settings.tables import validated
 from learner.join_service import JoinService
 from learner.roster import Roster
@@ -76,7 +81,10 @@ def main(way: str) -> None:
         if way == "router":
             serve("router", "--connect", head, "--listen", gate)
         inserters = Inserters(stack, inserter, (gate,) if way == "router" else (head, replay), way)
-        sampler = SampleClient(node, Stop(), incarnation, ATARI, BATCH, PREFETCH, shared_memory=way == "shm")
+        mirror = None if way == "whole" else FrameMirror(ATARI, mirror_slots(CONFIG, ATARI))
+        sampler = SampleClient(
+            node, Stop(), incarnation, ATARI, BATCH, PREFETCH, shared_memory=way == "shm", mirror=mirror
+        )
         inserters.insert(1.0)
         attend_service(inserters, sampler.next)
 

@@ -14,7 +14,7 @@ from turns import attend
 
 INSERTERS = 2
 BATCH, STEPS = 32, 32  # transitions of a draw, and of a segment
-CAPACITY = 50_000
+CAPACITY = 100_000
 INSERT_RATE = 5200.0  # transitions/s inserted while batches are drawn, by all
 
 # Inserts a segment, perhaps without waiting for its answer; waits for all answers.

@@ -39,17 +39,21 @@ def transitions(spec: EnvSpec, rows: str) -> dict[str, tuple[str, tuple[int | st
     }
 
 
-def check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
-    """Check the values of the arrays that segments and batches share, at least one row each; raises BadMessage."""
-    frames = arrays["frames"]
+def check_indices(arrays: Mapping[str, Array], frames: int) -> None:
+    """Check that a segment or a batch, of at least one row, refers to `frames` frames; raises BadMessage."""
     for name in ("obs_index", "next_index"):
-        check_range(f"arrays.{name}", arrays[name], 0, len(frames) - 1)
+        check_range(f"arrays.{name}", arrays[name], 0, frames - 1)
+
+
+def check_values(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
+    """Check the values of the arrays that segments and batches share; raises BadMessage."""
     check_range("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
     most = MAX_MAGNITUDE
     if "span" in arrays:
         check_range("arrays.span", arrays["span"], 1, MAX_N_STEP)
         most *= int(arrays["span"].max())  # rewards that a transition sums
     check_range("arrays.rewards", arrays["rewards"], -most, most)
+    frames = arrays["frames"]
     if frames.dtype == np.bool_:
         check_range("arrays.frames", frames.view(np.uint8), 0, 1)
     elif frames.dtype == np.float32:
@@ -60,6 +64,8 @@ def check_transitions(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
 
 def check_range(field: str, array: Array, low: float, high: float) -> None:
     """Raise BadMessage for a value outside [low, high] and for NaN."""
+    if not array.size:
+        return
     least, most = array.item(array.argmin()), array.item(array.argmax())  # min and max take thrice as long
     if not (low <= least and most <= high):
         raise BadMessage(field, f"values from {least} to {most}; allowed: {low} to {high}")
@@ -79,7 +85,8 @@ class SegmentReader:
         steps, frames = lengths["steps"], lengths["frames"]
         if not 1 <= steps <= MAX_SEGMENT_STEPS:
             raise BadMessage("arrays.actions", f"{steps} steps; allowed: 1 to {MAX_SEGMENT_STEPS}")
-        check_transitions(self._spec, message.arrays)
+        check_indices(message.arrays, frames)
+        check_values(self._spec, message.arrays)
         segment = to_struct(message, Segment, self._layout)
         if segment.carried > frames:
             raise BadMessage("fields.carried", f"{segment.carried} of {frames} frames")

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Self
 
+import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
 from common.bounded import Count, Counter, Incarnation, Updates
-from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_PRIORITIES, MAX_STREAMS, MAX_UPDATES
+from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_INTEGER, MAX_PRIORITIES, MAX_STREAMS, MAX_UPDATES
 from common.errors import BadMessage
 from common.messaging import wire
 from common.messaging.messages.body import Body, Layout, check_kind, to_struct
-from common.messaging.messages.insert import OPTIONAL, check_range, check_transitions, transitions
-from common.messaging.shared_frames import SharedFrames
+from common.messaging.messages.insert import OPTIONAL, check_indices, check_range, check_values, transitions
 from common.messaging.wire import Message, Source
 from common.process.shared_memory import ADDRESS
 from common.types import Array, Batch, EnvSpec, EpisodeEnd
 
 MAX_EPISODES = 1000  # in one answer; the next answer carries the rest
 KIND = "batch"
+NAMED = "batches"  # whose frames are named
 
 Priority = Annotated[float, Meta(ge=0, le=MAX_FLOAT32)]
 
@@ -54,14 +57,15 @@ class Drawn(Struct, frozen=True):
 
 
 class DrawRequest(Body, frozen=True):
-    """A request for the batch of update number `sequence`; a repeated request gets the same batch.
+    """A request for the batches of `draws` updates from number `sequence` on; a repeated request gets the same batches.
 
     base: updates that the learner will not repeat: it never asks again for a batch below. A replay service that
         has drawn fewer, or that served another incarnation, sets its own count of draws to it.
     episodes_from: number of the first episode that the learner has not received.
     priorities: new priorities (id of a transition, |TD error|), set before the draw.
     memory: the memory of the table's frames if the learner reads them there; "" if it could, but doesn't know where.
-        Otherwise the answer carries the frames.
+    mirror, mirror_slots: the number of the learner's mirror of the table's frames, and its size; 0 if it has none.
+        Without memory or mirror, a request is for one batch, and the answer carries all its frames.
     """
 
     kind: ClassVar[str] = "sample"
@@ -73,14 +77,19 @@ class DrawRequest(Body, frozen=True):
     episodes_from: Count
     priorities: Annotated[tuple[tuple[Counter, Priority], ...], Meta(max_length=MAX_PRIORITIES)] = ()
     memory: Annotated[str, Meta(pattern=f"{ADDRESS}|^$")] | None = None
+    mirror: Counter = 0
+    mirror_slots: Annotated[int, Meta(ge=0, lt=2**31)] = 0
+    draws: Annotated[int, Meta(ge=1, le=MAX_AHEAD)] = 1
 
     @classmethod
     def decode(cls, message: Message) -> Self:
         """Read it; raises BadMessage."""
         request = super().decode(message)
-        if not request.base <= request.sequence < request.base + MAX_AHEAD:
-            allowed = f"{request.base} to {request.base + MAX_AHEAD - 1}"
+        if not request.base <= request.sequence <= request.base + MAX_AHEAD - request.draws:
+            allowed = f"{request.base} to {request.base + MAX_AHEAD - request.draws}"
             raise BadMessage("fields.sequence", f"{request.sequence}; with base {request.base}: {allowed}")
+        if request.draws > 1 and not (request.memory or request.mirror):
+            raise BadMessage("fields.draws", f"{request.draws}; allowed without memory or mirror: 1")
         return request
 
 
@@ -99,37 +108,139 @@ def encode_batch(
     return wire.encode(KIND, run, drawn, {"frames": frames, **columns}, into)
 
 
-def encode_slots(run: str, slots: Array, columns: Mapping[str, Array], drawn: Drawn) -> bytearray:
-    """Build the answer to a draw whose frames, in these slots, int64 [unique], the learner reads in the table."""
-    return wire.encode(KIND, run, drawn, {"slots": slots, **columns})
+class Draws(Struct, frozen=True):
+    """The data that accompany batches whose frames are named: those of each draw, in the order of the columns.
+
+    table: a random id of the table whose frames are named. memory: where they lie, if the learner reads them there.
+    frames: different frames of each batch. admitted: draws of lower numbers need not wait, whatever happens.
+    """
+
+    table: Incarnation
+    memory: Annotated[str, Meta(pattern=f"{ADDRESS}|^$")]
+    admitted: Counter
+    frames: Annotated[tuple[Annotated[int, Meta(ge=1)], ...], Meta(max_length=MAX_AHEAD)]
+    draws: Annotated[tuple[Drawn, ...], Meta(min_length=1, max_length=MAX_AHEAD)]
+
+
+@dataclass(frozen=True, slots=True)
+class NamedBatch:
+    """A batch whose frames are named; see `FrameMirror`.
+
+    table, memory: as in `Draws`. slots, numbers: of its different frames, int32 [n] and int64 [n].
+    carried: which of them its answer carries, intp [m], and `frames`: those, [m, *frame_shape].
+    columns: the other fields of a `Batch`, by name.
+    """
+
+    table: int
+    memory: str
+    slots: NDArray[np.int32]
+    numbers: NDArray[np.int64]
+    carried: NDArray[np.intp]
+    frames: Array
+    columns: Mapping[str, Array]
+
+
+def encode_named(
+    run: str,
+    draws: Draws,
+    columns: Sequence[Mapping[str, Array]],
+    slots: Array,
+    numbers: Array,
+    carried: Array,
+    frames: Source,
+    into: bytearray,
+) -> bytearray:
+    """Build the answer with the named batches of one or several draws.
+
+    slots, numbers: of all batches' frames, int [n]. carried, frames: the indices of those that the answer carries.
+    """
+    joined = columns[0]
+    if len(columns) > 1:
+        joined = {name: np.concatenate([each[name] for each in columns]) for name in joined}
+    named = {"slots": slots.astype(np.int32), "numbers": numbers, "carried": carried.astype(np.int32)}
+    return wire.encode(NAMED, run, draws, {"frames": frames, **named, **joined}, into)
+
+
+def _columns(spec: EnvSpec) -> dict[str, tuple[str, tuple[int | str, ...]]]:
+    """The arrays of batches, as a `Layout` has them."""
+    return {
+        **transitions(spec, "batch"),
+        "weights": ("float32", ("batch",)),
+        "ids": ("int64", ("batch",)),
+        "age": ("int64", ("batch",)),
+        "reuse": ("int32", ("batch",)),
+    }
 
 
 class BatchReader:
-    """Reads batches of one environment."""
+    """Reads batches of one environment, with their frames."""
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        columns = {
-            **transitions(spec, "batch"),
-            "weights": ("float32", ("batch",)),
-            "ids": ("int64", ("batch",)),
-            "age": ("int64", ("batch",)),
-            "reuse": ("int32", ("batch",)),
-        }
-        frames = columns.pop("frames")
-        self._layout = Layout({"frames": frames, **columns}, OPTIONAL)
-        self._layout_of_slots = Layout({"slots": ("int64", ("frames",)), **columns}, OPTIONAL)
+        self._layout = Layout(_columns(spec), OPTIONAL)
 
-    def __call__(self, message: Message, shared: SharedFrames | None = None) -> tuple[Batch, Drawn]:
-        """Read one; shared: where its frames may lie. Raises BadMessage."""
+    def __call__(self, message: Message) -> tuple[Batch, Drawn]:
+        """Read one; raises BadMessage."""
         check_kind(message, KIND)
-        arrays = dict(message.arrays)
-        slots = None if shared is None else arrays.pop("slots", None)
-        layout = self._layout if slots is None else self._layout_of_slots
-        if not layout.lengths(message.table)["batch"]:
+        lengths = self._layout.lengths(message.table)
+        if not lengths["batch"]:
             raise BadMessage("arrays.actions", "an empty batch")
-        if shared is not None and slots is not None:
-            arrays["frames"] = shared.read(slots)
-        check_transitions(self._spec, arrays)
+        check_indices(message.arrays, lengths["frames"])
+        check_values(self._spec, message.arrays)
+        check_range("arrays.weights", message.arrays["weights"], 0.0, MAX_FLOAT32)
+        return Batch(**message.arrays), to_struct(message, Drawn)
+
+
+class NamedBatchReader:
+    """Reads batches of one environment whose frames are named."""
+
+    def __init__(self, spec: EnvSpec) -> None:
+        self._spec = spec
+        named: dict[str, tuple[str, tuple[int | str, ...]]] = {
+            "slots": ("int32", ("named",)),
+            "numbers": ("int64", ("named",)),
+            "carried": ("int32", ("frames",)),
+        }
+        self._columns = _columns(spec)
+        self._layout = Layout({**self._columns, **named})
+        del self._columns["frames"]
+
+    def __call__(self, message: Message) -> tuple[Draws, list[NamedBatch]]:
+        """Read those of one answer, at least one; raises BadMessage."""
+        check_kind(message, NAMED)
+        lengths, arrays = self._layout.lengths(message.table), message.arrays
+        draws = to_struct(message, Draws)
+        count, named = len(draws.draws), lengths["named"]
+        size, rest = divmod(lengths["batch"], count)
+        if not size or rest:
+            raise BadMessage("arrays.actions", f"{lengths['batch']} transitions of {count} batches")
+        if len(draws.frames) != count or sum(draws.frames) != named:
+            raise BadMessage("fields.frames", f"{draws.frames}; {named} in {count} batches")
+        check_values(self._spec, arrays)
         check_range("arrays.weights", arrays["weights"], 0.0, MAX_FLOAT32)
-        return Batch(**arrays), to_struct(message, Drawn)
+        check_range("arrays.slots", arrays["slots"], 0, MAX_INTEGER)
+        check_range("arrays.numbers", arrays["numbers"], 1, MAX_INTEGER)
+        carried = arrays["carried"].astype(np.intp)
+        check_range("arrays.carried", carried, 0, named - 1)
+        if not (carried[1:] > carried[:-1]).all():
+            raise BadMessage("arrays.carried", "not in ascending order")
+        batches, start = [], 0
+        for place, frames in enumerate(draws.frames):
+            stop = start + frames
+            low, high = (0, len(carried)) if count == 1 else carried.searchsorted((start, stop))
+            rows = slice(place * size, (place + 1) * size)
+            columns = {name: arrays[name][rows] for name in self._columns}
+            check_indices(columns, frames)
+            batches.append(
+                NamedBatch(
+                    draws.table,
+                    draws.memory,
+                    arrays["slots"][start:stop],
+                    arrays["numbers"][start:stop],
+                    carried[low:high] - start,
+                    arrays["frames"][low:high],
+                    columns,
+                )
+            )
+            start = stop
+        return draws, batches

@@ -1,0 +1,89 @@
+"""The learner's mirror of the table's frames: each frame crosses the network once, whatever is lost or repeated.
+
+The table keeps each frame in a slot and gives it a number that no other frame of this table ever gets. An answer to a
+draw names slots and numbers of its batch's frames, and carries those frames that the mirror lacks as far as the replay
+service knows (`replay.mirrored`). The learner compares the numbers before it reads a slot, so it can't read a wrong
+frame; where it lacks one, it asks again, and a draw that is answered again carries all its frames.
+
+Nothing here does I/O. A mirror on another device needs the same attributes and the same two methods.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.messaging.messages.sample import NamedBatch
+from common.process.memory import GrowingRows
+from common.types import Array, EnvSpec
+
+FIRST_SLOTS = 1024
+GROWTH = 1.5
+
+
+class FrameMirror:
+    """Copies of the frames that batches have needed, in the slots that they have in the table, in host memory.
+
+    Args:
+        slots: at most so many; frames in higher slots are in each answer.
+
+    Attributes:
+        number: counts the times that the mirror began, empty: once, and again for each table that it met.
+    """
+
+    def __init__(self, spec: EnvSpec, slots: int) -> None:
+        self.number = 1
+        self.slots = slots
+        self._shape = spec.frame_shape
+        self._dtype = np.dtype(spec.frame_dtype)
+        self._table: int | None = None
+        self._numbers = np.zeros(min(slots, FIRST_SLOTS), np.int64)  # of the frame in each slot; 0: none
+        row_bytes = math.prod(spec.frame_shape) * self._dtype.itemsize
+        self._rows = GrowingRows(row_bytes, max(1, len(self._numbers)))
+
+    def write(self, table: int, slots: NDArray[np.int32], numbers: NDArray[np.int64], frames: Array) -> None:
+        """Store frames [n, *frame_shape] of a table, with these numbers, int64 [n], in these slots, int32 [n].
+
+        A table other than the last one empties the mirror first.
+        """
+        if table != self._table:
+            self.number += self._table is not None
+            self._table = table
+            self._numbers.fill(0)
+        if not len(slots):
+            return
+        highest = slots.item(slots.argmax())
+        if highest >= self.slots:
+            inside = slots < self.slots
+            self.write(table, slots[inside], numbers[inside], frames[inside])
+            return
+        if highest >= len(self._numbers):
+            self._grow(highest + 1)
+        self._rows.view[slots] = self._items(frames)
+        self._numbers[slots] = numbers
+
+    def read(self, batch: NamedBatch) -> Array | None:
+        """Copy the frames of a batch, [n, *frame_shape]; None if one of them is neither here nor in its answer."""
+        found = np.empty(len(batch.slots), self._rows.dtype)
+        self._rows.view.take(batch.slots, out=found, mode="clip")
+        known = self._numbers.take(batch.slots, mode="clip") == batch.numbers
+        known &= batch.slots < len(self._numbers)
+        known[batch.carried] = True
+        if batch.table != self._table or not known.all():
+            return None
+        found[batch.carried] = self._items(batch.frames)
+        return found.view(self._dtype).reshape(len(found), *self._shape)
+
+    def _items(self, frames: Array) -> NDArray[np.void]:
+        """Frames [n, *frame_shape] as void [n]."""
+        return np.ascontiguousarray(frames).reshape(-1).view(self._rows.dtype)
+
+    def _grow(self, needed: int) -> None:
+        """Make room; raises OSError if there is none."""
+        slots = min(self.slots, max(needed, int(len(self._numbers) * GROWTH)))
+        self._rows.grow(slots)
+        numbers = np.zeros(slots, np.int64)
+        numbers[: len(self._numbers)] = self._numbers
+        self._numbers = numbers
