@@ -6,11 +6,11 @@ import importlib
 import sys
 from collections.abc import Collection
 from functools import reduce
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from common.errors import JoinError, UsageError
+from common.places import working_directory
 
 
 def import_module(module: str, field: str) -> ModuleType:
@@ -21,12 +21,12 @@ def import_module(module: str, field: str) -> ModuleType:
     Raises:
         UsageError: there is no such module, or its own code fails.
     """
-    here = str(Path.cwd())
+    here = str(working_directory())
     if here not in sys.path:  # as `python -m` has it; a console script lacks it
         sys.path.append(here)
     try:
         return importlib.import_module(module)
-    except Exception as error:  # a user's module may raise anything
+    except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise UsageError(f"{field}: cannot import {module!r}: {describe(error)}") from error
 
 
@@ -58,6 +58,6 @@ def check_allowed(path: str, allowed: Collection[str], field: str) -> None:
         )
 
 
-def describe(error: Exception) -> str:
+def describe(error: BaseException) -> str:
     """An exception of a user's code in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())

@@ -12,6 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from common.errors import CoopError, RunError, UsageError
+from common.places import absolute
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS, Method
 from experiments.evaluation import Evaluation, evaluate
@@ -40,7 +41,7 @@ __all__ = [
 
 def load(run_dir: str | Path) -> SavedRun:
     """The run in a folder, whether it has ended or not; raises UsageError if there is none."""
-    return SavedRun(Path(run_dir))
+    return SavedRun(absolute(Path(run_dir)))
 
 
 def register_method(method: Method) -> None:

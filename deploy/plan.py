@@ -12,7 +12,7 @@ from common.envs.make import env_spec
 from common.errors import UsageError
 from common.process.cli import parse
 from common.process.importing import importing
-from common.process.lifecycle import run_main
+from common.process.lifecycle import raise_on_signals, run_main
 from common.settings.config import RunConfig
 from common.settings.tables import load_tables, preset_names, resolve, validated
 from common.types import EnvSpec
@@ -43,6 +43,7 @@ class PlanOptions:
 
 def main() -> None:
     """Entry point."""
+    raise_on_signals()
     run_main("coop-plan", _run)
 
 

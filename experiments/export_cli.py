@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from common.process.cli import parse
-from common.process.lifecycle import run_main
+from common.process.lifecycle import raise_on_signals, run_main
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class ExportOptions:
 
 def main() -> None:
     """Entry point."""
+    raise_on_signals()
     run_main("coop-export", _run)
 
 

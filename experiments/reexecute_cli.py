@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from common.process import cli
-from common.process.lifecycle import run_main
+from common.process.lifecycle import raise_on_signals, run_main
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class ReexecuteOptions:
 
 def main() -> None:
     """Entry point."""
+    raise_on_signals()
     run_main("coop-reexecute", _run)
 
 

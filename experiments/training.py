@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import RunError, UsageError
+from common.places import absolute
 from common.process.lifecycle import Stop
 from common.process.processes import ChildProcess, command
 from common.process.summaries import read_summary
@@ -107,6 +108,8 @@ class TrainingRun:
     def _run(self) -> None:
         try:
             self._work(self._stop)
+        except SystemExit as error:  # which would end the program of the thread that waits, in silence
+            self._failure = RunError(f"the run's own code has called sys.exit({error.code!r})")
         except BaseException as error:  # the thread that waits for the run raises it
             self._failure = error
         atexit.unregister(self._at_exit)
@@ -177,11 +180,11 @@ def _options(
     """The options that the same flags give on a command line."""
     if preset is not None and file is not None:
         raise UsageError("preset and config: give one of them")
-    directory = None if run_dir is None else Path(run_dir)
+    directory = None if run_dir is None else absolute(Path(run_dir))
     steps = settings.get("total_steps")
     base = chosen_config(
         preset,
-        None if file is None else Path(file),
+        None if file is None else absolute(Path(file)),
         method,
         steps if isinstance(steps, int) else None,
         directory if resume else None,

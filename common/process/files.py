@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Self
 
 from common.errors import RunError
+from common.process.output import keep_standard_files
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)  # error numbers
 PIECE = 1 << 24  # bytes read at once
@@ -22,6 +23,7 @@ class SyncedFile:
     """
 
     def __init__(self, path: Path) -> None:
+        keep_standard_files()
         self._file = path.open("wb", buffering=0)
         self.size = 0
         self.checksum = 0
@@ -60,6 +62,7 @@ class LineFile:
     def __init__(self, path: Path, *, go_on: bool) -> None:
         self.problem = ""
         self._late = b""
+        keep_standard_files()
         self._file = path.open("ab" if go_on else "wb", buffering=0)
 
     def write(self, text: str) -> None:

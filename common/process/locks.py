@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Self
 
 from common.errors import RunError
+from common.process.output import keep_standard_files
 
 INHERITED = "COOP_LOCKS"  # comma-separated descriptors of locks that a process inherits from its supervisor
 HOLDER_BYTES = 512  # more than any holder's line
@@ -21,6 +22,7 @@ class FileLock:
 
     def __init__(self, path: Path) -> None:
         """Acquire the lock; raises BlockingIOError if another process holds it, OSError if the file cannot be made."""
+        keep_standard_files()  # children's logs replace theirs
         self.descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

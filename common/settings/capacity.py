@@ -1,15 +1,15 @@
-"""Checks that a run fits into this machine's memory and its data into the messages between roles."""
+"""Checks that a run fits into the memory of its processes and its data into the messages between roles."""
 
 from __future__ import annotations
 
 import math
-import os
 from itertools import pairwise
 
 import numpy as np
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
+from common.process.limits import memory_limit
 from common.settings.config import RunConfig
 from common.settings.policies import EVICTIONS
 from common.types import EnvSpec
@@ -30,19 +30,16 @@ def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Raise UsageError for a table that does not fit into this machine's memory.
+    """Raise UsageError for a table that does not fit into the memory that this process may use.
 
     Eviction policies that do not evict in order may keep stack + 1 frames per transition.
     """
     capacity = config.replay.capacity
     copies = 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
     needed = estimated_bytes(spec, min(capacity, config.total_steps)) * copies
-    present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if needed > present:
-        raise UsageError(
-            f"replay.capacity = {capacity:,}: needs up to {needed / 2**30:.1f} GiB, this machine has "
-            f"{present / 2**30:.1f} GiB"
-        )
+    limit = memory_limit()
+    if needed > limit.size:
+        raise UsageError(f"replay.capacity = {capacity:,}: needs up to {needed / 2**30:.1f} GiB, {limit}")
 
 
 def check_messages(config: RunConfig, spec: EnvSpec) -> None:

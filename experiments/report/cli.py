@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from common.errors import RunError, UsageError
 from common.process.cli import parse
-from common.process.lifecycle import run_main
+from common.process.lifecycle import raise_on_signals, run_main
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class ReportOptions:
 
 def main() -> None:
     """Entry point."""
+    raise_on_signals()
     run_main("coop-report", _run)
 
 
