@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from common.errors import JoinError, UsageError
+from common.places import working_directory
 
 _handed_over: list[Path] = []  # folders of runs whose settings this process reads
 _named: set[str] = set()  # modules that this process's user permits
@@ -56,7 +57,7 @@ def import_module(module: str, field: str, *, installed: bool = False) -> Module
     """
     if module in sys.modules:
         return sys.modules[module]
-    here = str(Path.cwd())
+    here = str(working_directory())
     # `python -m` has it; a console script lacks it.
     added = here not in sys.path and not (installed and _handed_over)
     if added:
@@ -73,7 +74,7 @@ def import_module(module: str, field: str, *, installed: bool = False) -> Module
         imported = importlib.import_module(module)
     except UsageError:
         raise
-    except Exception as error:  # a user's module may raise anything
+    except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise UsageError(f"{field}: cannot import {module!r}: {describe(error)}") from error
     if file is not None:
         _files[module] = file

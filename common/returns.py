@@ -1,4 +1,4 @@
-"""Running mean of returns over the last 100 episodes, the paper's measure."""
+"""Returns: their running mean over the last 100 episodes, the paper's measure, and their exact text."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from numpy.typing import ArrayLike, NDArray
 
 RETURN_WINDOW = 100  # episodes
 METRICS_EVERY = 200  # updates from one row of metrics to the next
+
+
+def exact(value: float) -> str:
+    """The shortest text that reads as the same number, without a fraction of zero: "1234567.89", "9", "nan"."""
+    return repr(float(value)).removesuffix(".0")
 
 
 def running_mean(values: ArrayLike, window: int = RETURN_WINDOW) -> NDArray[np.float64]:

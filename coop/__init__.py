@@ -15,6 +15,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from common.errors import CoopError, RunError, UsageError
+from common.places import absolute
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS, Method
 from experiments.evaluation import Evaluation, evaluate
@@ -51,7 +52,7 @@ def load(run_dir: str | Path, *, allow_import: Collection[str] = ()) -> SavedRun
         UsageError: there is no run.
         RunError: a link leads out of the folder.
     """
-    return SavedRun(Path(run_dir), allow_import)
+    return SavedRun(absolute(Path(run_dir)), allow_import)
 
 
 def register_method(method: Method) -> None:

@@ -57,15 +57,9 @@ if ! docker image inspect $base > /dev/null 2>&1; then
     quietly tar -C "$work/root" -cf "$work/root.tar" .
     quietly docker import "$work/root.tar" $base
 fi
-# The image to build in has this machine's certificates, wheels and pip configuration.
-mkdir -p "$work/builder/wheels"
-cp /etc/ssl/certs/ca-certificates.crt "$work/builder/"
+# The image to build in has this machine's certificates, folders of wheels and pip configuration.
 pip=$(command -v "${PIP:-pip}") || fail "no pip"
-"$pip" config list | sed -nE "s/^(:env:|global)\.([a-z-]+)='(.*)'$/\2 = \3/p" | sort -u -t= -k1,1 | { echo "[global]"; cat; } > "$work/builder/pip.conf"
-wheels=$(sed -n 's/^find-links = //p' "$work/builder/pip.conf")
-[ ! -d "$wheels" ] || cp "$wheels"/* "$work/builder/wheels/"
-printf '%s\n' "FROM $base" "COPY ca-certificates.crt /etc/ssl/certs/" "COPY pip.conf /etc/pip.conf" \
-    "COPY wheels ${wheels:-/wheels}/" > "$work/builder/Dockerfile"
+"$pip" config list | deploy/builder_image.sh $base "$work/builder"
 quietly docker build --tag coop-builder "$work/builder"
 export BUILDER=coop-builder BUILD_NETWORK=host
 began=$SECONDS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import threading
 import time
@@ -13,6 +12,7 @@ from typing import Any
 from common.messaging.messages.status import LearnerStatus
 from common.process.console import connected
 from common.process.display import printable
+from common.process.summaries import strict_json
 from common.process.web import Document, WebServer
 from deploy.curves import COLUMNS, Curves
 from deploy.facts import SILENT_AFTER, detail, facts, place, progress, settings, silence, times
@@ -49,7 +49,7 @@ class LivePage:
             address,
             {
                 "/": lambda: Document("text/html; charset=utf-8", html),
-                "/page.json": lambda: Document("application/json", json.dumps(self.told()).encode()),
+                "/page.json": lambda: Document("application/json", strict_json(self.told()).encode()),
             },
         )
         self.url = self._server.url

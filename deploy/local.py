@@ -9,7 +9,7 @@ from pathlib import Path
 from common.envs.make import check_filmed, env_spec
 from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
-from common.process.console import stamped
+from common.process.console import say, stamped
 from common.process.files import write_atomic
 from common.process.flags import HttpAddress
 from common.process.lifecycle import Stop, run_main
@@ -21,10 +21,11 @@ from common.settings.config import RunConfig, check_distributed
 from common.settings.options import LearnerRunOptions, beginning, holds_run, parse_run
 from common.settings.tables import to_toml
 from deploy.status import Display, Page, RunStatus, live_page
-from deploy.supervisor import RESTARTS, RestartPolicy
+from deploy.supervisor import RestartPolicy
 
 TICK = 0.1  # seconds
 GRACE = 30.0  # seconds for a role's clean stop
+LAST_WORDS = 5.0  # seconds for the news that the run is over, which has reached another role
 JOIN_TIMEOUT = 3600.0  # seconds; this process notices the learner's end itself, and a busy machine may start it slowly
 
 
@@ -79,6 +80,8 @@ class Topology:
             evaluating = command("coop-eval", *playing)
             self._others.append(ChildProcess("evaluator", evaluating, logs / "evaluator.log"))
         self._policies = {process.name: RestartPolicy() for process in self._all()}
+        self._given_up: set[ChildProcess] = set()
+        self._left_at: dict[ChildProcess, float] = {}  # when a process was found that has ended with status 0
         self._interrupted = False
 
     def start(self) -> None:
@@ -90,14 +93,14 @@ class Topology:
         """Restart killed roles; return True once the learner has ended properly or by a signal.
 
         Raises:
-            RunError: a role failed by itself, or was killed too often.
+            RunError: a role failed by itself, an actor twice in the same way; or was killed too often.
             UsageError: a role rejected the config.
         """
         status = self.learner.exit_status()  # once: it may end while this looks at the others
         if status == 0 or self.learner.was_interrupted():
             return True
         for process in self._all():
-            if process.exit_status() is not None and not self._interrupted:
+            if process.exit_status() is not None and not self._interrupted and process not in self._given_up:
                 self._restart(process, display)
         if self._interrupted and status is not None:
             raise RunError(f"{self.learner.why()}; interrupted before it was back, --resume goes on")
@@ -109,19 +112,28 @@ class Topology:
         self.learner.interrupt()
 
     def _restart(self, process: ChildProcess, display: Display) -> None:
+        """Start an ended process again when it is time, or give up: it, if the run can do without it, or the run."""
         policy, now = self._policies[process.name], time.monotonic()
-        if policy.at is None:
-            status = process.exit_status() or 0
-            if not policy.ended(now):
-                raise RunError(f"{process.why()}; it has been started again {RESTARTS} times")
-            if status > 0 and not process.was_interrupted() and not process.name.startswith(("actor", "evaluator")):
-                raise (UsageError if status == UsageError.exit_status else RunError)(process.why())
-            if status:
-                display.say(stamped(f"{process.why()}; starting it again"))
-            else:
-                policy.at = now + GRACE  # it was asked to stop, and the learner will probably follow
-        elif policy.due(now):
-            process.start()
+        if policy.at is not None:
+            if policy.due(now):
+                process.start()
+            return
+        status = process.exit_status() or 0
+        if status == 0:  # a stop may have reached it sooner than this process, and the learner follows
+            waited = now - self._left_at.setdefault(process, now)
+            if waited < (GRACE if display.run_is_over else LAST_WORDS):
+                return
+            del self._left_at[process]
+        in_vain = policy.ended(now, process.own_words(), for_memory=process.was_killed_for_memory())
+        at_once = status == UsageError.exit_status or (status > 0 and process.name in ("learner", "replay"))
+        if not in_vain and not (at_once and process.own_words()):
+            display.say(stamped(f"{process.why()}; starting it again"))
+        elif process.name == "evaluator":
+            self._given_up.add(process)
+            display.say(stamped(f"{process.why()}; the run goes on without it"))
+        else:
+            failure = UsageError if status == UsageError.exit_status else RunError
+            raise failure("; ".join(filter(None, (process.why(), in_vain))))
 
     def finish(self) -> None:
         """Wait for every role to stop; the other roles follow the learner."""
@@ -164,7 +176,7 @@ def _run() -> None:
         with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
             if options.resume:
                 found = f"goes on with the run in {directory}" if holds_run(directory) else beginning(directory)
-                print(found, flush=True)
+                say(found)
             _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)
 
 
@@ -193,11 +205,11 @@ def _supervise(
         status.close()
     if topology.learner.was_interrupted():
         topology.abort()
-        print(f"{topology.learner.last_line()}; coop-local --resume --run-dir {directory} goes on")
+        say(f"{topology.learner.last_line()}; coop-local --resume --run-dir {directory} goes on")
         stop.leave()
         raise RunError(topology.learner.why())  # the learner alone was interrupted
     topology.finish()
-    print(topology.learner.last_line())
+    say(topology.learner.last_line())
     curve = directory / "learning_curve.png"
     if curve.exists():
-        print(f"learning curve: {curve}")
+        say(f"learning curve: {curve}")

@@ -138,6 +138,11 @@ class Display(LiveDisplay):
         self._show_page()  # with the reason of the end
         super().__exit__(*error)
 
+    @property
+    def run_is_over(self) -> bool:
+        """Whether the learner has said so."""
+        return self._over.is_set()
+
     def update(self) -> None:
         """Show the present status."""
         self._status.refresh()

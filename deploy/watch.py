@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from common.messaging.transport import new_incarnation
 from common.process.cli import parse
 from common.process.flags import HttpAddress
 from common.process.lifecycle import Stop, run_main
+from common.process.summaries import strict_json
 from common.process.untrusted import check_run
 from deploy.screen import RunScreen
 from deploy.status import Display, RunStatus, live_page
@@ -94,7 +94,7 @@ def _print_once(status: RunStatus, options: WatchOptions, ctrl_c: Stop) -> None:
         status.refresh()
         _check(status, options)
     if options.json:
-        print(json.dumps(report(status.run, status.learner)))
+        print(strict_json(report(status.run, status.learner)))
     else:
         lines = [line for _, line in status.events()]
         Console().print(RunScreen(status.run, status.learner, lines, whole=True))

@@ -14,6 +14,7 @@ import numpy as np
 from common.bounds import MAX_EVALUATED, MAX_INTEGER, MAX_STREAMS
 from common.envs.make import make_vector_env
 from common.errors import RunError, UsageError
+from common.returns import exact
 from common.settings.environment import EnvSettings
 from common.settings.tables import resolve
 from experiments.episodes import AT_ONCE, Acting, exploring, play
@@ -159,7 +160,7 @@ def film_checkpoint(run_dir: Path, video: Path, seed: int, networks: Sequence[Ne
         write_video(film, video)
     except OSError as error:
         raise RunError(f"{video}: {error.strerror or error}") from error
-    return f"{video}: network {network}, return {film.episode_return:g} in {film.steps:,} steps"
+    return f"{video}: network {network}, return {exact(film.episode_return)} in {film.steps:,} steps"
 
 
 def _derived(run: SavedRun, seed: int) -> int:

@@ -12,8 +12,10 @@ from tyro.conf import Positional
 
 from common.errors import UsageError
 from common.imports import permit
+from common.places import shown
 from common.process import cli
-from common.process.lifecycle import run_main
+from common.process.lifecycle import raise_on_signals, run_main
+from common.returns import exact
 from common.settings.options import RoleOptions
 
 if TYPE_CHECKING:
@@ -60,6 +62,7 @@ class EvalOptions(RoleOptions):
 
 def main() -> None:
     """Entry point."""
+    raise_on_signals()
     run_main("coop-eval", _run)
 
 
@@ -86,17 +89,17 @@ def _run() -> None:
     runs = [
         evaluate_checkpoint(path, episodes, options.seed, networks, epsilons, options.envs) for path in options.run_dir
     ]
-    width = max(len(str(path)) for path in options.run_dir)
+    width = max(len(str(shown(path))) for path in options.run_dir)
     print(f"{'run':{width}}  {HEAD}", flush=True)
     for run in runs:
         for one in run:
-            print(f"{one.run:{width}}  {_row(one)}", flush=True)
+            print(f"{shown(Path(one.run))!s:{width}}  {_row(one)}", flush=True)
 
 
 def _row(one: CheckpointEvaluation) -> str:
     network, (low, high) = f"{one.network}{' acts' if one.acts else ''}", one.interval
     played = f"{one.epoch:10}  {network:7}  {one.epsilon:7g}  {len(one.returns):8}"
-    spread = f"{one.sd:8.2f}  {min(one.returns):7g}  {max(one.returns):7g}"
+    spread = f"{one.sd:8.2f}  {exact(min(one.returns)):>7}  {exact(max(one.returns)):>7}"
     return f"{played}  {one.mean:9.2f}  {f'{low:.2f} to {high:.2f}':>18}  {spread}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from torch import nn
 
 from common.errors import RunError, UsageError
 from common.process.files import SyncedFile, sync_folder
+from common.process.summaries import strict_json
 from common.settings.config import RunConfig
 from experiments.export_onnx import NotExportedError, onnx_model, preparation
 from experiments.saved import Checkpoint, SavedRun
@@ -60,7 +60,7 @@ def export(run_dir: Path, out: Path) -> Exported:
             contents[f"network-{number}.onnx"] = onnx_model(network, checkpoint.spec)
         except NotExportedError as error:
             without_onnx = str(error)
-    contents[CARD] = f"{json.dumps(_card(run.config, checkpoint), indent=2)}\n".encode()
+    contents[CARD] = f"{strict_json(_card(run.config, checkpoint), indent=2)}\n".encode()
     try:
         _write(out, contents)
     except OSError as error:

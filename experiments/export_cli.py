@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from common.imports import permit
 from common.process.cli import parse
-from common.process.lifecycle import run_main
+from common.process.lifecycle import raise_on_signals, run_main
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class ExportOptions:
 
 def main() -> None:
     """Entry point."""
+    raise_on_signals()
     run_main("coop-export", _run)
 
 

@@ -35,7 +35,7 @@ def _run() -> None:
     opened = LockstepRun(config, path, "coop-lockstep", resume=options.resume, wandb=options.wandb, replaying=replaying)
     with closing(opened) as run:
         if options.resume:
-            print(beginning(path) if run.epoch is None else f"goes on from epoch {run.epoch.name}", flush=True)
+            say(beginning(path) if run.epoch is None else f"goes on from epoch {run.epoch.name}")
         summary = run.play(stop, _progress)
     stopped = summary.exit == stop.reason  # otherwise the run was complete before the signal
     say(f"{summary}; coop-lockstep --resume --run-dir {path} goes on" if stopped else f"{summary}; {path}")

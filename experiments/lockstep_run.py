@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from common.envs.make import check_filmed
-from common.errors import RunError
+from common.errors import CoopError, RunError
 from common.process.console import say
-from common.process.lifecycle import Stop
+from common.process.lifecycle import Stop, first_line
 from common.process.locks import RunLock
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
@@ -102,28 +102,32 @@ def play_lockstep(
     trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
     evaluator = Evaluator(run.config, stop.is_set, say)
     _evaluate(run, directory, evaluator)  # what a stop has abandoned
-    while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
-        for effects in run.play():
-            directory.record(effects.episodes, effects.metrics)
-        _evaluate(run, directory, evaluator)
-        if trainer.epoch_due() and not trainer.outcome():
-            trainer.epoch_begun()
-            try:
-                run.save(directory)
-            except RunError as error:
-                say(f"{error}; the run goes on without it")
-        if time.monotonic() >= due:
-            due = time.monotonic() + PROGRESS_EVERY
-            progress(_progress(run))
-    outcome = trainer.diverged or outcome
+    outcome = ""
     try:
+        while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
+            for effects in run.play():
+                directory.record(effects.episodes, effects.metrics)
+            _evaluate(run, directory, evaluator)
+            if trainer.epoch_due() and not trainer.outcome():
+                trainer.epoch_begun()
+                try:
+                    run.save(directory)
+                except RunError as error:
+                    say(f"{error}; the run goes on without it")
+            if time.monotonic() >= due:
+                due = time.monotonic() + PROGRESS_EVERY
+                progress(_progress(run))
+        outcome = trainer.diverged or outcome
         if trainer.saveable():
             run.save(directory)
-    except RunError as error:
+    except CoopError as error:
         outcome = f"failed: {error}"
         raise
+    except (Exception, SystemExit) as error:  # users' code may raise anything
+        outcome = f"failed: {first_line(error)}"
+        raise
     finally:
-        summary = summarise(trainer, outcome, time.monotonic(), run.step)
+        summary = summarise(trainer, outcome or "interrupted", time.monotonic(), run.step)
         directory.conclude(summary, f"{summary.title}, lockstep")
     return summary
 

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from common.imports import permit
 from common.process import cli
-from common.process.lifecycle import run_main
+from common.process.lifecycle import raise_on_signals, run_main
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class ReexecuteOptions:
 
 def main() -> None:
     """Entry point."""
+    raise_on_signals()
     run_main("coop-reexecute", _run)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from common.errors import CoopError, RunError, UsageError
 from common.imports import describe, permit
+from common.places import absolute
 from common.process.lifecycle import Stop
 from common.process.processes import ChildProcess, command
 from common.process.summaries import read_summary
@@ -112,6 +113,8 @@ class TrainingRun:
     def _run(self) -> None:
         try:
             self._work(self._stop)
+        except SystemExit as error:  # which would end the program of the thread that waits, in silence
+            self._failure = RunError(f"the run's own code has called sys.exit({error.code!r})")
         except BaseException as error:  # the thread that waits for the run raises it
             self._failure = error
         atexit.unregister(self._at_exit)
@@ -187,11 +190,11 @@ def _options(
     """The options that the same flags give on a command line."""
     if preset is not None and file is not None:
         raise UsageError("preset and config: give one of them")
-    directory = None if run_dir is None else Path(run_dir)
+    directory = None if run_dir is None else absolute(Path(run_dir))
     steps = settings.get("total_steps")
     base = chosen_config(
         preset,
-        None if file is None else Path(file),
+        None if file is None else absolute(Path(file)),
         method,
         steps if isinstance(steps, int) else None,
         directory if resume else None,

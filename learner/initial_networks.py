@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from common.errors import UsageError
+from common.places import absolute
 from common.process.untrusted import check_links
 from learner.protocol import Agent
 from learner.records.epochs import load_learner, newest_epoch
@@ -19,8 +20,9 @@ def load_initial_networks(agent: Agent) -> None:
     folder = agent.config.learner.initial_networks
     if not folder:
         return
-    check_links(Path(folder))
-    setting, epoch = f"learner.initial_networks = {folder!r}", newest_epoch(Path(folder))
+    path = absolute(Path(folder))
+    check_links(path)
+    setting, epoch = f"learner.initial_networks = {folder!r}", newest_epoch(path)
     if epoch is None:
         raise UsageError(f"{setting}: holds no complete checkpoint of a run")
     networks, size = load_learner(epoch)["agent"]["networks"], agent.networks[0].size

@@ -78,7 +78,7 @@ class LearnerService:
                 self._turn()
             self._save()
             outcome = self._trainer.diverged or outcome
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # users' code may raise anything
             outcome = f"failed: {error}"
             raise
         finally:

@@ -16,6 +16,7 @@ from common.messaging.messages.join import MOST_EPOCHS, Join, Joined
 from common.messaging.presence import LEASE
 from common.messaging.session import open_session
 from common.messaging.transport import Node, new_incarnation
+from common.places import absolute
 from common.process import cli
 from common.process.console import Console
 from common.process.health import answering
@@ -76,7 +77,7 @@ def _run() -> None:
 
 
 def _named(run: str, run_id: int) -> Path:
-    return Path("runs") / f"{run}-replay-{run_id:x}"
+    return absolute(Path("runs") / f"{run}-replay-{run_id:x}")
 
 
 def _serve(

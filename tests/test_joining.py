@@ -166,7 +166,7 @@ def test_the_limiter_changes_while_the_run_goes_on(nodes: tuple[Node, Node], spe
 
 def test_restarts_are_bounded_and_slow_down() -> None:
     policy, now, pauses = RestartPolicy(), 100.0, []
-    while policy.ended(now):
+    while not policy.ended(now):
         assert policy.at is not None
         assert len(pauses) < RESTARTS
         assert not policy.due(policy.at - 0.01)
@@ -176,5 +176,5 @@ def test_restarts_are_bounded_and_slow_down() -> None:
         assert not policy.due(now)
     assert len(pauses) == RESTARTS
     assert pauses[:6] == pytest.approx([0.25, 0.5, 1, 2, 4, 4])
-    assert policy.ended(now + HEALTHY), "a healthy spell, and the past is forgotten"
+    assert not policy.ended(now + HEALTHY), "a healthy spell, and the past is forgotten"
     assert policy.ends == 1

@@ -28,7 +28,8 @@ from common.messaging.session import open_session
 from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from common.messaging.wire import Message
 from common.process.lifecycle import Stop
-from common.process.memory import GrowingRows, job_memory
+from common.process.limits import MemoryLimit
+from common.process.memory import GrowingRows
 from common.settings.capacity import MIRROR_SHARE, estimated_bytes, mirror_slots
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.settings.effects import without_effect
@@ -513,33 +514,8 @@ def test_priorities_arrive_with_requests_for_several_batches(nodes: tuple[Node, 
 # How much memory it may take, and its setting.
 
 
-def test_the_memory_of_a_job(tmp_path: Path) -> None:
-    machine = job_memory(tmp_path)
-    assert machine > 2**28
-    (tmp_path / "proc/self").mkdir(parents=True)
-    groups = tmp_path / "proc/self/cgroup"
-
-    def limit(path: str, text: str) -> None:
-        (tmp_path / "sys/fs/cgroup" / path).mkdir(parents=True, exist_ok=True)
-        name = "memory.limit_in_bytes" if path.startswith("memory") else "memory.max"
-        (tmp_path / "sys/fs/cgroup" / path / name).write_text(f"{text}\n", encoding="utf-8")
-
-    groups.write_text("0::/slurm/job 5/step\n", encoding="utf-8")
-    assert job_memory(tmp_path) == machine
-    limit("slurm/job 5/step", "max")
-    limit("slurm/job 5", "134217728")
-    assert job_memory(tmp_path) == 2**27, "the limit of a group above"
-    limit("slurm", "67108864")
-    assert job_memory(tmp_path) == 2**26
-    groups.write_text("12:cpu,cpuacct:/x\n5:memory:/docker/a:b\n", encoding="utf-8")
-    assert job_memory(tmp_path) == machine
-    limit("memory", "9223372036854771712")
-    limit("memory/docker/a:b", "1048576")
-    assert job_memory(tmp_path) == 2**20
-
-
 def test_the_mirror_takes_a_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("common.settings.capacity.job_memory", lambda: 2**30)
+    monkeypatch.setattr("common.settings.capacity.memory_limit", lambda: MemoryLimit(2**30, "this test allows"))
     atari, each = EnvSpec("Atari", (84, 84), "uint8", 4, 4), 84 * 84 + 8
 
     def slots(capacity: int, eviction: str = "fifo") -> int:

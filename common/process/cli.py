@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -14,9 +15,11 @@ from tyro import _errors as tyro_errors  # private; pyproject.toml pins the vers
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from common.errors import UsageError
+from common.places import absolute
 from common.process.files import user_path
 from common.process.flags import SHELLS, completion, placeholder, sections
 from common.process.help import full_help, short_help
+from common.process.lifecycle import Leave
 from common.suggestions import closest, not_among, refusal
 
 PACKAGE = "coop-rl"
@@ -55,7 +58,7 @@ def parse(
 
     Raises:
         UsageError: an unknown flag or a value of the wrong type.
-        SystemExit: the flags asked for help, the version or a completion script; it has been printed.
+        Leave: the flags asked for help, the version or a completion script; it has been printed.
     """
     args = sys.argv[1:] if args is None else args
     asked = {token.partition("=")[0].replace("_", "-") for token in args}
@@ -73,8 +76,8 @@ def parse(
 
     with _PATHS, tyro_errors.on_parse_error(refuse):
         if default is None:
-            return tyro.cli(kind, prog=program, args=args, add_help=False)
-        return tyro.cli(kind, prog=program, args=args, add_help=False, default=default)
+            return _with_absolute_paths(tyro.cli(kind, prog=program, args=args, add_help=False))
+        return _with_absolute_paths(tyro.cli(kind, prog=program, args=args, add_help=False, default=default))
 
 
 def given_flags(args: Sequence[str]) -> set[str]:
@@ -83,9 +86,21 @@ def given_flags(args: Sequence[str]) -> set[str]:
     return names | {name.replace(".no_", ".") for name in names}
 
 
+def _with_absolute_paths(options: T) -> T:
+    """The options, whose paths mean the same wherever users' code goes."""
+    changed: dict[str, Any] = {}
+    for field in fields(options):  # type: ignore[arg-type] # always a dataclass
+        match getattr(options, field.name):
+            case Path() as path:
+                changed[field.name] = absolute(path)
+            case (Path(), *_) as paths:
+                changed[field.name] = tuple(map(absolute, paths))
+    return replace(options, **changed) if changed else options  # type: ignore[type-var]
+
+
 def _answer(text: str) -> NoReturn:
     print(text)
-    raise SystemExit(0)
+    raise Leave(0)
 
 
 def _shell(args: Sequence[str]) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from common.process.files import NO_SPACE
+from common.process.output import out
 from common.returns import RETURN_WINDOW
 
 PROGRESS_EVERY = 10.0  # seconds
@@ -104,7 +105,7 @@ class PeerMonitor:
 def say(text: str, end: str = "\n") -> None:
     """Print a line. If there is no space for it, Python's buffer keeps it for later: a full disk must not end a run."""
     try:
-        print(text, end=end, flush=True)
+        print(text, end=end, file=out(), flush=True)
     except OSError as error:
         if error.errno not in NO_SPACE:
             raise

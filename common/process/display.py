@@ -14,6 +14,8 @@ from typing import Self
 from rich.console import Console, RenderableType
 from rich.live import Live
 
+from common.process.files import NO_SPACE
+
 KEPT = 200  # lines said while the picture fills the screen
 
 
@@ -78,7 +80,11 @@ class LiveDisplay(ABC):
         return self._said
 
     def _print(self, text: str) -> None:
-        self._console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
+        try:
+            self._console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
+        except OSError as error:
+            if error.errno not in NO_SPACE:  # Python's buffer keeps it for later
+                raise
 
     @abstractmethod
     def picture(self) -> RenderableType:

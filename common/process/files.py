@@ -11,6 +11,7 @@ from typing import Self
 
 from common.errors import RunError
 from common.process.locks import check_held
+from common.process.output import keep_standard_files
 from common.process.untrusted import no_links
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)  # error numbers
@@ -25,6 +26,7 @@ class SyncedFile:
 
     def __init__(self, path: Path) -> None:
         check_held()
+        keep_standard_files()
         self._file = open(path, "wb", buffering=0, opener=no_links)  # noqa: SIM115 (Path.open takes no opener)
         self.size = 0
         self.checksum = 0
@@ -63,6 +65,7 @@ class LineFile:
     def __init__(self, path: Path, *, go_on: bool) -> None:
         self.problem = ""
         self._late = b""
+        keep_standard_files()
         mode = "ab" if go_on else "wb"
         self._file = open(path, mode, buffering=0, opener=no_links)  # noqa: SIM115 (Path.open takes no opener)
 

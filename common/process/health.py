@@ -14,7 +14,7 @@ from contextlib import closing, contextmanager
 
 from common.errors import RunError, UsageError
 from common.process.console import Console
-from common.process.lifecycle import run_main
+from common.process.lifecycle import Leave, run_main
 from common.process.ports import http_address
 
 STUCK = 60.0  # seconds without a turn of the main loop; an epoch or a compilation may take half of that
@@ -74,7 +74,7 @@ def _ask() -> None:
             print(answer.read().decode())
         except OSError as error:
             raise RunError(f"{sys.argv[1]}: {error.strerror or error}") from error
-    sys.exit(answer.status != 200)
+    raise Leave(int(answer.status != 200))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,11 @@ EXIT_STATUSES = (
     ("0", "It has done what it was asked to do."),
     ("1", "It could not start or finish, or lost a process that it needs; the last line on stderr says why."),
     ("2", "A flag, a file or a setting is wrong; nothing has begun. One line on stderr says what is allowed."),
-    ("130, 143", "SIGINT (Ctrl-C) or SIGTERM has ended it; where there is --resume, that goes on from there."),
+    (
+        "129, 130, 141, 143",
+        "SIGHUP (the terminal has gone), SIGINT (Ctrl-C), output that nobody reads any more, or SIGTERM has ended it; "
+        "where there is --resume, that goes on from there.",
+    ),
 )
 _WIDEST = 100  # columns
 _INDENT = 28  # column of the texts

@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from types import FrameType
 
 from common.errors import CoopError, PeerLost
 from common.process.files import NO_SPACE
+from common.process.limits import memory_limit
+from common.process.output import complain, flush_at_end, on_output_gone
 
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
 LOOK_EVERY = 0.5  # seconds after which a wait notices a signal that came just before it began
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Leave(SystemExit):
+    """The end of this process with a status that the program has chosen itself; users' code raises SystemExit."""
+
+
+class Signalled(KeyboardInterrupt):
+    """A signal, in a command that needs no `Stop`; not an Exception, which users' code may swallow."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.exit_status = status_after(number)
 
 
 class Stop:
@@ -56,10 +73,11 @@ class Stop:
         return self.is_set()
 
     def on_signals(self) -> None:
-        """Make SIGINT and SIGTERM request a clean stop; a second SIGINT interrupts at once.
+        """Make SIGINT, SIGTERM and SIGHUP request a clean stop; a second SIGINT interrupts at once.
 
         A first SIGINT never does, whatever else has requested the stop: a supervisor may pass on by SIGINT what a
-        scheduler has told all processes by SIGTERM.
+        scheduler has told all processes by SIGTERM. Output that nobody reads any more requests the stop too: a session
+        that is lost need not send a signal.
         """
         received: set[int] = set()
 
@@ -69,20 +87,21 @@ class Stop:
             received.add(number)
             self.set("interrupted", exit_status=status_after(number))
 
-        for number in SIGNALS:
-            signal.signal(number, handle)
+        _handle(handle)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # under nohup, output may go away
+            on_output_gone(lambda: self.set("interrupted", exit_status=status_after(signal.SIGPIPE)))
 
     def leave(self) -> None:
         """End the process with the status that the stop requires; return if that is 0.
 
         Raises:
             PeerLost: the stop is a failure.
-            SystemExit: a signal caused the stop; schedulers must not mistake this for completed work.
+            Leave: a signal caused the stop; schedulers must not mistake this for completed work.
         """
         if self.failed:
             raise PeerLost(self.reason)
         if self.exit_status:
-            sys.exit(self.exit_status)
+            raise Leave(self.exit_status)
 
     def on_thread_failures(self) -> None:
         """Stop the process when an uncaught exception ends one of its threads."""
@@ -90,7 +109,7 @@ class Stop:
         def handle(failure: threading.ExceptHookArgs) -> None:
             threading.__excepthook__(failure)  # prints the traceback
             name = failure.thread.name if failure.thread is not None else "?"
-            self.set(f"error of this program in the thread {name!r}: {failure.exc_value!r}", failed=True)
+            self.set(f"error of this program in the thread {name!r}: {first_line(failure.exc_value)}", failed=True)
 
         threading.excepthook = handle
 
@@ -101,42 +120,89 @@ def status_after(number: int) -> int:
 
 
 def end_on_signals(program: str) -> None:
-    """Make SIGINT and SIGTERM end this process at once, as long as `Stop.on_signals` has not taken over."""
+    """Make a signal end this process at once, as long as nothing else has taken over."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         # Not by an exception: a module that is being imported may swallow it.
-        os.write(sys.stderr.fileno(), f"{program}: interrupted\n".encode())
+        with suppress(OSError):
+            os.write(2, f"{program}: interrupted\n".encode())
         os._exit(status_after(number))
 
+    _handle(handle)
+
+
+def raise_on_signals() -> None:
+    """Make a signal raise `Signalled`: for commands that hold no state, but children and half-written files."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        raise Signalled(number)
+
+    _handle(handle)
+
+
+def _handle(handler: Callable[[int, FrameType | None], None]) -> None:
+    """Handle the signals that end a process; not SIGHUP where nohup has it ignored."""
     for number in SIGNALS:
-        signal.signal(number, handle)
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def run_main(program: str, main: Callable[[], None]) -> None:
-    """Run a command's body; print a CoopError as one line and exit with its status."""
+    """Run a command's body; end with one line, and its status, for whatever it raises.
+
+    What is no CoopError and no failure of a file or of memory is printed with its traceback before that line.
+    """
+    status: int | None = None
     try:
         main()
-    except CoopError as error:
-        print(f"{program}: error: {error}", file=sys.stderr, flush=True)
-        sys.exit(error.exit_status)
-    except BrokenPipeError:  # the reader of the output has gone
-        _give_up_output()
-        sys.exit(1)
-    except OSError as error:
-        if error.errno not in NO_SPACE:
-            raise
-        print(f"{program}: error: {error.filename or 'output'}: {error.strerror}", file=sys.stderr, flush=True)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        print(f"{program}: interrupted", file=sys.stderr, flush=True)
-        sys.exit(status_after(signal.SIGINT))
+    except Leave as error:
+        status = error.code if isinstance(error.code, int) else 0
+    except KeyboardInterrupt as error:
+        complain(f"{program}: interrupted")
+        status = getattr(error, "exit_status", status_after(signal.SIGINT))
+    except BaseException as error:
+        line, status = _explained(error)
+        complain(f"{program}: error: {line}")
     finally:
-        try:
-            sys.stdout.flush()
-        except OSError:
-            _give_up_output()
+        flush_at_end()
+    if status is not None:
+        sys.exit(status)
 
 
-def _give_up_output() -> None:
-    """Keep the interpreter from flushing the rest of the output, which would fail and change the exit status."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _explained(error: BaseException) -> tuple[str, int]:
+    """The line that tells a user of a failure, and its exit status; prints the traceback if the line is not enough."""
+    match error:
+        case CoopError():
+            return str(error), error.exit_status
+        case SystemExit():
+            code = "" if error.code is None else repr(error.code)
+            return f"sys.exit({code}) was called {_where(error)}; only this program ends its processes", 1
+        case OSError(errno=number) if number in NO_SPACE:
+            return f"{error.filename or 'output'}: {error.strerror}", 1
+        case OSError(filename=str() | bytes() as name, strerror=str() as why):
+            return f"{os.fsdecode(name)}: {why}", 1
+    if is_out_of_memory(error):
+        return f"not enough memory ({first_line(error)}); {memory_limit()}", 1
+    traceback.print_exception(error)
+    return first_line(error), 1
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether the system has refused memory; PyTorch says so in words."""
+    return (
+        isinstance(error, MemoryError)
+        or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+        or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error))
+    )
+
+
+def first_line(error: BaseException | None) -> str:
+    """An exception's type and the first line of its text."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def _where(error: BaseException) -> str:
+    """Where an exception was raised, in words."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"in {frames[-1].name}, line {frames[-1].lineno} of {frames[-1].filename}" if frames else "somewhere"

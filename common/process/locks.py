@@ -24,6 +24,7 @@ from types import TracebackType
 from typing import Self
 
 from common.errors import RunError
+from common.process.output import keep_standard_files
 from common.process.untrusted import check_links
 
 INHERITED = "COOP_LOCKS"  # comma-separated descriptors of locks that a process inherits from its supervisor
@@ -57,6 +58,7 @@ class FileLock:
             self.descriptor = inherited
             self._token = _read(path)[1]
         else:
+            keep_standard_files()  # children's logs replace theirs
             self._token = secrets.token_hex(16)
             self.descriptor = os.open(path, _OPEN, 0o644)
             try:

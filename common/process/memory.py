@@ -1,13 +1,10 @@
-"""Memory of this process: how much its job may use, rows that grow in place, how the C library treats freed memory."""
+"""Memory of this process: rows that grow in place, and how the C library treats freed memory."""
 
 from __future__ import annotations
 
 import ctypes
 import mmap
-import os
-from contextlib import suppress
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -26,28 +23,6 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(_TRIM_THRESHOLD, _KEEP)
         mallopt(_MMAP_THRESHOLD, _KEEP)
-
-
-def job_memory(root: Path = Path("/")) -> int:
-    """Bytes that this process may use: this machine's memory, or less if a control group limits its job.
-
-    root: where /proc and /sys are, for tests.
-    """
-    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
-    groups = ""
-    with suppress(OSError):
-        groups = (root / "proc/self/cgroup").read_text(encoding="utf-8")
-    for line in groups.splitlines():
-        _, controllers, path = line.split(":", 2)
-        if controllers in ("", "memory"):
-            top, name = (
-                ("sys/fs/cgroup/memory", "memory.limit_in_bytes") if controllers else ("sys/fs/cgroup", "memory.max")
-            )
-            group = Path(path.lstrip("/"))
-            for each in (group, *group.parents):  # a limit holds for all groups below it
-                with suppress(OSError, ValueError):  # no such group in this container; "max"
-                    limits.append(int((root / top / each / name).read_text(encoding="utf-8")))
-    return min(limits)
 
 
 class GrowingRows:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
+
+from common.process.output import complain
 
 _told: set[tuple[str, str]] = set()
 
 
 def warn(text: str) -> None:
     """Print a warning of a likely mistake."""
-    print(f"warning: {text}", file=sys.stderr, flush=True)
+    complain(f"warning: {text}")
 
 
 def warn_once(text: str) -> None:
@@ -25,4 +26,4 @@ def note_renamed(names: Mapping[str, str]) -> None:
     fresh = [f"{former} is now {present}" for former, present in names.items() if (former, present) not in _told]
     _told.update(names.items())
     if fresh:
-        print(f"note: {', '.join(fresh)}", file=sys.stderr, flush=True)
+        complain(f"note: {', '.join(fresh)}")

@@ -13,11 +13,17 @@ from pathlib import Path
 from types import MappingProxyType
 
 from common.errors import RunError
+from common.places import working_directory
 from common.process.lifecycle import SIGNALS, SUPERVISED, status_after
+from common.process.limits import memory_kills, memory_limit
 from common.process.locks import INHERITED
+from common.process.output import keep_standard_files
 
 SIGNAL_STATUSES = tuple(map(status_after, SIGNALS))
-LAST_WORDS = 400  # characters of a log's last line
+LAST_WORDS = 400  # characters of a log's line
+SAYS_WHY = ": error: "  # in the line in which a command says why it fails
+# Signals by which a process ends itself.
+FAULTS = tuple(-number for number in (signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV))
 
 
 class ChildProcess:
@@ -26,7 +32,7 @@ class ChildProcess:
     Args:
         name: shown to users, for example "actor 2".
         inherit: file descriptors of locks that the child holds too. environment: variables that it gets as well.
-        directory: in which it works; this process's if None.
+        directory: in which it works; if None, the one in which this process was started.
     """
 
     def __init__(
@@ -45,16 +51,21 @@ class ChildProcess:
         self._environment = environment
         self._directory = directory
         self._process: subprocess.Popen[bytes] | None = None
+        self._begin = 0  # of what this start has written to the log, in bytes
+        self._memory_kills = 0  # before this start
 
     def start(self) -> None:
         """Start or restart it."""
+        keep_standard_files()
+        self._memory_kills = memory_kills()
         with self._log.open("ab") as log:
+            self._begin = log.tell()
             self._process = subprocess.Popen(
                 self._command,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                cwd=self._directory,
+                cwd=self._directory or working_directory(),
                 pass_fds=self._inherit,
                 start_new_session=True,  # a Ctrl-C at the terminal reaches the supervisor alone
                 env={
@@ -75,8 +86,19 @@ class ChildProcess:
         return None if self._process is None else self._process.poll()
 
     def was_interrupted(self) -> bool:
-        """True if SIGINT or SIGTERM ended it, cleanly or during its start."""
+        """True if SIGINT, SIGTERM or SIGHUP ended it, cleanly or during its start."""
         return self.exit_status() in (*SIGNAL_STATUSES, *(-number for number in SIGNALS))
+
+    def was_killed_for_memory(self) -> bool:
+        """True if the system has killed it because its memory was used up."""
+        return self.exit_status() == -signal.SIGKILL and memory_kills() > self._memory_kills
+
+    def own_words(self) -> str:
+        """How it ended by itself, the same at each start if it ends like that again; empty if others ended it."""
+        status = self.exit_status() or 0
+        if self.was_interrupted() or (status < 0 and status not in FAULTS):
+            return ""
+        return f"{status} {self._reason()}"
 
     def interrupt(self) -> None:
         """Ask it to stop cleanly."""
@@ -94,17 +116,31 @@ class ChildProcess:
             self._process.wait()
 
     def why(self) -> str:
-        """Describe how it ended; if not by a signal, with the last line of its log."""
+        """Describe how it ended; if not by a signal, with the line of its log that says why."""
         status = self.exit_status() or 0
+        if self.was_killed_for_memory():
+            return f"{self.name} (pid {self.pid}) was killed because the memory is used up; {memory_limit()}"
         if status < 0:
             return f"{self.name} (pid {self.pid}) was killed by {signal.Signals(-status).name}"
-        line = self.last_line()[-LAST_WORDS:]
+        if status == 0:
+            return f"{self.name} (pid {self.pid}) ended by itself before the run did (exit status 0)"
+        line = self._reason()
         return f"{self.name} ended (exit status {status})" + (f": {line}" if line else "")
 
     def last_line(self) -> str:
         """The last line that it printed."""
-        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        lines = self._lines()
         return lines[-1] if lines else ""
+
+    def _reason(self) -> str:
+        """The line in which it says why it failed, or else its last line."""
+        return next((line for line in reversed(self._lines()) if SAYS_WHY in line), self.last_line())[:LAST_WORDS]
+
+    def _lines(self) -> list[str]:
+        """What it has printed since this start."""
+        with self._log.open("rb") as log:
+            log.seek(self._begin)
+            return log.read().decode(errors="replace").strip().splitlines()
 
 
 def command(name: str, *flags: str) -> list[str]:

@@ -1,16 +1,15 @@
-"""Checks that a run fits into this machine's memory and its data into the messages between roles."""
+"""Checks that a run fits into the memory of its processes and its data into the messages between roles."""
 
 from __future__ import annotations
 
 import math
-import os
 from itertools import pairwise
 
 import numpy as np
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import UsageError
-from common.process.memory import job_memory
+from common.process.limits import memory_limit
 from common.settings.config import RunConfig
 from common.settings.policies import EVICTIONS
 from common.types import EnvSpec
@@ -33,20 +32,15 @@ def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Raise UsageError for a table that does not fit into this machine's memory."""
-    capacity = config.replay.capacity
-    needed = _most_bytes(config, spec)
-    present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if needed > present:
-        raise UsageError(
-            f"replay.capacity = {capacity:,}: needs up to {needed / 2**30:.1f} GiB, this machine has "
-            f"{present / 2**30:.1f} GiB"
-        )
+    """Raise UsageError for a table that does not fit into the memory that this process may use."""
+    needed, limit = _most_bytes(config, spec), memory_limit()
+    if needed > limit.size:
+        raise UsageError(f"replay.capacity = {config.replay.capacity:,}: needs up to {needed / 2**30:.1f} GiB, {limit}")
 
 
 def mirror_slots(config: RunConfig, spec: EnvSpec) -> int:
     """The most frames that the learner's mirror may hold, as if the table were on this machine, too; 0 for no room."""
-    memory = job_memory()
+    memory = memory_limit().size
     room = min(MIRROR_SHARE * memory, (memory - _most_bytes(config, spec)) / 2)
     return max(0, min(2**31 - 1, int(room) // (frame_bytes(spec) + 8)))  # each with its number
 

@@ -14,6 +14,7 @@ import tyro
 
 from common.errors import RunError, UsageError
 from common.imports import permit
+from common.places import absolute
 from common.process import cli
 from common.process.extras import check_extra
 from common.process.flags import HttpAddress
@@ -103,7 +104,7 @@ class RunOptions(RunConfig):
             return self._resumed()
         game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
         named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-        path = self.run_dir or Path("runs") / named
+        path = self.run_dir or absolute(Path("runs") / named)
         if holds_run(path):
             how = "give another folder, or go on with --resume (resume=True in Python)"
             raise UsageError(f"run directory {path}: holds a run already; {how}")

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from common.errors import RunError, UsageError
 from common.process.cli import parse
-from common.process.lifecycle import run_main
+from common.process.lifecycle import raise_on_signals, run_main
 from common.process.untrusted import refuse_links
 
 
@@ -38,6 +38,7 @@ class ReportOptions:
 
 def main() -> None:
     """Entry point."""
+    raise_on_signals()
     run_main("coop-report", _run)
 
 

@@ -12,6 +12,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from common.returns import exact
+
 Columns = dict[str, list[Any]]  # values of each column by line; None if a line lacks it
 LARGEST = 2**63
 
@@ -56,9 +58,11 @@ def csv_type(columns: Sequence[Sequence[str]]) -> tuple[pa.DataType, Callable[[s
     cells = [cell for column in columns for cell in column]
     if all(map(_is_integer, cells)):
         return pa.int64(), int
-    # 32 bits preserve six digits, which `RunDirectory` writes for floats.
+    # 32 bits preserve six digits, which `RunDirectory` writes for floats other than returns.
     if all(map(_is_float, cells)) and [*map(_cell, _narrow(cells).tolist())] == cells:
         return pa.float32(), float
+    if all(map(_is_float, cells)) and [exact(float(cell)) for cell in cells] == cells:
+        return pa.float64(), float
     return pa.string(), str
 
 

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from common.errors import RunError, UsageError
 from common.process.files import write_atomic
 from common.process.untrusted import check_links, check_run_name
+from common.returns import exact
 from experiments.report.columns import (
     Columns,
     csv_columns,
@@ -73,7 +74,7 @@ class PackedStudy:
         if file in TEXTS:
             text: str | None = self._value(run, file).as_py()
             return text
-        columns = {name: value.as_py() for name, value in self._columns(run, file).items()}
+        columns = {name: _cells(file, value) for name, value in self._columns(run, file).items()}
         if not columns:
             return ""
         if file == EPISODES:
@@ -92,8 +93,8 @@ class PackedStudy:
             return {name: [] for name in (*wanted, *optional)}
         read = decimal if file == EPISODES else list
         lacking: list[Any] = [None] * len(next(iter(columns.values())))
-        found = {name: read(columns[name].as_py()) for name in wanted}
-        return found | {name: read(columns[name].as_py()) if name in columns else lacking for name in optional}
+        found = {name: read(_cells(file, columns[name])) for name in wanted}
+        return found | {name: read(_cells(file, columns[name])) if name in columns else lacking for name in optional}
 
     def _columns(self, run: str, file: str) -> dict[str, pa.Scalar]:
         start = f"{file}/"
@@ -102,6 +103,12 @@ class PackedStudy:
 
     def _value(self, run: str, column: str) -> pa.Scalar:
         return self._table[column][self._rows[run]]
+
+
+def _cells(file: str, value: pa.Scalar) -> list[Any]:
+    """A column of a run; of episodes.csv as text where its numbers need 64 bits."""
+    cells: list[Any] = value.as_py()
+    return [*map(exact, cells)] if file == EPISODES and value.type.value_type == pa.float64() else cells
 
 
 def pack(folder: Path, path: Path, rows: int | None = None) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import RunError, UsageError
+from common.process.limits import cores
 from common.process.notices import warn
 from common.process.untrusted import refuse_links
 from experiments.report.answer import answer
@@ -92,7 +92,7 @@ def write_report(runs: Path, out: Path, baseline: str | None = None) -> tuple[Pa
 
 def _draw_all(figures: Sequence[tuple[Figure, Path]]) -> None:
     """Draw every figure, on all cores: matplotlib takes half of a report's time. Raises OSError as `draw`."""
-    workers = max(1, min(len(figures), len(os.sched_getaffinity(0))))
+    workers = max(1, min(len(figures), cores()))
     # Forked, since a new process would first spend a second on its imports.
     with ProcessPoolExecutor(workers, get_context("fork")) as pool:
         for _ in pool.map(draw, *zip(*figures, strict=True)):

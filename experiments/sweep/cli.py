@@ -11,7 +11,9 @@ import tyro
 from tyro.conf import Positional
 
 from common.errors import Interrupted, RunError, UsageError
+from common.places import absolute
 from common.process.cli import parse
+from common.process.console import say
 from common.process.extras import check_extra
 from common.process.lifecycle import Stop, run_main
 from common.suggestions import closest, refusal
@@ -60,7 +62,7 @@ def _run() -> None:
             raise UsageError("--dask and --slurm: give one of them")
         check_extra("--dask", "dask", "distributed")
     grid = load_grid(options.grid, options.quick)
-    folder = options.dir or default_folder(options.grid, options.quick)
+    folder = options.dir or absolute(default_folder(options.grid, options.quick))
     cells = chosen(options, grid, folder)
     claim_folder(grid, cells, folder)
     if options.slurm:
@@ -114,11 +116,11 @@ def _work(runner: Runner, folder: Path) -> None:
             runner.abort()
         line = display.line()
     for name, why in runner.failed.items():
-        print(f"failed: {name}: {why}")
+        say(f"failed: {name}: {why}")
     if not runner.done:
         raise Interrupted(f"{stop.reason} with {line}; the same command goes on from here", stop.exit_status or 1)
     if runner.failed:
         count = len(runner.failed)
         raise RunError(f"{count} of {len(runner.folders)} cells failed; the same command tries them again")
     diverged = f", {len(runner.diverged)} of them diverged" if runner.diverged else ""
-    print(f"all {len(runner.folders)} cells are finished{diverged}; coop-report {folder}")
+    say(f"all {len(runner.folders)} cells are finished{diverged}; coop-report {folder}")

@@ -19,6 +19,7 @@ from uuid import uuid4
 from distributed import Client, Future, KilledWorker, Security, Status, Worker, get_worker
 
 from common.errors import RunError, UsageError
+from common.places import working_directory
 from common.process.cli import PACKAGE
 from experiments.sweep.folder import CellFolder, Ending
 from experiments.sweep.grid import GridFile
@@ -86,7 +87,7 @@ class DaskWorkers:
         name = folder.cell.name
         there = CellFolder(folder.path.parent.resolve(), folder.cell)
         self._futures[name] = self._client.submit(
-            run_cell, there, self._grid, Path.cwd(), key=f"{name}-{uuid4().hex}", pure=False
+            run_cell, there, self._grid, working_directory(), key=f"{name}-{uuid4().hex}", pure=False
         )
         return True
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 
+from common.process.limits import cores
 from common.process.locks import RunLock
 from common.process.processes import ChildProcess, command
 from experiments.sweep.folder import CellFolder, Ending
@@ -19,13 +19,13 @@ class LocalProcesses:
     """An executor. A cell's process shares the run's locks with the sweep, and keeps them if the sweep is killed.
 
     Args:
-        jobs: number of cells to run concurrently; the number of cores if None.
+        jobs: number of cells to run concurrently; the number of cores of this job if None.
         directory: working directory of the cells, where they find users' own modules; this process's if None.
     """
 
     def __init__(self, grid: GridFile, jobs: int | None, directory: Path | None = None) -> None:
         self._grid = grid
-        self._jobs = jobs or len(os.sched_getaffinity(0))
+        self._jobs = jobs or cores()
         self._directory = directory
         self._processes: dict[str, ChildProcess] = {}
         self._locks: dict[str, RunLock] = {}

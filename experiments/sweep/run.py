@@ -12,6 +12,7 @@ import pandas as pd
 import tomli_w
 
 from common.errors import UsageError
+from common.places import absolute
 from common.process.summaries import read_summary
 from common.settings.config import value_of
 from experiments.sweep.folder import CellFolder, claim_folder, default_folder
@@ -61,10 +62,10 @@ def sweep(
     if isinstance(grid, Mapping):
         if folder is None:
             raise UsageError("folder: a grid without a name needs one")
-        checked, path = parse_grid(tomli_w.dumps(grid), str(folder), quick), Path(folder)
+        checked, path = parse_grid(tomli_w.dumps(grid), str(folder), quick), absolute(Path(folder))
     else:
         checked = load_grid(str(grid), quick)
-        path = Path(folder or default_folder(grid, quick))
+        path = absolute(Path(folder or default_folder(grid, quick)))
     cells = [CellFolder(path, cell) for cell in checked.cells]
     claim_folder(checked, cells, path)
     runner = Runner(cells, LocalProcesses(checked.file, jobs))

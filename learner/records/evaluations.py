@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from common.messaging.messages.evaluate import EvaluationRow
 from common.process.files import LineFile
+from common.returns import exact
 
 EVALUATIONS = "evaluations.csv"
 Floats = NDArray[np.float64]
@@ -43,7 +44,7 @@ class EvaluationsFile(LineFile):
     def add(self, row: EvaluationRow) -> None:
         """Add a line."""
         values = [getattr(row, name) for name in FIELDS]
-        self._write([f"{value:.8g}" if isinstance(value, float) else str(value) for value in values])
+        self._write([exact(value) if isinstance(value, float) else str(value) for value in values])
 
     def _write(self, row: list[str]) -> None:
         self._csv.writerow(row)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import time
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -17,7 +16,8 @@ from common.messaging.messages.evaluate import EvaluationRow
 from common.process.console import say
 from common.process.files import LineFile, truncate, write_atomic
 from common.process.run_ids import draw_run_id, read_run_id
-from common.process.summaries import SUMMARY
+from common.process.summaries import SUMMARY, strict_json
+from common.returns import exact
 from common.settings.config import RunConfig
 from common.settings.overrides import leaves
 from common.settings.tables import to_tables, to_toml
@@ -25,7 +25,7 @@ from learner.records.curve import draw_learning_curve
 from learner.records.evaluations import EvaluationsFile
 from learner.records.mirror import WandbMirror
 from learner.records.summary import Summary
-from learner.records.tensorboard import TensorBoardWriter
+from learner.records.tensorboard import Kept, TensorBoardWriter
 from learner.trainer import EpisodeRow
 
 EPISODE_FIELDS = (
@@ -64,7 +64,10 @@ class RunDirectory:
             self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
             self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
             self._evaluations = EvaluationsFile(path, None if sizes is None else env_step)
-            self._tensorboard = TensorBoardWriter(path / "tb", mirror)
+            kept = None
+            if sizes is not None:
+                kept = Kept(_lines(path / "episodes.csv") - 1, _lines(path / "metrics.jsonl"), env_step)
+            self._tensorboard = TensorBoardWriter(path / "tb", mirror, kept)
             self._tensorboard.hyperparameters({".".join(place): value for place, value in leaves(to_tables(config))})
         except OSError as error:
             raise RunError(f"run directory {path}: {error.strerror or error}") from error
@@ -89,12 +92,12 @@ class RunDirectory:
         record, end = row.record, row.record.end
         place = (row.number, record.env_step, row.update, f"{record.actor:x}", record.stream)
         values = (f"{value:.6g}" for value in (end.epsilon, row.s, end.q1_mean, end.q2_mean))
-        self._csv.writerow((*place, f"{end.episode_return:g}", end.length, *values, end.param_version))
+        self._csv.writerow((*place, exact(end.episode_return), end.length, *values, end.param_version))
         self._tensorboard.episode(end.episode_return, end.length, record.env_step)
 
     def _metrics_row(self, row: dict[str, Any]) -> None:
         """Add a line to metrics.jsonl, and its numbers to TensorBoard."""
-        self._metrics.write(json.dumps({"time": time.time(), **row}) + "\n")
+        self._metrics.write(strict_json({"time": time.time(), **row}) + "\n")
         self._tensorboard.metrics(row)
 
     @property
@@ -129,7 +132,7 @@ class RunDirectory:
         try:
             for file in (self._episodes, self._metrics, self._evaluations):
                 file.finish()
-            write_atomic(self.path / SUMMARY, f"{json.dumps(asdict(summary), indent=2)}\n".encode())
+            write_atomic(self.path / SUMMARY, f"{strict_json(asdict(summary), indent=2)}\n".encode())
         except OSError as error:
             # The message must also say how the run ended.
             raise RunError(f"{self.path}: {error.strerror or error}; how the run ended: {summary.exit}") from error
@@ -170,6 +173,11 @@ class RunDirectory:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _lines(path: Path) -> int:
+    with path.open("rb") as file:
+        return sum(1 for _ in file)
 
 
 def claim_run_directory(path: Path, config: RunConfig) -> int:

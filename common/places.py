@@ -1,0 +1,41 @@
+"""The working directory that a command was started in, which users' code may leave or somebody delete."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+from common.errors import UsageError
+
+_started_in: Path | None = None
+
+
+def remember_working_directory() -> None:
+    """Make this process's working directory the one that `working_directory` tells from now on."""
+    global _started_in  # noqa: PLW0603 (of the process)
+    with suppress(OSError):
+        _started_in = Path.cwd()
+
+
+def working_directory() -> Path:
+    """The directory in which this command was started; the present one in a process that is no command of ours.
+
+    Raises:
+        UsageError: it has been deleted.
+    """
+    try:
+        return _started_in or Path.cwd()
+    except OSError as error:
+        raise UsageError("the working directory has been deleted; give absolute paths") from error
+
+
+def absolute(path: Path) -> Path:
+    """A path as it was meant when this command was started; raises UsageError as `working_directory`."""
+    return path if path.is_absolute() else working_directory() / path
+
+
+def shown(path: Path) -> Path:
+    """A path below that directory as users write it; others as they are."""
+    if _started_in is not None and path.is_relative_to(_started_in):
+        return path.relative_to(_started_in)
+    return path

@@ -1,0 +1,179 @@
+"""Output whose reader or terminal goes away, descriptors that are closed, and SIGHUP: no run is lost, nothing fails."""
+
+import fcntl
+import json
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import sysconfig
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from common.process.lifecycle import Stop
+from learner.records.epochs import newest_epoch
+
+pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
+
+SCRIPTS = Path(sysconfig.get_path("scripts"))
+SMALL = "--replay.capacity 100 --replay.learning-starts 40 --network.hidden 8"
+SHORT, LONG = f"{SMALL} --total-steps 300", f"{SMALL} --total-steps 1000000"
+VARIABLES = {**os.environ, "OMP_NUM_THREADS": "1", "PATH": f"{SCRIPTS}:{os.environ['PATH']}"}
+ENVS = """
+import os, sys
+import gymnasium
+from gymnasium.envs.classic_control import CartPoleEnv
+
+class Closing(CartPoleEnv):
+    def __init__(self):
+        super().__init__()
+        sys.stdout.close()
+        sys.stdout = sys.stderr = None
+        os.close(1)
+
+gymnasium.register("Closing-v0", entry_point=Closing)
+"""
+
+
+def shell(line: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    command = ["bash", "-c", line]
+    return subprocess.run(
+        command, cwd=cwd, env=VARIABLES | variables, capture_output=True, text=True, timeout=200, check=False
+    )
+
+
+def how_it_ended(path: Path) -> str:
+    return str(json.loads((path / "summary.json").read_text())["exit"])
+
+
+@contextmanager
+def on_a_terminal(line: str, cwd: Path, *, nohup: bool = False) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Run a command in a session with a terminal; gives it and the other side of the terminal."""
+
+    def begin() -> None:
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+        if nohup:
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    side, terminal = pty.openpty()
+    with subprocess.Popen(
+        line.split(), cwd=cwd, env=VARIABLES, stdin=terminal, stdout=terminal, stderr=terminal,
+        start_new_session=True, preexec_fn=begin,  # noqa: PLW1509 (this process has no other threads)
+    ) as process:  # fmt: skip
+        os.close(terminal)
+        try:
+            yield process, side
+        finally:
+            process.kill()
+
+
+def read_until(side: int, path: Path) -> None:
+    """Read a terminal until a file has two lines."""
+    deadline = time.monotonic() + 120
+    while not path.exists() or path.read_bytes().count(b"\n") < 2:
+        assert time.monotonic() < deadline, f"no {path}"
+        if select.select([side], [], [], 0.05)[0]:
+            with suppress(OSError):
+                os.read(side, 65536)
+
+
+def test_a_reader_that_goes_ends_a_run_with_a_closing_checkpoint(tmp_path: Path) -> None:
+    done = shell(f"coop-lockstep {LONG} --run-dir run | head -1; echo ${{PIPESTATUS[0]}}", tmp_path)
+    assert done.stdout.splitlines()[-1] == "141"
+    assert done.stderr == ""
+    assert how_it_ended(tmp_path / "run") == "interrupted"
+    assert newest_epoch(tmp_path / "run") is not None
+
+
+def test_a_terminal_that_goes_ends_a_topology_with_a_closing_checkpoint(tmp_path: Path) -> None:
+    with on_a_terminal(f"coop-local {LONG} --run-dir run", tmp_path) as (process, side):
+        read_until(side, tmp_path / "run" / "metrics.jsonl")
+        os.close(side)
+        assert process.wait(120) == 128 + signal.SIGHUP
+    assert how_it_ended(tmp_path / "run") == "interrupted"
+    assert newest_epoch(tmp_path / "run") is not None
+    for log in (tmp_path / "run" / "logs").glob("*.log"):
+        assert "Traceback" not in log.read_text()
+
+
+@pytest.mark.parametrize("command", ["coop-lockstep", "coop-local"])
+def test_under_nohup_a_run_outlives_its_terminal(command: str, tmp_path: Path) -> None:
+    line = f"{command} {SMALL} --total-steps 1500 --run-dir run"
+    with on_a_terminal(line, tmp_path, nohup=True) as (process, side):
+        read_until(side, tmp_path / "run" / "metrics.jsonl")
+        os.close(side)
+        assert process.wait(200) == 0
+    assert how_it_ended(tmp_path / "run") == "complete"
+
+
+def test_closed_descriptors_of_a_lockstep_run(tmp_path: Path) -> None:
+    done = shell(f"coop-lockstep {SHORT} --run-dir run <&- >&-", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert how_it_ended(tmp_path / "run") == "complete"
+    told = shell("coop-eval run --episodes 1 --networks 1 >&- 2>&-", tmp_path)
+    assert told.returncode == 0
+
+
+def test_a_topology_whose_environment_closes_its_output(tmp_path: Path) -> None:
+    """Also on a full disk, and without standard error: no lock or log takes the place of what is closed."""
+    (tmp_path / "closing_envs.py").write_text(ENVS)
+    done = shell(f"coop-local --env.id closing_envs:Closing-v0 {SHORT} --run-dir run >/dev/full 2>&-", tmp_path)
+    assert done.returncode == 0
+    assert how_it_ended(tmp_path / "run") == "complete"
+    assert (tmp_path / "run" / "logs" / "learner.log").read_text().splitlines()[-1].startswith("complete: 300 steps")
+
+
+def test_no_file_takes_the_place_of_a_closed_descriptor(tmp_path: Path) -> None:
+    code = """
+import os, sys
+from pathlib import Path
+from common.process.files import LineFile, SyncedFile
+from common.process.locks import FileLock
+for opened in (FileLock, SyncedFile, lambda path: LineFile(path, go_on=False)):
+    os.close(1)
+    file = opened(Path(sys.argv[1], "file"))
+    os.write(1, b"a library's own words")
+print(os.path.getsize(sys.argv[1] + "/file"), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True)
+    assert done.stderr == "0\n"
+
+
+@pytest.mark.parametrize("name", ["läuft-猫", "b\udcff"])
+@pytest.mark.parametrize("command", ["coop-report", "coop-eval"])
+def test_names_that_the_terminal_lacks(command: str, name: str, tmp_path: Path) -> None:
+    done = shell(f"{command} '{name}'", tmp_path, PYTHONIOENCODING="ascii")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"{command}: error: ")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("flags", ["--help", "--nonsense"])
+def test_answers_to_nowhere(flags: str, tmp_path: Path) -> None:
+    for where in (">&- 2>&-", "2>/dev/full | true"):
+        done = shell(f"coop-watch {flags} {where}; exit ${{PIPESTATUS[0]}}", tmp_path)
+        assert (done.returncode, done.stderr) == (0 if flags == "--help" else 2, "")
+
+
+def test_sighup_requests_a_stop_unless_it_is_ignored() -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    ignoring, stopping = Stop(), Stop()
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        ignoring.on_signals()
+        signal.raise_signal(signal.SIGHUP)
+        assert not ignoring.is_set()
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        stopping.on_signals()
+        signal.raise_signal(signal.SIGHUP)
+        assert (stopping.reason, stopping.exit_status) == ("interrupted", 129)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
