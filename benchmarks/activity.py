@@ -18,11 +18,12 @@ from torch import Tensor, nn
 from common.envs.make import env_spec
 from common.networks.inputs import preprocess
 from common.networks.network import FlatNetwork
+from common.process.checkpoints import REPLAY
 from common.process.run_ids import read_run_id
 from common.process.threads import use_threads
 from common.settings.tables import load_tables, resolve
 from learner.agent import Agent
-from learner.records.epochs import load_learner, newest_epoch
+from learner.records.epochs import newest_epoch
 from replay.core import ReplayCore
 from replay.persistence.storage import load_snapshot
 
@@ -53,14 +54,14 @@ def main() -> None:
     config = resolve(load_tables(None, options.run_dir / "config.toml"))
     spec = env_spec(config.env)
     core = ReplayCore(config, spec)
-    load_snapshot(core, epoch / "replay", read_run_id(options.run_dir))
+    load_snapshot(core, epoch.path / REPLAY, read_run_id(options.run_dir), epoch.number)
     batch = core.table.sample(options.states)
     fresh, trained = Agent(config, spec), Agent(config, spec)
-    trained.load_state(load_learner(epoch)["agent"])
+    trained.load_state(epoch.state["agent"])
     acting = trained.acting
     with torch.inference_mode():
         x = preprocess(torch.from_numpy(batch.frames[batch.obs_index]).view(-1, *spec.obs_shape), spec)
-        print(f"{epoch}: network {acting + 1} acts")
+        print(f"{epoch.path}: network {acting + 1} acts")
         show(trained.networks[acting], x)
         print("as the run began")
         show(fresh.networks[acting], x)

@@ -21,7 +21,7 @@ from common.settings.environment import EnvSettings
 from common.settings.tables import load_tables, resolve
 from common.types import EnvSpec
 from learner.qnetwork import make_network
-from learner.records.epochs import load_learner, newest_epoch
+from learner.records.epochs import fitting, newest_epoch
 from learner.records.evaluations import EVALUATIONS
 
 CPU = torch.device("cpu")
@@ -116,18 +116,20 @@ class SavedRun:
         return read_summary(self.path) or None
 
     def checkpoint(self) -> Checkpoint:
-        """The networks of the newest epoch; raises UsageError if there is none."""
+        """The networks of the newest whole checkpoint; a warning names younger ones that are not.
+
+        Raises UsageError if there is none.
+        """
         epoch = newest_epoch(self.path)
         if epoch is None:
             raise UsageError(f"{self.path}: has no complete checkpoint")
-        state = load_learner(epoch)
-        spec = env_spec(self.config.env)
+        state, spec = epoch.state, env_spec(self.config.env)
         first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
-        for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
-            network.load(flat)
-        steps = state["drawn"]["inserted"] if "drawn" in state else state["step"]  # the latter in version 0.1.0
-        returns = state["telemetry"]["returns"]
-        return Checkpoint(int(epoch.name), spec, (first, second), state["agent"]["acting"], steps, returns)
+        with fitting(epoch.path):
+            for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
+                network.load(flat)
+            steps, returns = state["drawn"]["inserted"], state["telemetry"]["returns"]
+            return Checkpoint(epoch.number, spec, (first, second), state["agent"]["acting"], steps, returns)
 
     def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
         """The greedy policy of the newest epoch.

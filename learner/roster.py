@@ -16,7 +16,7 @@ from common.errors import BadMessage, RunError
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join
 from common.messaging.presence import LEASE
-from common.process.files import write_atomic
+from common.process.files import sealed, unsealed, write_atomic
 
 ROSTER = "roster.json"
 RESERVE = 8  # a roster of n actors saves n / 8 numbers in advance, which a restarted learner leaves out
@@ -64,7 +64,7 @@ class Roster:
         self._actors: dict[int, int] = {}  # numbers of the actors known to this learner, by incarnation
         try:
             if self._path is not None and self._path.exists():
-                self._entries = _Entries(**json.loads(self._path.read_text(encoding="utf-8")))
+                self._entries = _Entries(**json.loads(unsealed(self._path.read_bytes())))
                 self._given = self._entries.actors
         except (OSError, ValueError, TypeError) as error:
             raise RunError(f"{self._path}: {error}") from error
@@ -126,7 +126,7 @@ class Roster:
         """Save the entries and then use them; raises RunError."""
         if self._path is not None:
             try:
-                write_atomic(self._path, json.dumps(asdict(entries)).encode())
+                write_atomic(self._path, sealed(json.dumps(asdict(entries)).encode()))
             except OSError as error:
                 raise RunError(f"{self._path}: {error.strerror or error}") from error
         self._entries = entries

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Self
 
 from common.errors import RunError
+from common.process.files import make_folder
 
 INHERITED = "COOP_LOCKS"  # comma-separated descriptors of locks that a process inherits from its supervisor
 HOLDER_BYTES = 512  # more than any holder's line
@@ -53,16 +54,17 @@ class RunLock:
     """
 
     def __init__(self, folder: Path, program: str, roles: Sequence[str]) -> None:
-        """Lock the places of `roles`; create the folder if it does not exist.
+        """Lock the places of `roles`; create the folder if it does not exist. `sign` names this process in them.
 
         Raises:
             RunError: another process, which the message names, holds one of them, or the folder cannot be written.
         """
         self._locks: list[FileLock] = []
+        self._holder = f"{program} on {socket.gethostname()} (pid {os.getpid()})"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             for role in roles:
-                self._take(folder, role, program)
+                self._take(folder, role)
         except OSError as error:
             self.release()
             raise RunError(f"run directory {folder}: {error.strerror or error}") from error
@@ -75,13 +77,19 @@ class RunLock:
         """The descriptors that a child must inherit, and find in the variable `INHERITED`, to hold the locks too."""
         return tuple(lock.descriptor for lock in self._locks)
 
+    def sign(self) -> Self:
+        """Name this process to others that want the directory; before, the locks' files are as they were."""
+        for lock in self._locks:
+            lock.name_holder(self._holder)
+        return self
+
     def release(self) -> None:
         """Release all locks."""
         for lock in self._locks:
             lock.release()
         self._locks.clear()
 
-    def _take(self, folder: Path, role: str, program: str) -> None:
+    def _take(self, folder: Path, role: str) -> None:
         path = folder / f".{role}.lock"
         if _is_inherited(path):
             return  # the supervisor holds it and is named in it
@@ -90,7 +98,6 @@ class RunLock:
         except BlockingIOError:
             holder = path.read_text(encoding="utf-8", errors="replace") or "another process"
             raise RunError(f"run directory {folder}: in use by {holder}") from None
-        lock.name_holder(f"{program} on {socket.gethostname()} (pid {os.getpid()})")
         self._locks.append(lock)
 
     def __enter__(self) -> Self:

@@ -6,7 +6,7 @@ import secrets
 from pathlib import Path
 
 from common.errors import RunError
-from common.process.files import write_atomic
+from common.process.files import make_folder, write_atomic
 
 RUN_ID = "run-id"
 
@@ -42,7 +42,7 @@ def claim(folder: Path, run_id: int) -> None:
         check_owner(folder, read_run_id(folder), run_id)
         return
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         write_atomic(folder / RUN_ID, f"{run_id}\n".encode())
     except OSError as error:
         raise RunError(f"{folder / RUN_ID}: {error.strerror or error}") from error

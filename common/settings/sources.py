@@ -16,7 +16,7 @@ from common.settings.tables import load_tables, resolve, shortened
 def base_config(args: Sequence[str] | None = None) -> RunConfig:
     """The config given by `--preset`, `--config`, `--method` and `--total-steps`; the other flags override it.
 
-    With `--resume` and neither a preset nor a file, it is the config of the run in `--run-dir`.
+    With `--resume` or `--resume-from` and neither a preset nor a file, it is the config of the run in `--run-dir`.
 
     Raises:
         UsageError: an unknown preset, a bad file, or both given.
@@ -28,13 +28,14 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     early.add_argument("--total-steps", "--total_steps", type=int)
     early.add_argument("--run-dir", "--run_dir", type=Path)
     early.add_argument("--resume", action="store_true")
+    early.add_argument("--resume-from", "--resume_from")
     try:
         known, _ = early.parse_known_args(sys.argv[1:] if args is None else args)
     except argparse.ArgumentError as error:
         raise UsageError(str(error)) from error
     if known.preset and known.config:
         raise UsageError("--preset and --config: give one of them")
-    resumed = known.run_dir if known.resume else None
+    resumed = known.run_dir if known.resume or known.resume_from else None
     return chosen_config(known.preset, known.config, known.method, known.total_steps, resumed)
 
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
+from common.process.checkpoints import checked_summary
+from common.process.files import make_folder, write_atomic
 from common.process.locks import FileLock
-from common.process.summaries import read_summary
 from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, resolve, to_toml
 from experiments.sweep.grid import Cell, Grid
@@ -53,7 +54,6 @@ class CellFolder:
         held = self.path / "config.toml"
         text = held.read_text(encoding="utf-8") if held.exists() else ""
         try:
-            # A kill during writing leaves an empty file.
             same = not text or identity(resolve(tomllib.loads(text))) == identity(self.cell.config)
         except (tomllib.TOMLDecodeError, UsageError):
             same = False
@@ -68,13 +68,16 @@ class CellFolder:
         return Ending("diverged", outcome) if outcome.startswith("diverged") else None
 
     def outcome(self) -> str:
-        """How its run ended, from summary.json; empty if that does not exist."""
-        return str(read_summary(self.path).get("exit", ""))
+        """How its run ended, from summary.json; empty if that can't be read, or the records are not those it seals."""
+        try:
+            return str(checked_summary(self.path).get("exit", ""))
+        except RunError:
+            return ""  # resuming the run names what is wrong, or writes them again
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[int | None]:
         """Hold the cell's lock; None if another process has it. A child that inherits the descriptor keeps it."""
-        self.path.mkdir(exist_ok=True)
+        make_folder(self.path)
         try:
             lock = FileLock(self.path / "lock")
         except BlockingIOError:
@@ -85,7 +88,7 @@ class CellFolder:
 
     def prepare(self) -> None:
         """Write the config from which the run starts or continues."""
-        (self.path / "config.toml").write_text(to_toml(self.cell.config), encoding="utf-8")
+        write_atomic(self.path / "config.toml", to_toml(self.cell.config).encode())
 
     def progress(self) -> Progress:
         """Read the progress from the end of episodes.csv; zeros before the first episode's end."""
@@ -115,11 +118,9 @@ def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
         UsageError: it holds runs of other configs, or cannot be written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for cell in cells:
             cell.check()
-        part = folder / f"sweep.toml.{os.getpid()}"  # the tasks of a job array write it concurrently
-        part.write_text(grid.to_toml(), encoding="utf-8")
-        part.replace(folder / "sweep.toml")
+        write_atomic(folder / "sweep.toml", grid.to_toml().encode())
     except OSError as error:
         raise UsageError(f"--dir {folder}: {error.strerror}") from error
