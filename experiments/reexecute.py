@@ -16,7 +16,7 @@ from common.process.run_ids import read_run_id
 from common.process.summaries import read_summary
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
-from common.settings.tables import load_tables, resolve
+from common.settings.tables import read_run_config
 from learner.agent import Agent
 from learner.initial_networks import load_initial_networks
 from learner.records.epochs import fitting, load_learner
@@ -57,7 +57,7 @@ def reexecute(run_dir: Path) -> Outcome:
         RunError: the journal is incomplete, contains a segment twice or disagrees with the summary's transitions, or
             parameters, optimizers or random state differ in any bit.
     """
-    config = resolve(load_tables(None, run_dir / "config.toml"))
+    config = read_run_config(run_dir)
     folder = run_dir / "journal"
     if not journal_files(folder):
         raise UsageError(f"{run_dir}: no journal with a finished epoch; was the run started with --replay.journal?")

@@ -1,6 +1,7 @@
 """The rules of the registered MinAtar study (results/minatar/plan.md), applied to packed studies.
 
-`python -m experiments.registered pilot|rates|scores|outcome FILE` prints a table of the plan and what it decides.
+`python -m experiments.registered pilot|rates|scores|outcome FILE` prints a table of the plan and what it decides, if
+study and plan are what SHA256SUMS beside them lists.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import pandas as pd
 from common.settings.config import value_of
 from common.settings.methods import METHODS
 from experiments.report.learning import area
+from experiments.report.packed import check_content
 from experiments.report.study import Study, load_study
 
+PLAN = "plan.md"
 LARGE = 100_000  # transitions
 LOSS = 45.0  # percent, of dqn's area at LARGE: "small" is the capacity whose loss is nearest
 ENOUGH = 10.0  # points: the least advantage that confirms the hypothesis
@@ -150,6 +153,9 @@ def main() -> None:
     parser.add_argument("rule", choices=RULES)
     parser.add_argument("file", type=Path, help="packed study")
     args = parser.parse_args()
+    plan = args.file.with_name(PLAN)
+    if plan.exists():
+        check_content(plan, plan.read_bytes())
     table = table_of(args.rule, load_study(args.file))
     print(table.to_string(index=False, float_format="{:.6g}".format))
     if args.rule == "outcome":

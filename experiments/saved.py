@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,11 +19,12 @@ from common.networks.network import FlatNetwork
 from common.process.summaries import read_summary
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
-from common.settings.tables import load_tables, resolve
+from common.settings.tables import read_run_config
 from common.types import EnvSpec
 from learner.qnetwork import make_network
 from learner.records.epochs import fitting, newest_epoch
 from learner.records.evaluations import EVALUATIONS
+from learner.records.reading import check_records, read_csv, read_jsonl, read_lines
 
 CPU = torch.device("cpu")
 NetworkChoice = Literal["mean", 1, 2]
@@ -93,22 +95,29 @@ class SavedRun:
     @cached_property
     def config(self) -> RunConfig:
         """The config of the run."""
-        return resolve(load_tables(None, self.path / "config.toml"))
+        return read_run_config(self.path)
 
     @property
     def episodes(self) -> pd.DataFrame:
         """A row for each finished episode, with the columns of episodes.csv."""
-        return pd.read_csv(self.path / "episodes.csv")
+        return self._table("episodes.csv")
 
     @property
     def metrics(self) -> pd.DataFrame:
         """A row for each line of metrics.jsonl."""
-        return pd.read_json(self.path / "metrics.jsonl", lines=True, convert_dates=False)
+        check_records(self.path)
+        return pd.DataFrame(read_jsonl(self.path / "metrics.jsonl"))
 
     @property
     def evaluations(self) -> pd.DataFrame:
         """A row for each evaluation during the run, with the columns of evaluations.csv."""
-        return pd.read_csv(self.path / EVALUATIONS)
+        return self._table(EVALUATIONS)
+
+    def _table(self, name: str) -> pd.DataFrame:
+        """A CSV record, after its checks; raises RunError."""
+        check_records(self.path)
+        read_csv(self.path / name)  # names a line that pandas would fill up
+        return pd.read_csv(io.StringIO("\n".join(read_lines(self.path / name))))
 
     @property
     def summary(self) -> dict[str, Any] | None:

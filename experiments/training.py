@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import json
 import sys
 import threading
 import warnings
@@ -28,6 +27,7 @@ from common.settings.overrides import leaves, merged
 from common.settings.sources import chosen_config
 from common.settings.tables import to_tables, to_toml, validated
 from experiments.lockstep_run import LockstepRun
+from learner.records.reading import parse_row
 
 POLL = 0.1  # seconds
 GRACE = 90.0  # seconds for a topology's clean stop
@@ -82,7 +82,7 @@ class TrainingRun:
                     file.seek(place)
                     lines = file.read().rpartition(b"\n")[0]
                 for line in lines.splitlines():
-                    row = json.loads(line)
+                    row = parse_row(line, f"{path}, after update {max(update, 0):,}")
                     if row["update"] > update:
                         update = row["update"]
                         yield row

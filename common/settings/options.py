@@ -25,7 +25,7 @@ from common.settings.methods import METHODS, table_of
 from common.settings.renamed import current_flags
 from common.settings.resuming import check_resumed
 from common.settings.sources import base_config
-from common.settings.tables import load_tables, preset_names, resolve, validated
+from common.settings.tables import preset_names, read_run_config, validated
 
 # What --help shows of a run's flags, in this order.
 COMMON = (
@@ -120,7 +120,7 @@ class RunOptions(RunConfig):
             raise UsageError("--resume: give the run's folder too, --run-dir")
         file = path / "config.toml"
         if file.exists():
-            check_resumed(self.run_config(), resolve(load_tables(None, file)), file)
+            check_resumed(self.run_config(), read_run_config(path), file)
         elif checkpoint_numbers(path, LEARNER) or any((path / name).exists() for name in RECORDS):
             raise UsageError(f"run directory {path}: holds a run, but its config.toml is missing; nothing was changed")
         elif has_run_id(path):

@@ -10,7 +10,7 @@ from pathlib import Path
 from common.errors import UsageError
 from common.process.notices import warn
 from common.settings.config import RunConfig
-from common.settings.tables import load_tables, resolve, shortened
+from common.settings.tables import load_tables, read_run_config, resolve, shortened
 
 
 def base_config(args: Sequence[str] | None = None) -> RunConfig:
@@ -48,7 +48,8 @@ def chosen_config(
         UsageError: an unknown preset or method, or a bad file.
     """
     saved = resumed and not (preset or file) and resumed / "config.toml"
-    if saved and saved.exists():
+    if resumed and saved and saved.exists():
+        read_run_config(resumed)
         file = saved
     tables = load_tables(None if file else preset or "cartpole", file)
     if file is None and total_steps is not None:

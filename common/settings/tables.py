@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from importlib.resources import files
@@ -13,6 +14,7 @@ import pydantic
 import tomli_w
 
 from common.errors import UsageError
+from common.process.run_ids import has_run_id
 from common.settings.config import OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from common.settings.methods import METHODS
 from common.settings.overrides import merged, of_method
@@ -21,6 +23,8 @@ from common.settings.rules import check_rules
 from common.suggestions import not_among
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
+CONFIG = "config.toml"
+_SEAL = "# crc32 "
 _FIELDS = [field.name for field in fields(RunConfig) if field.name != "own"]
 
 
@@ -120,6 +124,37 @@ def _own_settings(tables: dict[str, Any]) -> Any:  # noqa: ANN401 (an instance o
 def to_toml(config: RunConfig) -> str:
     """The resolved config as TOML, which `--config` reads."""
     return tomli_w.dumps(to_tables(config))
+
+
+def run_config_text(config: RunConfig) -> str:
+    """The text of a run's config.toml: the resolved config, and its checksum as a comment."""
+    text = to_toml(config)
+    return f"{text}{_SEAL}{zlib.crc32(text.encode()):08x}\n"
+
+
+def read_run_config(run_dir: Path) -> RunConfig:
+    """Read a run's config.toml, after a check of its checksum; raises UsageError."""
+    path = run_dir / CONFIG
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    # Runs of a packed study have no id, and may come from versions that wrote no checksum.
+    return parse_run_config(text, path, needed=has_run_id(run_dir))
+
+
+def parse_run_config(text: str, place: object, *, needed: bool = False) -> RunConfig:
+    """Read the text of a run's config.toml; place: for the error. needed: it must have a checksum.
+
+    Raises UsageError.
+    """
+    content, seal, checksum = text.rpartition(_SEAL)
+    if (seal or needed) and checksum != f"{zlib.crc32(content.encode()):08x}\n":
+        raise UsageError(f"{place}: not what the run wrote (wrong checksum); flags change the settings of a run")
+    try:
+        return resolve(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{place}: {error}") from error
 
 
 def to_tables(config: RunConfig) -> dict[str, Any]:

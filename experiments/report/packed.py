@@ -2,10 +2,16 @@
 
 Columns: `run`, the folder's name; `config.toml`, `summary.json` and `evaluations.csv`, their text; and a list for each
 column of `episodes.csv` and `metrics.jsonl`, named like `episodes.csv/return`. The schema's metadata hold `sweep.toml`.
+
+Every page has a checksum, and the metadata hold one of the whole file, for what pages don't cover. A file without
+one is looked up in SHA256SUMS beside it; one that is in neither is read with a warning.
 """
 
 from __future__ import annotations
 
+import hashlib
+import re
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +20,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from common.errors import RunError, UsageError
-from common.process.files import write_atomic
+from common.process.files import sync_folder, write_atomic
+from common.process.notices import warn
 from experiments.report.columns import (
     Columns,
     csv_columns,
@@ -38,6 +45,9 @@ TYPE: Mapping[str, Callable[[Sequence[Sequence[Any]]], tuple[pa.DataType, Callab
 }
 JSON = {b"holds": b"json"}
 SMALLEST = 22  # zstd's level
+SUMS = "SHA256SUMS"  # as sha256sum writes it
+SEAL, UNSEALED = "coop", "crc32 of the rest:00000000"  # an entry of the metadata; with its digits the checksum
+_SEALED = re.compile(rb"crc32 of the rest:[0-9a-f]{8}")
 
 
 class PackedStudy:
@@ -45,10 +55,15 @@ class PackedStudy:
 
     def __init__(self, path: Path) -> None:
         try:
-            self._table = pq.read_table(path)
+            content = path.read_bytes()
+            check_content(path, content)
+            self._table = pq.read_table(pa.BufferReader(content), page_checksum_verification=True)
             self.names: list[str] = self._table["run"].to_pylist()
-        except (OSError, KeyError, pa.ArrowException) as error:
-            raise UsageError(f"{path}: not a packed study: {str(error).splitlines()[0]}") from error
+        except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+            text = (str(error).splitlines() or [type(error).__name__])[0]
+            raise UsageError(f"{path}: not a packed study: {text}") from error
+        if SEAL.encode() in (self._table.schema.metadata or {}) and not _SEALED.search(content):
+            raise UsageError(f"{path}: wrong checksum: not what was packed")
         self._rows = {name: row for row, name in enumerate(self.names)}
         sweep = (self._table.schema.metadata or {}).get(SWEEP.encode())
         self.sweep = None if sweep is None else sweep.decode()
@@ -112,12 +127,14 @@ def pack(folder: Path, path: Path) -> str:
     for file in READ:
         fields += _lists(file, [_read(folder / run / file, files[run][file]) for run in runs])
     sweep = _file(folder / SWEEP)
-    schema = pa.schema([field for field, _ in fields], None if sweep is None else {SWEEP: sweep})
+    metadata = {SEAL: UNSEALED, **({} if sweep is None else {SWEEP: sweep})}
+    schema = pa.schema([field for field, _ in fields], metadata)
     part = path.with_name(f"{path.name}.part")
     try:
-        _write(pa.table([array for _, array in fields], schema=schema), part)
+        write_atomic(part, _packed(pa.table([array for _, array in fields], schema=schema)))
         _check(PackedStudy(part), folder, files)
         part.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
         raise UsageError(f"--pack {path}: {error.strerror or error}") from error
     finally:
@@ -182,7 +199,7 @@ def _lists(file: str, runs: Sequence[Columns]) -> list[tuple[pa.Field, pa.Array]
     return made
 
 
-def _write(table: pa.Table, path: Path) -> None:
+def _packed(table: pa.Table) -> bytes:
     encodings, texts = {}, []
     for field in table.schema:
         leaf = f"{field.name}.list.element" if pa.types.is_list(field.type) else field.name
@@ -191,8 +208,36 @@ def _write(table: pa.Table, path: Path) -> None:
             texts.append(leaf)
         else:
             encodings[leaf] = "DELTA_BINARY_PACKED" if pa.types.is_integer(kind) else "BYTE_STREAM_SPLIT"
-    with path.open("wb") as file:
-        pq.write_table(
-            table, file, compression="zstd", compression_level=SMALLEST, use_dictionary=texts,
-            column_encoding=encodings, write_statistics=False, data_page_size=1 << 30,
-        )  # fmt: skip
+    out = pa.BufferOutputStream()
+    pq.write_table(
+        table, out, compression="zstd", compression_level=SMALLEST, use_dictionary=texts, column_encoding=encodings,
+        write_statistics=False, data_page_size=1 << 30, write_page_checksum=True,
+    )  # fmt: skip
+    content: bytes = out.getvalue().to_pybytes()
+    place = content.rindex(UNSEALED.encode())
+    return content[:place] + _sealed(content).encode() + content[place + len(UNSEALED) :]
+
+
+def check_content(path: Path, content: bytes) -> None:
+    """Check the checksum of a whole packed study, or of a file beside it, which SHA256SUMS holds for older ones.
+
+    Raises UsageError if it differs; warns if there is none.
+    """
+    found = list(_SEALED.finditer(content))
+    if found:
+        start, end = found[-1].span()
+        unsealed = content[:start] + UNSEALED.encode() + content[end:]
+        if found[-1][0].decode() != _sealed(unsealed):
+            raise UsageError(f"{path}: wrong checksum: not what was packed")
+        return
+    sums = path.with_name(SUMS)
+    lines = sums.read_text(encoding="utf-8").splitlines() if sums.exists() else []
+    listed = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+    if path.name not in listed:
+        warn(f"{path}: has no checksum, as earlier versions wrote it")
+    elif listed[path.name] != hashlib.sha256(content).hexdigest():
+        raise UsageError(f"{path}: wrong checksum: not what {sums} lists")
+
+
+def _sealed(content: bytes) -> str:
+    return f"{UNSEALED[:-8]}{zlib.crc32(content):08x}"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from common.errors import RunError
 from experiments.report.packed import CONFIG, EPISODES, SWEEP, PackedStudy
+from learner.records.reading import check_records, column, read_csv, read_jsonl
 
 
 class Source(Protocol):
@@ -27,7 +27,7 @@ class Source(Protocol):
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
         """Some columns of a run's episodes or metrics; an optional one has None if a line lacks it.
 
-        Raises KeyError or ValueError if a wanted one is missing.
+        Raises RunError, KeyError or ValueError if a wanted one is missing or can't be read.
         """
         ...
 
@@ -37,22 +37,29 @@ class FolderSource:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._checked: set[str] = set()  # runs whose records are those that they seal
         self.names = sorted(path.parent.name for path in folder.glob(f"*/{CONFIG}"))
         self.sweep = (folder / SWEEP).read_text(encoding="utf-8") if (folder / SWEEP).exists() else None
 
     def text(self, run: str, file: str) -> str | None:
         """See `Source`."""
+        path = self._folder / run / file
         try:
-            return (self._folder / run / file).read_text(encoding="utf-8")
+            return path.read_text(encoding="utf-8")
         except FileNotFoundError:
             return None
+        except (OSError, UnicodeDecodeError) as error:
+            raise RunError(f"{path}: can't be read: {getattr(error, 'strerror', None) or error}") from error
 
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
         """See `Source`."""
-        with (self._folder / run / file).open(encoding="utf-8") as lines:
-            rows = list(csv.DictReader(lines) if file == EPISODES else map(json.loads, lines))
-        found = {name: [row[name] for row in rows] for name in wanted}
-        return found | {name: [row.get(name) for row in rows] for name in optional}
+        path = self._folder / run / file
+        if run not in self._checked:
+            check_records(self._folder / run)
+            self._checked.add(run)
+        rows, first = (read_csv(path), 2) if file == EPISODES else (read_jsonl(path), 1)
+        found = {name: column(rows, name, path, first) for name in wanted}
+        return found | {name: column(rows, name, path, first, optional=True) for name in optional}
 
 
 def open_source(path: Path) -> Source:

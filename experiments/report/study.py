@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,9 +13,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
+from common.process.summaries import parse_summary
 from common.settings.config import RunConfig, value_of
 from common.settings.methods import METHODS
-from common.settings.tables import identity, load_tables, resolve
+from common.settings.tables import identity, load_tables, parse_run_config, resolve
 from experiments.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
 from experiments.report.sources import Source, open_source
 from experiments.sweep.grid import parse_grid
@@ -44,7 +43,8 @@ class Run:
     [episodes], of the columns `return`, `s`, `q1_mean` and `q2_mean`. metrics: float64 [rows] of each name of SERIES,
     of LATER, and of "q_share", mean |Q| as a share of its bound; nan where a row lacks it.
     above_bound: number of rows of metrics.jsonl whose mean |Q| exceeds its bound, `q_bound`. evaluated: float64
-    [2, evaluations], environment steps and mean returns of greedy play.
+    [2, evaluations], environment steps and mean returns of greedy play. fallbacks: where it went on from an older
+    checkpoint than its newest, which was not whole.
     """
 
     name: str
@@ -56,6 +56,7 @@ class Run:
     q2_means: Floats
     metrics: Mapping[str, Floats]
     above_bound: int = 0
+    fallbacks: Sequence[str] = ()
     evaluated: Floats = field(default_factory=lambda: np.empty((2, 0)))
 
 
@@ -98,8 +99,9 @@ class Study:
 
     @property
     def warnings(self) -> list[str]:
-        """A line for each finished run whose mean |Q| exceeded its bound at times."""
-        return [
+        """A line for each finished run whose mean |Q| exceeded its bound at times, and for each fallback of a run."""
+        fallen = [f"{run.name}: went on from an older checkpoint: {why}" for run in self.runs for why in run.fallbacks]
+        return fallen + [
             f"{run.name}: mean |Q| is above the largest that the rewards seen allow in {run.above_bound} of "
             f"{len(run.metrics['env_step'])} rows of {METRICS}"
             for run in self.runs
@@ -210,7 +212,7 @@ def _state(source: Source, run: str) -> str:
     if summary is None:
         begun = any(source.text(run, file) is not None for file in (CONFIG, EPISODES))
         return "begun, not finished" if begun else "not begun"
-    outcome = str(json.loads(summary)["exit"])
+    outcome = str(parse_summary(summary, f"{run}/{SUMMARY}").get("exit", ""))
     if outcome.startswith("diverged"):
         return outcome
     return "" if outcome.startswith("complete") else f"begun, not finished: {outcome}"
@@ -229,15 +231,16 @@ def _read(source: Source, run: str, path: Path) -> Run:
     size, bound = metrics.pop(Q_SIZE), metrics.pop(Q_BOUND)
     with np.errstate(divide="ignore", invalid="ignore"):  # without rewards the bound is 0
         metrics[Q_SHARE] = size / bound
-    return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()), evaluated)
+    fallbacks = parse_summary(source.text(run, SUMMARY) or "{}", path / run / SUMMARY).get("fallbacks", [])
+    return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()), fallbacks, evaluated)
 
 
 def read_config(source: Source, run: str, path: Path) -> RunConfig:
     """The config of a run of the study at `path`; raises RunError."""
     try:
-        return resolve(tomllib.loads(source.text(run, CONFIG) or ""))
-    except (OSError, ValueError, UsageError) as error:
-        raise RunError(f"{path / run}: a run whose config can't be read: {error!r}") from error
+        return parse_run_config(source.text(run, CONFIG) or "", path / run / CONFIG)
+    except UsageError as error:
+        raise RunError(str(error)) from error
 
 
 def _axes(configs: list[RunConfig]) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ import contextlib
 import csv
 import io
 import os
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from common.process.checkpoints import checked_summary
 from common.process.files import make_folder, write_atomic
 from common.process.locks import FileLock
 from common.returns import RETURN_WINDOW
-from common.settings.tables import identity, resolve, to_toml
+from common.settings.tables import identity, read_run_config, run_config_text
 from experiments.sweep.grid import Cell, Grid
 
 TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
@@ -52,12 +51,7 @@ class CellFolder:
     def check(self) -> None:
         """Raise UsageError if the folder holds a run of another config."""
         held = self.path / "config.toml"
-        text = held.read_text(encoding="utf-8") if held.exists() else ""
-        try:
-            same = not text or identity(resolve(tomllib.loads(text))) == identity(self.cell.config)
-        except (tomllib.TOMLDecodeError, UsageError):
-            same = False
-        if not same:
+        if held.exists() and identity(read_run_config(self.path)) != identity(self.cell.config):
             raise UsageError(f"{held}: not the config of this grid's cell; give another --dir")
 
     def ending(self) -> Ending | None:
@@ -88,7 +82,7 @@ class CellFolder:
 
     def prepare(self) -> None:
         """Write the config from which the run starts or continues."""
-        write_atomic(self.path / "config.toml", to_toml(self.cell.config).encode())
+        write_atomic(self.path / "config.toml", run_config_text(self.cell.config).encode())
 
     def progress(self) -> Progress:
         """Read the progress from the end of episodes.csv; zeros before the first episode's end."""

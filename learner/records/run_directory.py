@@ -20,7 +20,7 @@ from common.process.run_ids import draw_run_id, read_run_id
 from common.process.summaries import SUMMARY, summary_text
 from common.settings.config import RunConfig
 from common.settings.overrides import leaves
-from common.settings.tables import to_tables, to_toml
+from common.settings.tables import CONFIG, run_config_text, to_tables
 from learner.records.curve import draw_learning_curve
 from learner.records.evaluations import EVALUATIONS, EvaluationsFile
 from learner.records.mirror import WandbMirror
@@ -192,7 +192,7 @@ def claim_run_directory(path: Path, config: RunConfig) -> int:
     """
     try:
         make_folder(path)
-        write_atomic(path / "config.toml", to_toml(config).encode())  # first: an id alone is a replay service's folder
+        write_atomic(path / CONFIG, run_config_text(config).encode())  # first: an id alone is a replay service's folder
     except OSError as error:
         raise RunError(f"run directory {path}: {error.strerror or error}") from error
     return draw_run_id(path)
