@@ -15,7 +15,6 @@ from common.process.console import Console, say
 from common.process.health import answering
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
-from common.process.run_ids import read_run_id
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from common.types import EnvSpec
@@ -62,8 +61,8 @@ def _train(
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory, send_queue=SHORT_QUEUE)
     with Node(session, config.run, "learner", incarnation) as node, answering(options.health, console):
-        run_id = read_run_id(path) if held else claim_run_directory(path, config)
-        roster = Roster(path, time.monotonic())
+        run_id = claim_run_directory(path, config) if found.newest is None else found.newest.manifest.run
+        roster = Roster(path, time.monotonic(), run_id)
         layout = agent.networks[0].layout_digest()
         join_service = JoinService(node, config, spec, layout, run_id, epochs, roster, console.event)
         console.event(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}")
@@ -77,13 +76,15 @@ def _train(
         if state is not None:
             with fitting(found.of(number).path):
                 trainer.load_state(state, time.monotonic())
-            for each in found.whole:
-                each.state.clear()  # only its memory
-            console.event(f"goes on from checkpoint {number}")
+            found = found.cut_back(number, "the replay service has no whole part of it")
+            told = "; ".join(found.fallbacks(number))
+            console.event(f"goes on from checkpoint {number}{told and f'; passes over {told}'}")
         elif held:
             load_initial_networks(agent)
             console.event("begins anew: no epoch is held by both")
         settings, episodes_received = config.learner, 0 if state is None else state["told"]
+        for each in found.whole:
+            each.state.clear()  # only its memory
         samples = SampleClient(
             node,
             stop,

@@ -25,11 +25,11 @@ from common.process.checkpoints import Manifest, Survey, Whole, go_back, survey
 from common.process.files import Measured, truncate
 from common.process.lifecycle import Stop
 from common.process.locks import INHERITED, RunLock
-from common.process.run_ids import RUN_ID, claim, draw_run_id, read_run_id
+from common.process.run_ids import RUN_ID, claim, read_run_id
 from common.settings.options import RunOptions
 from common.types import EnvSpec
 from learner.join_service import JoinService
-from learner.records.run_directory import RunDirectory
+from learner.records.run_directory import RunDirectory, claim_run_directory
 from learner.roster import Roster
 from learner.shared_epochs import SharedEpochs
 from replay.core import ReplayCore
@@ -169,8 +169,8 @@ def test_commands_respect_the_lock(name: str, flags: list[str], tmp_path: Path) 
 
 
 def test_a_run_id_is_drawn_once(tmp_path: Path) -> None:
-    first = draw_run_id(tmp_path)
-    assert draw_run_id(tmp_path) == first
+    first = claim_run_directory(tmp_path, RunOptions().run_config())
+    assert claim_run_directory(tmp_path, RunOptions().run_config()) == first
     claim(tmp_path, first)
     with pytest.raises(RunError, match="belongs to another run"):
         claim(tmp_path, first + 1)

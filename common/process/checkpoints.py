@@ -16,7 +16,7 @@ import re
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -197,6 +197,11 @@ class Survey:
     def of(self, number: int) -> Whole:
         """The whole checkpoint with a number."""
         return next(each for each in self.whole if each.number == number)
+
+    def cut_back(self, number: int, why: str) -> Survey:
+        """The survey with whole checkpoints younger than `number` as ones that can't be gone on from."""
+        younger = {each.number: why for each in self.whole if each.number > number}
+        return replace(self, problems={**self.problems, **younger})
 
     def describe(self) -> str:
         """Where a resumed run goes on, and what it passes over, in one line."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 from pathlib import Path
 
 from common.errors import RunError
@@ -23,13 +22,6 @@ def read_run_id(folder: Path) -> int:
         return int(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: {error}") from error
-
-
-def draw_run_id(folder: Path) -> int:
-    """Read the id of the run in a directory, or draw one if no run has begun in it; raises RunError."""
-    if not has_run_id(folder):
-        claim(folder, secrets.randbits(63))
-    return read_run_id(folder)
 
 
 def claim(folder: Path, run_id: int) -> None:

@@ -15,6 +15,7 @@ from common.errors import RunError, UsageError
 from common.process.checkpoints import checked_summary
 from common.process.files import make_folder, write_atomic
 from common.process.locks import FileLock
+from common.process.run_ids import has_run_id, read_run_id
 from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, read_run_config, run_config_text
 from experiments.sweep.grid import Cell, Grid
@@ -82,22 +83,25 @@ class CellFolder:
 
     def prepare(self) -> None:
         """Write the config from which the run starts or continues."""
-        write_atomic(self.path / "config.toml", run_config_text(self.cell.config).encode())
+        write_atomic(self.path / "config.toml", run_config_text(self.cell.config, self._run_id()).encode())
+
+    def _run_id(self) -> int | None:
+        return read_run_id(self.path) if has_run_id(self.path) else None
 
     def progress(self) -> Progress:
-        """Read the progress from the end of episodes.csv; zeros before the first episode's end."""
+        """Read the progress from the end of episodes.csv; zeros before the first episode's end, or if it is damaged."""
         try:
             with (self.path / "episodes.csv").open("rb") as file:
                 header = file.readline().decode()
                 file.seek(max(len(header), os.fstat(file.fileno()).st_size - TAIL))
                 # The first and the last line of the tail may be incomplete.
                 lines = file.read().decode().rpartition("\n")[0].splitlines()[-RETURN_WINDOW:]
-        except FileNotFoundError:
-            return Progress(0, 0.0)
-        rows = list(csv.DictReader(io.StringIO("\n".join([header.strip(), *lines]))))
-        if not rows:
-            return Progress(0, 0.0)
-        return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
+            rows = list(csv.DictReader(io.StringIO("\n".join([header.strip(), *lines]))))
+            if not rows:
+                return Progress(0, 0.0)
+            return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
+        except (OSError, ValueError, KeyError, TypeError, csv.Error):
+            return Progress(0, 0.0)  # only for the display: who continues or reports the run names what is damaged
 
 
 def default_folder(grid: str | Path, quick: bool) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import secrets
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -16,7 +17,7 @@ from common.messaging.messages.evaluate import EvaluationRow
 from common.process.checkpoints import RECORDS, Survey, go_back
 from common.process.console import say
 from common.process.files import LineFile, Measured, make_folder, truncate, write_atomic
-from common.process.run_ids import draw_run_id, read_run_id
+from common.process.run_ids import claim, has_run_id, read_run_id
 from common.process.summaries import SUMMARY, summary_text
 from common.settings.config import RunConfig
 from common.settings.overrides import leaves
@@ -61,14 +62,14 @@ class RunDirectory:
         self.aside = ""
         sealed: Mapping[str, Measured] = {}
         try:
-            run_id = claim_run_directory(path, config)
+            newest = None if found is None or number is None else found.of(number)
+            run_id = claim_run_directory(path, config, None if newest is None else newest.manifest.run)
             mirror = WandbMirror(path, run_id) if wandb else None
             if found is not None:
                 self.aside = go_back(found, number)
-                if number is not None:
-                    manifest = found.of(number).manifest
-                    self.fallbacks = [*manifest.fallbacks, *found.fallbacks(number)]
-                    sealed = manifest.records
+                if newest is not None:
+                    self.fallbacks = [*newest.manifest.fallbacks, *found.fallbacks(newest.number)]
+                    sealed = newest.manifest.records
             for name, (size, _) in sealed.items():
                 truncate(path / name, size)
             (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
@@ -184,15 +185,21 @@ class RunDirectory:
         self.close()
 
 
-def claim_run_directory(path: Path, config: RunConfig) -> int:
+def claim_run_directory(path: Path, config: RunConfig, known: int | None = None) -> int:
     """Assign a directory to this run, or check that it is assigned; write its config and return the run's id.
+
+    known: the id, if a checkpoint there names it.
 
     Raises:
         RunError: it cannot be written.
     """
     try:
         make_folder(path)
-        write_atomic(path / CONFIG, run_config_text(config).encode())  # first: an id alone is a replay service's folder
+        drawn = secrets.randbits(63) if known is None else known
+        run_id = read_run_id(path) if has_run_id(path) else drawn
+        # First, as an id alone makes it a replay service's folder.
+        write_atomic(path / CONFIG, run_config_text(config, run_id).encode())
     except OSError as error:
         raise RunError(f"run directory {path}: {error.strerror or error}") from error
-    return draw_run_id(path)
+    claim(path, run_id)
+    return run_id
