@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import RunError
+from common.process.checkpoints import REPLAY
 from common.types import Array
 from learner.records.epochs import newest_epoch
 
@@ -24,7 +25,7 @@ def audit(run_dir: Path) -> tuple[int, int]:
     closing = newest_epoch(run_dir)
     if closing is None:
         raise RunError(f"{run_dir}: has no epoch")
-    table = closing / "replay"
+    table = closing.path / REPLAY
     slots, frames = np.load(table / "slots.npy"), np.load(table / "frames.npy")
     obs, next_obs = frames[slots[:, 0]], frames[slots[:, 1]]
     begins = (np.abs(obs) <= RESET).all(1)

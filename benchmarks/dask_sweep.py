@@ -99,7 +99,7 @@ class Sweep:
             if (count := sum(line.startswith("complete:") for line in log.splitlines())) != 1:
                 raise RunError(f"{cell} was completed {count} times")
             if cell in hit:
-                if "goes on from epoch" not in log:
+                if "goes on from checkpoint" not in log:
                     raise RunError(f"{cell} began anew")
                 alone = self._folder / "alone"
                 subprocess.run(self.command(alone, f"--cell={cell}"), stdout=subprocess.DEVNULL, check=True)

@@ -10,7 +10,7 @@ from common.envs.make import check_filmed, env_spec
 from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
 from common.process.console import say, stamped
-from common.process.files import write_atomic
+from common.process.files import make_folder, write_atomic
 from common.process.flags import HttpAddress
 from common.process.lifecycle import Stop, run_main
 from common.process.locks import RunLock
@@ -18,7 +18,7 @@ from common.process.ports import check_can_listen, check_loopback
 from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.capacity import check_memory, check_messages
 from common.settings.config import RunConfig, check_distributed
-from common.settings.options import LearnerRunOptions, beginning, holds_run, parse_run
+from common.settings.options import LearnerRunOptions, parse_run
 from common.settings.tables import to_toml
 from deploy.status import Display, Page, RunStatus, live_page
 from deploy.supervisor import RestartPolicy
@@ -52,7 +52,7 @@ class Topology:
     def __init__(self, options: LocalOptions, config: RunConfig, directory: Path, locks: tuple[int, ...]) -> None:
         logs = directory / "logs"
         try:
-            logs.mkdir(parents=True, exist_ok=True)
+            make_folder(logs)
             resolved = logs / "config.toml"  # the run's own is the learner's to write
             write_atomic(resolved, to_toml(config).encode())
         except OSError as error:
@@ -174,9 +174,11 @@ def _run() -> None:
         if options.prometheus:
             check_can_listen("--prometheus", options.prometheus)
         with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
-            if options.resume:
-                found = f"goes on with the run in {directory}" if holds_run(directory) else beginning(directory)
-                say(found)
+            # Before anything is written; what the roles find, they find by the same code.
+            _, told = options.start.prepare(directory, replay=not options.restart)
+            for line in told:
+                say(line)
+            lock.sign()
             _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)
 
 

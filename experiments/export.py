@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from safetensors.numpy import save
 from torch import nn
 
 from common.errors import RunError, UsageError
-from common.process.files import SyncedFile, sync_folder
+from common.process.files import SyncedFile, make_folder, sync_folder
 from common.process.summaries import strict_json
 from common.settings.config import RunConfig
 from experiments.export_onnx import NotExportedError, onnx_model, preparation
@@ -60,7 +61,8 @@ def export(run_dir: Path, out: Path) -> Exported:
             contents[f"network-{number}.onnx"] = onnx_model(network, checkpoint.spec)
         except NotExportedError as error:
             without_onnx = str(error)
-    contents[CARD] = f"{strict_json(_card(run.config, checkpoint), indent=2)}\n".encode()
+    sums = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
+    contents[CARD] = f"{strict_json({**_card(run.config, checkpoint), 'sha256': sums}, indent=2)}\n".encode()
     try:
         _write(out, contents)
     except OSError as error:
@@ -111,7 +113,7 @@ def _check_folder(out: Path) -> None:
 
 def _write(out: Path, contents: Mapping[str, bytes]) -> None:
     """Write all files, the last one only when all others have their place."""
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     parts = {name: out / f"{name}.part" for name in contents}
     try:
         for name, data in contents.items():

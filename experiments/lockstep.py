@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from functools import partial
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -17,12 +15,11 @@ from actors.policy import Policy
 from common.envs.make import make_vector_env
 from common.errors import RunError, UsageError
 from common.messaging.messages.sample import EpisodeRecord
+from common.process.checkpoints import REPLAY, Whole
 from common.process.randomness import generator_state, set_generator_state
-from common.process.run_ids import read_run_id
 from common.settings.config import RunConfig
-from experiments import old_checkpoints
-from experiments.memory import TableMemory, make_memory
-from learner.records.epochs import load_learner, save_epoch
+from experiments.memory import make_memory
+from learner.records.epochs import fitting, save_epoch
 from learner.records.run_directory import RunDirectory
 from learner.trainer import Effects, Trainer
 from replay.persistence.storage import Mark
@@ -97,49 +94,44 @@ class Lockstep:
                 "actions": torch.tensor(self._actions),
                 "seen": self._seen,
             },
-            "sizes": directory.sizes(),
         }
-        mark = Mark(directory.run_id(), 0)
+        run_id, number = directory.run_id(), self.agent.updates
+        mark = Mark(run_id, number, 0)
 
         def snapshot(folder: str) -> None:
-            self.memory.save(directory.path / folder / "replay", mark, self.agent.updates)
+            self.memory.save(directory.path / folder / REPLAY, mark)
 
+        records, fallbacks = directory.records(), directory.fallbacks
         try:
-            save_epoch(directory.path, self.agent.updates, state, snapshot)
+            save_epoch(directory.path, run_id, number, state, snapshot, records=records, fallbacks=fallbacks)
         except OSError as error:
             text = f"epoch {self.agent.updates} in {directory.path}: {error.strerror or error}"
             raise RunError(text) from error
 
-    def restore(self, epoch: Path, replaying: Replaying = lambda played, actions: None) -> dict[str, int]:
-        """Restore an epoch from `save`; return the sizes of the run's files at that time, in bytes.
+    def restore(self, epoch: Whole, replaying: Replaying = lambda played, actions: None) -> None:
+        """Restore a whole checkpoint from `save`.
 
         The emulator's state is restored by playing the same actions again, which is exact for every deterministic
         environment. replaying: called before each action with how many are played and how many there are.
 
         Raises:
-            UsageError: the epoch does not belong to a lockstep run.
+            UsageError: the checkpoint does not belong to a lockstep run, or not to one like this.
             RunError: the environment is not deterministic: its observations, rewards or ends differ from the run's.
         """
-        state = load_learner(epoch)
-        replay_actions = partial(self._replay_actions, replaying=replaying)
-        if isinstance(self.memory, TableMemory) and old_checkpoints.is_old(epoch):
-            state = old_checkpoints.load(epoch, state, self.memory.table, replay_actions)
-            self.memory.forget_stored()
-        elif "player" not in state:
-            raise UsageError(f"{epoch}: saved by a distributed run; coop-local --resume continues it")
-        else:
-            replay_actions(state["player"]["actions"].tolist())
-            if state["player"].get("seen", self._seen) != self._seen:  # earlier versions did not save it
+        state = epoch.state
+        if "player" not in state:
+            raise UsageError(f"{epoch.path}: saved by a distributed run; coop-local --resume continues it")
+        with fitting(epoch.path):
+            self._replay_actions(state["player"]["actions"].tolist(), replaying)
+            if state["player"]["seen"] != self._seen:
                 raise RunError(
-                    f"{epoch}: {self.config.env.id} showed something else when the run's {len(self._actions):,} "
+                    f"{epoch.path}: {self.config.env.id} showed something else when the run's {len(self._actions):,} "
                     "actions were played again; a lockstep run goes on only where the seed determines the environment"
                 )
-            self.memory.load(epoch / "replay", read_run_id(epoch.parents[1]))
-        self.trainer.load_state(state, time.monotonic())
-        set_generator_state(self._policy_rng, state["player"]["policy"])
+            self.memory.load(epoch.path / REPLAY, Mark(epoch.manifest.run, epoch.number, 0))
+            self.trainer.load_state(state, time.monotonic())
+            set_generator_state(self._policy_rng, state["player"]["policy"])
         self.step = self.trainer.drawn.inserted
-        sizes: dict[str, int] = state["sizes"]
-        return sizes
 
     def _replay_actions(self, actions: list[int], replaying: Replaying) -> None:
         """Play the actions of a run again; the memory is restored separately."""

@@ -11,7 +11,7 @@ from common.errors import RunError
 from common.process.console import say
 from common.process.importing import importing
 from common.process.lifecycle import Stop, run_main
-from common.settings.options import RunOptions, beginning, parse_run
+from common.settings.options import RunOptions, parse_run
 
 REPLAY_PROGRESS_EVERY = 5.0  # seconds
 
@@ -32,10 +32,10 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     replaying = _replaying(stop)
-    opened = LockstepRun(config, path, "coop-lockstep", resume=options.resume, wandb=options.wandb, replaying=replaying)
+    opened = LockstepRun(config, path, "coop-lockstep", options.start, wandb=options.wandb, replaying=replaying)
     with closing(opened) as run:
-        if options.resume:
-            say(beginning(path) if run.epoch is None else f"goes on from epoch {run.epoch.name}")
+        for line in run.told:
+            say(line)
         summary = run.play(stop, _progress)
     stopped = summary.exit == stop.reason  # otherwise the run was complete before the signal
     say(f"{summary}; coop-lockstep --resume --run-dir {path} goes on" if stopped else f"{summary}; {path}")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from common.envs.make import check_filmed
 from common.errors import CoopError, RunError
+from common.process.checkpoints import Start
 from common.process.console import say
 from common.process.lifecycle import Stop, first_line
 from common.process.locks import RunLock
@@ -16,7 +17,7 @@ from common.settings.config import RunConfig
 from experiments.episodes import Evaluator
 from experiments.lockstep import Lockstep, Replaying
 from learner.initial_networks import load_initial_networks
-from learner.records.epochs import newest_epoch
+from learner.records.epochs import load_learner
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import Summary, summarise
 
@@ -26,7 +27,7 @@ PROGRESS_EVERY = 5.0  # seconds
 class LockstepRun:
     """A run that holds its directory's locks until `close`.
 
-    epoch: from which it goes on; None if it starts.
+    told: lines that say what it goes on from, and what was passed over or moved aside.
     """
 
     def __init__(
@@ -34,14 +35,14 @@ class LockstepRun:
         config: RunConfig,
         path: Path,
         program: str,
+        start: Start,
         *,
-        resume: bool,
         wandb: bool = False,
         replaying: Replaying = lambda played, actions: None,
     ) -> None:
         """Prepare the run; program: named to other processes that want the directory. wandb: see `RunDirectory`.
 
-        replaying: see `Lockstep.restore`; what it raises leaves the run as it was.
+        start: how it begins there. replaying: see `Lockstep.restore`; what it raises leaves the run as it was.
 
         Raises:
             UsageError: the config does not fit the environment, or the directory's epoch a lockstep run.
@@ -52,19 +53,20 @@ class LockstepRun:
         self._wandb = wandb
         if config.video_every:
             check_filmed(config.env)
-        self._run = Lockstep(config)
+        self._lock = RunLock(path, program, ("learner", "replay"))
         try:
-            self._lock = RunLock(path, program, ("learner", "replay"))
-        except RunError:
-            self._run.env.close()
+            self._found, self.told = start.prepare(path, replay=not config.streaming, load=load_learner)
+            self._lock.sign()
+            self._run = Lockstep(config)
+        except BaseException:
+            self._lock.release()
             raise
         try:
-            self.epoch = newest_epoch(path) if resume else None
-            if self.epoch is None:
+            if self._found.newest is None:
                 load_initial_networks(self._run.agent)
-                self._sizes = None
             else:
-                self._sizes = self._run.restore(self.epoch, replaying)
+                self._run.restore(self._found.newest, replaying)
+                self._found.newest.state.clear()  # only its memory
         except BaseException:
             self.close()
             raise
@@ -76,8 +78,11 @@ class LockstepRun:
             RunError: there is no space for the closing epoch or the summary.
             UsageError: Weights & Biases refuses.
         """
-        run = self._run
-        with RunDirectory(self.path, run.config, self._sizes, run.step, wandb=self._wandb) as directory:
+        run, newest = self._run, self._found.newest
+        number = None if newest is None else newest.number
+        with RunDirectory(self.path, run.config, self._found, number, run.step, wandb=self._wandb) as directory:
+            if directory.aside:
+                progress(directory.aside)
             return play_lockstep(self._run, directory, stop, progress)
 
     @property

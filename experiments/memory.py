@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from actors.player import Turn
 from actors.segments import SegmentAssembler
+from common.errors import UsageError
+from common.process.checkpoints import Damaged
 from common.registry import loaded
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS
@@ -45,11 +47,11 @@ class Memory(Protocol):
     def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Store new priorities, float32 [batch], of the transitions with the numbers `ids`, int64 [batch]."""
 
-    def save(self, folder: Path, mark: Mark, update: int) -> None:
-        """Save what is stored for an epoch of the run that `mark` names; raises OSError."""
+    def save(self, folder: Path, mark: Mark) -> None:
+        """Save what is stored for the checkpoint that `mark` names; raises OSError."""
 
-    def load(self, folder: Path, run_id: int) -> None:
-        """Restore what `save` stored."""
+    def load(self, folder: Path, mark: Mark) -> None:
+        """Restore what `save` stored; raises UsageError if that is no longer whole."""
 
 
 def make_memory(config: RunConfig, spec: EnvSpec) -> tuple[AnyAgent, Memory]:
@@ -73,7 +75,6 @@ class TableMemory:
         self._segments = SegmentAssembler(
             spec, 1, 0, config.actor.segment_steps, n_step=config.replay.n_step, gamma=config.learner.gamma
         )
-        self._cut_steps = 0  # transitions of all segments so far
         self._core = ReplayCore(config, spec)
         self.table = self._core.table
         self.update_priorities = self.table.update_priorities
@@ -93,7 +94,6 @@ class TableMemory:
         segments = self._segments.add(turn.actions, turn.steps, version, turn.ended)
         if self._due(step):
             segments += self._segments.flush()
-        self._cut_steps += sum(segment.steps for segment in segments)
         return segments
 
     def batches(self, step: int) -> Iterator[Batch]:
@@ -120,19 +120,16 @@ class TableMemory:
             "terminal": table.terminal,
         }
 
-    def save(self, folder: Path, mark: Mark, update: int) -> None:
+    def save(self, folder: Path, mark: Mark) -> None:
         """See `Memory`."""
-        save_snapshot(self._core.snapshot(update), threading.Condition(), folder, mark)
+        save_snapshot(self._core.snapshot(mark.number), threading.Condition(), folder, mark)
 
-    def load(self, folder: Path, run_id: int) -> None:
+    def load(self, folder: Path, mark: Mark) -> None:
         """See `Memory`."""
-        load_snapshot(self._core, folder, run_id)
-        self.forget_stored()
-
-    def forget_stored(self) -> None:
-        """Drop the steps that wait for a segment but are in the table: earlier versions stored each one at once."""
-        if self.table.inserted > self._cut_steps:
-            self._segments.flush()
+        try:
+            load_snapshot(self._core, folder, mark.run_id, mark.number)
+        except Damaged as damaged:
+            raise UsageError(f"{folder}: {damaged}") from damaged
 
 
 class NoMemory:
@@ -179,8 +176,8 @@ class NoMemory:
     def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """See `Memory`."""
 
-    def save(self, folder: Path, mark: Mark, update: int) -> None:
+    def save(self, folder: Path, mark: Mark) -> None:
         """See `Memory`."""
 
-    def load(self, folder: Path, run_id: int) -> None:
+    def load(self, folder: Path, mark: Mark) -> None:
         """See `Memory`."""

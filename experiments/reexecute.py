@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,28 +12,28 @@ import torch
 from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.imports import hand_over
-from common.messaging.messages.sample import DrawRequest
+from common.process.checkpoints import Survey, survey
 from common.process.run_ids import read_run_id
 from common.process.summaries import read_summary
 from common.process.threads import use_threads
 from common.process.untrusted import check_links
 from common.settings.config import RunConfig
-from common.settings.tables import load_tables, resolve
+from common.settings.tables import read_run_config
 from learner.agent import Agent
 from learner.initial_networks import load_initial_networks
-from learner.records.epochs import complete_epochs, load_learner, newest_epoch
+from learner.records.epochs import fitting, load_learner
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
-from replay.persistence.journal import DRAW, TornFile, journal_files, read_draw, read_file
-from replay.persistence.recovery import following_files, replay_file
-from replay.table.table import PinnedBatch
+from replay.persistence.journal import DRAW, Lost, journal_files, read_draw, read_file
+from replay.persistence.recovery import Replaying
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """The result of a re-execution.
 
-    began: number of the first update; 0 if the journal reaches back to the beginning of the run.
+    began: number of the checkpoint that it began from; 0 if the journal reaches back to the beginning of the run.
+    updates: number of the checkpoint that it was compared with. not_checked: what it did not compare, in words.
     missing_segments: segments missing in the journal although it contains later ones of their stream.
     repeated, held: transitions of the closing table that equal another one there, and all that it holds.
     digest: SHA-256 over both networks' parameters.
@@ -47,6 +46,7 @@ class Outcome:
     repeated: int
     held: int
     digest: str
+    not_checked: tuple[str, ...]
 
 
 def reexecute(run_dir: Path) -> Outcome:
@@ -61,76 +61,92 @@ def reexecute(run_dir: Path) -> Outcome:
     """
     check_links(run_dir)
     hand_over(run_dir)
-    config = resolve(load_tables(None, run_dir / "config.toml"))
-    final, folder, run_id = newest_epoch(run_dir), run_dir / "journal", read_run_id(run_dir)
-    if final is None or not journal_files(folder):
+    config = read_run_config(run_dir)
+    folder = run_dir / "journal"
+    if not journal_files(folder):
         raise UsageError(f"{run_dir}: no journal with a finished epoch; was the run started with --replay.journal?")
-    expected = load_learner(final)["agent"]
+    run_id = read_run_id(run_dir)
+    found = survey(run_dir, replay=True, load=load_learner, every=True)
+    final = found.newest
+    if final is None:
+        raise UsageError(f"{run_dir}: no whole checkpoint to compare with; {found.passed_over or 'there is none'}")
     use_threads(config.learner.threads)
-    agent, core, first = _beginning(config, run_dir, folder, run_id)
+    with fitting(final.path):
+        expected = final.state["agent"]
+        agent, core, first = _beginning(config, found, folder, run_id)
     began = agent.updates
-    files = following_files(folder, first)
+    files = [number for number in journal_files(folder) if number >= first]
     counts = _last_draws(folder, files, run_id)
     waiting = {drawn.sequence: batch for batch, drawn in core.repeatable() if drawn.sequence not in counts}
-    for place, (request, batch) in enumerate(_draws(core, folder, files, run_id)):
+    replaying = Replaying(core, folder, run_id)
+    for place, (request, batch) in enumerate(replaying.draws(first, files)):
+        _check_whole(replaying)
         if counts[request.sequence] == place:
             waiting[request.sequence] = batch.read()
         while agent.updates < expected["updates"] and agent.updates in waiting:
             agent.update(waiting.pop(agent.updates))
+    _check_whole(replaying)
     if agent.updates < expected["updates"]:
         raise RunError(f"{folder}: lacks batch {agent.updates} of {expected['updates']}")
     if problem := _difference(agent.state(), expected, "agent"):
-        raise RunError(f"{problem} differs from {final}")
+        raise RunError(f"{problem} differs from {final.path}")
+    not_checked = _not_checked(found, began)
     accepted = read_summary(run_dir).get("transitions_accepted")
-    if accepted != core.table.inserted:
+    if accepted is None:
+        not_checked.append("the number of transitions, as there is no summary.json")
+    elif accepted != core.table.inserted:
         raise RunError(f"{folder}: {core.table.inserted:,} transitions, but the run accepted {accepted:,}")
     digest = hashlib.sha256(b"".join(network.snapshot().tobytes() for network in agent.networks)).hexdigest()
     closing = ReplayCore(config, core.table.spec)
-    ReplayEpochs(run_dir, run_id).restore(closing, int(final.name))
+    ReplayEpochs(run_dir, run_id).restore(closing, final.number)
     repeated, held = closing.table.repeated(), len(closing.table)
-    return Outcome(began, agent.updates, core.table.inserted, core.missing_segments, repeated, held, digest)
+    return Outcome(
+        began, agent.updates, core.table.inserted, core.missing_segments, repeated, held, digest, tuple(not_checked)
+    )
 
 
-def _beginning(config: RunConfig, run_dir: Path, folder: Path, run_id: int) -> tuple[Agent, ReplayCore, int]:
-    """Agent and core at the start of the journal's first file, or at the oldest epoch that the journal continues."""
+def _check_whole(replaying: Replaying) -> None:
+    """Raise RunError if something of the journal can't be read: what follows was trained on other batches."""
+    if replaying.lost:
+        raise RunError(f"{replaying.lost[0]}; nothing behind it can be compared")
+
+
+def _not_checked(found: Survey, began: int) -> list[str]:
+    lines = [f"checkpoint {number}: {why}" for number, why in sorted(found.problems.items())]
+    if began:
+        lines.insert(0, f"the updates before checkpoint {began}, which the journal does not reach back to")
+    return lines
+
+
+def _beginning(config: RunConfig, found: Survey, folder: Path, run_id: int) -> tuple[Agent, ReplayCore, int]:
+    """Agent and core at the start of the journal's first file, or at the oldest checkpoint that it continues."""
     spec = env_spec(config.env)
     agent, core = Agent(config, spec), ReplayCore(config, spec)
     files = journal_files(folder)
     if files[0] == 1:
         load_initial_networks(agent)
         return agent, core, 1
-    for number in complete_epochs(run_dir):
-        first, _ = ReplayEpochs(run_dir, run_id).restore(core, number)
+    for whole in sorted(found.whole, key=lambda each: each.number):
+        first, _ = ReplayEpochs(found.run_dir, run_id).restore(core, whole.number)
         if first in files:
-            agent.load_state(load_learner(run_dir / "checkpoints" / str(number))["agent"])
+            agent.load_state(whole.state["agent"])
             return agent, core, first
         core = ReplayCore(config, spec)
-    raise RunError(f"{folder}: begins at file {files[0]}, and no epoch precedes it")
+    raise RunError(f"{folder}: begins at file {files[0]}, and no whole checkpoint precedes it")
 
 
 def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:
-    """For each batch number, the index of its last draw in the journal."""
+    """For each batch number, the index of its last draw in the journal; raises RunError if a record can't be read."""
     last: dict[int, int] = {}
     place = 0
     for number in files:
-        try:
-            for kind, payload in read_file(folder, number, run_id):
-                if kind == DRAW:
-                    last[read_draw(payload)[0].sequence] = place
-                    place += 1
-        except TornFile:
-            if number != files[-1]:  # a kill leaves an incomplete record only at the end of the journal
-                raise
+        for entry in read_file(folder, number, run_id):
+            if isinstance(entry, Lost):
+                raise RunError(f"{entry.text}; nothing behind it can be compared")
+            if entry.kind == DRAW:
+                last[read_draw(entry.payload)[0].sequence] = place
+                place += 1
     return last
-
-
-def _draws(core: ReplayCore, folder: Path, files: list[int], run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
-    for number in files:
-        try:
-            yield from replay_file(core, folder, number, run_id)
-        except TornFile:
-            if number != files[-1]:
-                raise
 
 
 def _difference(mine: Any, theirs: Any, name: str) -> str | None:  # noqa: ANN401 (nested state)

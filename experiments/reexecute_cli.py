@@ -36,9 +36,12 @@ def _run() -> None:
 
     permit(options.allow_import)
     outcome = reexecute(options.run_dir)
+    begin = f"from checkpoint {outcome.began:,}" if outcome.began else "from the beginning of the run"
     print(
-        f"updates {outcome.began:,} to {outcome.updates:,} on {outcome.transitions:,} transitions, "
+        f"updates {begin} to checkpoint {outcome.updates:,} on {outcome.transitions:,} transitions, "
         f"{outcome.repeated:,} of {outcome.held:,} in the closing table equal another, "
         f"{outcome.missing_segments} segments missing: parameters, optimizers and random state equal "
-        f"the run's, bit for bit (sha256 {outcome.digest})"
+        f"those of the checkpoint, bit for bit (sha256 {outcome.digest})"
     )
+    for line in outcome.not_checked:
+        print(f"not checked: {line}")

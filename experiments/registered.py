@@ -1,7 +1,7 @@
 """The rules of the registered MinAtar study (results/minatar/plan.md), applied to packed studies.
 
-`python -m experiments.registered pilot|rates|scores|outcome|games FILE` prints a table of the plan and what it decides;
-`figure FILE` draws the outcome by game.
+`python -m experiments.registered pilot|rates|scores|outcome|games FILE` prints a table of the plan and what it decides,
+if study and plan are what SHA256SUMS beside them lists; `figure FILE` draws the outcome by game.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from common.settings.config import value_of
 from common.settings.methods import METHODS
 from experiments.report.intervals import Interval, over_seeds
 from experiments.report.learning import area
+from experiments.report.packed import check_content
 from experiments.report.plots import Figure, Line, Panel, draw
 from experiments.report.study import Study, load_study
 
+PLAN = "plan.md"
 LARGE = 100_000  # transitions
 LOSS = 45.0  # percent, of dqn's area at LARGE: "small" is the capacity whose loss is nearest
 ENOUGH = 10.0  # points: the least advantage that confirms the hypothesis
@@ -197,6 +199,9 @@ def main() -> None:
     parser.add_argument("rule", choices=[*RULES, "figure"])
     parser.add_argument("file", type=Path, help="packed study")
     args = parser.parse_args()
+    plan = args.file.with_name(PLAN)
+    if plan.exists():
+        check_content(plan, plan.read_bytes())
     if args.rule == "figure":
         path = args.file.with_suffix("") / "report" / "outcome.png"
         draw(forest(areas(load_study(args.file), NEEDED)), path)

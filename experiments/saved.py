@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,11 +22,12 @@ from common.process.summaries import read_summary
 from common.process.untrusted import check_links
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
-from common.settings.tables import load_tables, resolve
+from common.settings.tables import read_run_config
 from common.types import Array, EnvSpec
 from learner.qnetwork import make_network
-from learner.records.epochs import load_learner, newest_epoch
+from learner.records.epochs import fitting, newest_epoch
 from learner.records.evaluations import EVALUATIONS
+from learner.records.reading import check_records, read_csv, read_jsonl, read_lines
 
 CPU = torch.device("cpu")
 NetworkChoice = Literal["mean", 1, 2]
@@ -117,22 +119,29 @@ class SavedRun:
     @cached_property
     def config(self) -> RunConfig:
         """The config of the run."""
-        return resolve(load_tables(None, self.path / "config.toml"))
+        return read_run_config(self.path)
 
     @property
     def episodes(self) -> pd.DataFrame:
         """A row for each finished episode, with the columns of episodes.csv."""
-        return pd.read_csv(self.path / "episodes.csv")
+        return self._table("episodes.csv")
 
     @property
     def metrics(self) -> pd.DataFrame:
         """A row for each line of metrics.jsonl."""
-        return pd.read_json(self.path / "metrics.jsonl", lines=True, convert_dates=False)
+        check_records(self.path)
+        return pd.DataFrame(read_jsonl(self.path / "metrics.jsonl"))
 
     @property
     def evaluations(self) -> pd.DataFrame:
         """A row for each evaluation during the run, with the columns of evaluations.csv."""
-        return pd.read_csv(self.path / EVALUATIONS)
+        return self._table(EVALUATIONS)
+
+    def _table(self, name: str) -> pd.DataFrame:
+        """A CSV record, after its checks; raises RunError."""
+        check_records(self.path)
+        read_csv(self.path / name)  # names a line that pandas would fill up
+        return pd.read_csv(io.StringIO("\n".join(read_lines(self.path / name))))
 
     @property
     def summary(self) -> dict[str, Any] | None:
@@ -140,18 +149,20 @@ class SavedRun:
         return read_summary(self.path) or None
 
     def checkpoint(self) -> Checkpoint:
-        """The networks of the newest epoch; raises UsageError if there is none."""
+        """The networks of the newest whole checkpoint; a warning names younger ones that are not.
+
+        Raises UsageError if there is none.
+        """
         epoch = newest_epoch(self.path)
         if epoch is None:
             raise UsageError(f"{self.path}: has no complete checkpoint")
-        state = load_learner(epoch)
-        spec = env_spec(self.config.env)
+        state, spec = epoch.state, env_spec(self.config.env)
         first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
-        for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
-            network.load(flat)
-        steps = state["drawn"]["inserted"] if "drawn" in state else state["step"]  # the latter in version 0.1.0
-        returns = state["telemetry"]["returns"]
-        return Checkpoint(int(epoch.name), spec, (first, second), state["agent"]["acting"], steps, returns)
+        with fitting(epoch.path):
+            for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
+                network.load(flat)
+            steps, returns = state["drawn"]["inserted"], state["telemetry"]["returns"]
+            return Checkpoint(epoch.number, spec, (first, second), state["agent"]["acting"], steps, returns)
 
     def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
         """The greedy policy of the newest epoch.

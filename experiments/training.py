@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import atexit
-import json
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from common.errors import CoopError, RunError, UsageError
 from common.imports import describe, permit
 from common.places import absolute
+from common.process.checkpoints import Start
+from common.process.console import say
+from common.process.files import make_folder
 from common.process.lifecycle import Stop
+from common.process.locks import RunLock
 from common.process.processes import ChildProcess, command
 from common.process.summaries import read_summary
 from common.process.untrusted import check_links
@@ -27,6 +30,7 @@ from common.settings.overrides import leaves, merged
 from common.settings.sources import chosen_config
 from common.settings.tables import to_tables, to_toml, validated
 from experiments.lockstep_run import LockstepRun
+from learner.records.reading import parse_row
 
 POLL = 0.1  # seconds
 GRACE = 90.0  # seconds for a topology's clean stop
@@ -81,7 +85,7 @@ class TrainingRun:
                     file.seek(place)
                     lines = file.read().rpartition(b"\n")[0]
                 for line in lines.splitlines():
-                    row = json.loads(line)
+                    row = parse_row(line, f"{path}, after update {max(update, 0):,}")
                     if row["update"] > update:
                         update = row["update"]
                         yield row
@@ -138,6 +142,8 @@ def train(
     distributed: bool = False,
     actors: int = 1,
     resume: bool = False,
+    resume_from: int | None = None,
+    overwrite: bool = False,
     allow_import: Collection[str] = (),
     **settings: Any,  # noqa: ANN401 (the fields of a run, each checked)
 ) -> TrainingRun:
@@ -151,18 +157,20 @@ def train(
         distributed: run a learner, a replay service and `actors` actors as processes of this machine; otherwise the
             run is one of `coop-lockstep`, in a thread of this process.
         actors: actor processes of a distributed run.
-        resume: continue the run in `run_dir`; start it if there is none yet.
+        resume: continue the run in `run_dir`, from its newest whole checkpoint; start it if there is none yet.
+        resume_from: as `resume`, but go back to the checkpoint with this number first.
+        overwrite: begin anew where `run_dir` holds a run, which is moved to its folder aside/.
         allow_import: modules of a resumed run's environment or network that may be imported even if they lie in its
             folder or beside it; those that `settings` name need not be listed.
         settings: fields of a run; a table as a mapping: `seed=1, total_steps=20_000, replay={"capacity": 500}`.
 
     Raises:
-        UsageError: a setting is invalid, or `run_dir` holds a run already.
+        UsageError: a setting is invalid, `run_dir` holds a run already, or one that can't be resumed.
         RunError: `run_dir` is in use.
     """
     named = [*allow_import, *_named(settings)]
     permit(named)
-    options = _options(preset, method, config, run_dir, resume, settings)
+    options = _options(preset, method, config, run_dir, Start(resume, resume_from, overwrite), settings)
     run_config = options.run_config()
     for line in without_effect(run_config, {".".join(path) for path, _ in leaves(settings)}, lockstep=not distributed):
         warnings.warn(line, stacklevel=2)
@@ -170,12 +178,14 @@ def train(
         if actors != 1:
             raise UsageError(f"actors = {actors}: in distributed runs only; a lockstep run is one process")
         directory = options.directory()
-        run = LockstepRun(run_config, directory, "coop.train", resume=resume)
+        run = LockstepRun(run_config, directory, "coop.train", options.start)
+        for line in run.told:
+            say(line)
         return TrainingRun(run_config, directory, lambda stop: _play(run, stop))
     if actors < 1:
         raise UsageError(f"actors = {actors}: must be at least 1")
     check_distributed(run_config)
-    topology = _topology(run_config, options.directory(), actors, resume, named)
+    topology = _topology(run_config, options.directory(), actors, options.start, named)
     return TrainingRun(run_config, topology.directory, topology.play)
 
 
@@ -184,7 +194,7 @@ def _options(
     method: str | None,
     file: str | Path | None,
     run_dir: str | Path | None,
-    resume: bool,
+    start: Start,
     settings: Mapping[str, Any],
 ) -> RunOptions:
     """The options that the same flags give on a command line."""
@@ -197,11 +207,11 @@ def _options(
         None if file is None else absolute(Path(file)),
         method,
         steps if isinstance(steps, int) else None,
-        directory if resume else None,
+        directory if start.goes_on else None,
     )
     chosen = validated(merged(to_tables(base), settings))
     values = {field.name: getattr(chosen, field.name) for field in fields(RunConfig)}
-    return RunOptions(**values, run_dir=directory, resume=resume)
+    return RunOptions(**values, run_dir=directory, **asdict(start))
 
 
 def _play(run: LockstepRun, stop: Stop) -> None:
@@ -239,15 +249,22 @@ def _named(settings: Mapping[str, Any]) -> list[str]:
     return [value.partition(":")[0] for value in values if isinstance(value, str) and ":" in value]
 
 
-def _topology(config: RunConfig, directory: Path, actors: int, resume: bool, named: list[str]) -> _Topology:
+def _topology(config: RunConfig, directory: Path, actors: int, start: Start, named: list[str]) -> _Topology:
     check_links(directory)
+    with RunLock(directory, "coop.train", ("learner", "replay")):  # the process takes it after this one
+        start.prepare(directory, replay=True)
     logs = directory / "logs"
     try:
-        logs.mkdir(parents=True, exist_ok=True)
+        make_folder(logs)
         file = logs / "coop-local.toml"
         file.write_text(to_toml(config), encoding="utf-8")
     except OSError as error:
         raise RunError(f"run directory {directory}: {error.strerror or error}") from error
-    flags = [f"--config={file}", f"--run-dir={directory}", f"--actors={actors}", *(["--resume"] if resume else [])]
-    flags += ["--allow-import", *named] if named else []
+    flags = [
+        f"--config={file}",
+        f"--run-dir={directory}",
+        f"--actors={actors}",
+        *(["--resume"] if start.goes_on else []),
+        *(["--allow-import", *named] if named else []),
+    ]
     return _Topology(ChildProcess("coop-local", command("coop-local", *flags), logs / "coop-local.log"), directory)

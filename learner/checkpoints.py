@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from common.errors import CoopError, RunError
@@ -15,7 +14,10 @@ from common.messaging.messages.epoch import Snapshot, Written
 from common.messaging.sample_client import SampleClient
 from common.messaging.transport import NoAnswer, Node
 from common.messaging.wire import Message
-from learner.records.epochs import complete_epochs, save_epoch
+from common.process.checkpoints import DONE, KEPT, checkpoint_numbers
+from common.process.files import Measured
+from learner.records.epochs import save_epoch
+from learner.records.run_directory import RunDirectory
 from learner.shared_epochs import SharedEpochs
 
 PATIENCE = 5.0  # seconds to wait for the replay service's answer
@@ -33,10 +35,16 @@ class Checkpoints:
     """
 
     def __init__(
-        self, node: Node, run_dir: Path, samples: SampleClient, epochs: SharedEpochs, event: Callable[[str], None]
+        self,
+        node: Node,
+        directory: RunDirectory,
+        samples: SampleClient,
+        epochs: SharedEpochs,
+        event: Callable[[str], None],
     ) -> None:
         self._node = node
-        self._run_dir = run_dir
+        self._directory = directory
+        self._run_dir = directory.path
         self._event = event
         self._samples = samples
         self._epochs = epochs
@@ -46,8 +54,8 @@ class Checkpoints:
         """Begin an epoch between two updates; do nothing and return False while the last one is being written."""
         if self._writing():
             return False
-        number, frozen = self._samples.pin(), state()
-        self._writer = threading.Thread(target=self._try, args=(number, frozen), name=f"epoch {number}")
+        number, frozen, records = self._samples.pin(), state(), self._directory.records()
+        self._writer = threading.Thread(target=self._try, args=(number, frozen, records), name=f"epoch {number}")
         self._writer.start()
         return True
 
@@ -58,7 +66,7 @@ class Checkpoints:
             RunError: it could not be saved; the message gives the reason.
         """
         self.wait()
-        self._save(self._samples.pin(), state)
+        self._save(self._samples.pin(), state, self._directory.records())
 
     def wait(self) -> None:
         """Wait for the epoch being written, if there is one."""
@@ -68,21 +76,29 @@ class Checkpoints:
     def _writing(self) -> bool:
         return self._writer is not None and self._writer.is_alive()
 
-    def _try(self, number: int, state: dict[str, Any]) -> None:
+    def _try(self, number: int, state: dict[str, Any], records: dict[str, Measured]) -> None:
         try:
-            self._save(number, state)
+            self._save(number, state, records)
         except RunError as error:
             self._event(f"{error}; the run goes on without it")
 
-    def _save(self, number: int, state: dict[str, Any]) -> None:
+    def _save(self, number: int, state: dict[str, Any], records: dict[str, Measured]) -> None:
         began = time.monotonic()
         try:
             try:
-                self._ask(Snapshot(number, complete_epochs(self._run_dir)).encode(self._node.run))
+                self._ask(Snapshot(number, checkpoint_numbers(self._run_dir, DONE)[-KEPT:]).encode(self._node.run))
             finally:
                 self._samples.release()
             written = Written(number).encode(self._node.run)
-            save_epoch(self._run_dir, number, state, lambda _: self._wait_for(written))
+            save_epoch(
+                self._run_dir,
+                self._directory.run_id(),
+                number,
+                state,
+                lambda _: self._wait_for(written),
+                records=records,
+                fallbacks=self._directory.fallbacks,
+            )
         except OSError as error:
             raise RunError(f"epoch {number} in {self._run_dir}: {error.strerror or error}") from error
         except CoopError as error:

@@ -8,7 +8,7 @@ from common.errors import UsageError
 from common.places import absolute
 from common.process.untrusted import check_links
 from learner.protocol import Agent
-from learner.records.epochs import load_learner, newest_epoch
+from learner.records.epochs import fitting, newest_epoch
 
 
 def load_initial_networks(agent: Agent) -> None:
@@ -25,7 +25,9 @@ def load_initial_networks(agent: Agent) -> None:
     setting, epoch = f"learner.initial_networks = {folder!r}", newest_epoch(path)
     if epoch is None:
         raise UsageError(f"{setting}: holds no complete checkpoint of a run")
-    networks, size = load_learner(epoch)["agent"]["networks"], agent.networks[0].size
-    if networks[0].numel() != size:
-        raise UsageError(f"{setting}: its networks have {networks[0].numel():,} parameters; this run's have {size:,}")
-    agent.load_state({**agent.state(), "networks": networks})
+    with fitting(epoch.path):
+        networks, size = epoch.state["agent"]["networks"], agent.networks[0].size
+        if networks[0].numel() != size:
+            own = networks[0].numel()
+            raise UsageError(f"{setting}: its networks have {own:,} parameters; this run's have {size:,}")
+        agent.load_state({**agent.state(), "networks": networks})

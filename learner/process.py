@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
 
 from common.errors import RunError, UsageError
 from common.messaging.links import locators
@@ -12,6 +11,7 @@ from common.messaging.mirror import FrameMirror
 from common.messaging.sample_client import SampleClient
 from common.messaging.session import SHORT_QUEUE, open_session
 from common.messaging.transport import Node, new_incarnation
+from common.process.checkpoints import Survey
 from common.process.console import Console, say
 from common.process.health import answering
 from common.process.lifecycle import Stop
@@ -19,14 +19,13 @@ from common.process.locks import RunLock
 from common.process.threads import use_threads
 from common.settings.capacity import mirror_slots
 from common.settings.config import RunConfig
-from common.settings.options import beginning
 from common.types import EnvSpec
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
 from learner.cli import LearnerOptions
 from learner.initial_networks import load_initial_networks
 from learner.join_service import JoinService
-from learner.records.epochs import intact_epochs, load_learner, rewind
+from learner.records.epochs import fitting, load_learner
 from learner.records.run_directory import RunDirectory, claim_run_directory
 from learner.roster import Roster
 from learner.service import LearnerService
@@ -41,18 +40,21 @@ def learn(options: LearnerOptions, config: RunConfig, spec: EnvSpec) -> None:
     stop.on_signals()
     stop.on_thread_failures()
     path = options.directory()
-    with RunLock(path, "coop-learner", ("learner",)):
-        _train(options, config, spec, path, stop)
+    with RunLock(path, "coop-learner", ("learner",)) as lock:
+        console = Console()
+        found, told = options.start.prepare(path, replay=False, load=load_learner, every=True)
+        _check_origin(found)
+        for line in told:
+            console.event(line)
+        lock.sign()
+        _train(options, config, spec, found, stop, console)
 
 
-def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path, stop: Stop) -> None:
-    """Train a run from its beginning, or from an epoch, to its end."""
-    console = Console()
-    held = intact_epochs(path) if options.resume else []
-    if options.resume and not held:
-        console.event(beginning(path))
-    if held:
-        _check_origin(path / "checkpoints" / str(held[-1]))
+def _train(
+    options: LearnerOptions, config: RunConfig, spec: EnvSpec, found: Survey, stop: Stop, console: Console
+) -> None:
+    """Train a run from its beginning, or from a checkpoint, to its end."""
+    path, held = found.run_dir, [each.number for each in reversed(found.whole)]
     trainer = Trainer(Agent(config, spec), time.monotonic())
     agent = trainer.agent
     if not held:
@@ -61,8 +63,8 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory, send_queue=SHORT_QUEUE)
     with Node(session, config.run, "learner", incarnation) as node, answering(options.health, console):
-        run_id = claim_run_directory(path, config)
-        roster = Roster(path, time.monotonic())
+        run_id = claim_run_directory(path, config) if found.newest is None else found.newest.manifest.run
+        roster = Roster(path, time.monotonic(), run_id)
         layout = agent.networks[0].layout_digest()
         join_service = JoinService(node, config, spec, layout, run_id, epochs, roster, console.event)
         console.event(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}")
@@ -72,14 +74,19 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
         if number is None:
             stop.leave()
             return
-        state = rewind(path, number)
+        state = found.of(number).state if number else None
         if state is not None:
-            trainer.load_state(state, time.monotonic())
-            console.event(f"goes on from epoch {number}")
+            with fitting(found.of(number).path):
+                trainer.load_state(state, time.monotonic())
+            found = found.cut_back(number, "the replay service has no whole part of it")
+            told = "; ".join(found.fallbacks(number))
+            console.event(f"goes on from checkpoint {number}{told and f'; passes over {told}'}")
         elif held:
             load_initial_networks(agent)
             console.event("begins anew: no epoch is held by both")
         settings, episodes_received = config.learner, 0 if state is None else state["told"]
+        for each in found.whole:
+            each.state.clear()  # only its memory
         samples = SampleClient(
             node,
             stop,
@@ -92,9 +99,11 @@ def _train(options: LearnerOptions, config: RunConfig, spec: EnvSpec, path: Path
             shared_memory=options.shared_memory,
             mirror=_mirror(config, spec, console),
         )
-        checkpoints = Checkpoints(node, path, samples, epochs, console.event)
-        sizes = None if state is None else state["sizes"]
-        with RunDirectory(path, config, sizes, trainer.drawn.inserted, wandb=options.wandb) as directory:
+        steps = trainer.drawn.inserted
+        with RunDirectory(path, config, found, number or None, steps, wandb=options.wandb) as directory:
+            if directory.aside:
+                console.event(directory.aside)
+            checkpoints = Checkpoints(node, directory, samples, epochs, console.event)
             service = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console)
             with _exported(options.prometheus, service):
                 summary = service.run()
@@ -124,7 +133,7 @@ def _exported(address: str, service: LearnerService) -> AbstractContextManager[o
     return exported(address, service.status)
 
 
-def _check_origin(epoch: Path) -> None:
-    """Raise UsageError for an epoch of a lockstep run, before anything is deleted or written."""
-    if "told" not in load_learner(epoch):
-        raise UsageError(f"{epoch}: saved by a lockstep run; coop-lockstep --resume goes on with it")
+def _check_origin(found: Survey) -> None:
+    """Raise UsageError for a checkpoint of a lockstep run, before anything is written."""
+    if found.newest is not None and "told" not in found.newest.state:
+        raise UsageError(f"{found.newest.path}: saved by a lockstep run; coop-lockstep --resume goes on with it")

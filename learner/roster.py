@@ -16,7 +16,8 @@ from common.errors import BadMessage, RunError
 from common.messaging.members import Origin
 from common.messaging.messages.join import Join
 from common.messaging.presence import LEASE
-from common.process.files import write_atomic
+from common.process.files import sealed, unsealed, write_atomic
+from common.process.run_ids import check_owner
 
 ROSTER = "roster.json"
 RESERVE = 8  # a roster of n actors saves n / 8 numbers in advance, which a restarted learner leaves out
@@ -30,10 +31,12 @@ class AlreadyServed(RunError):
 class _Entries:
     """The roster's state on disk.
 
-    actors: how many numbers may have been given. replays: how many have been given. serving: incarnation of the active
-    replay service, which has the last number; -1 before the first. host, pid: of that service.
+    run: id of the run. actors: how many numbers may have been given. replays: how many have been given.
+    serving: incarnation of the active replay service, which has the last number; -1 before the first. host, pid: of
+    that service.
     """
 
+    run: int = -1
     actors: int = 0
     replays: int = 0
     serving: int = -1
@@ -49,22 +52,24 @@ class Roster:
 
     Args:
         folder: where the roster is saved; it is not saved if None.
+        run_id: of the run that the folder belongs to.
         now: seconds; the learner must assume that the last replay service was confirmed just before.
 
     Raises:
         RunError: the file in `folder` cannot be read.
     """
 
-    def __init__(self, folder: Path | None = None, now: float = 0.0) -> None:
+    def __init__(self, folder: Path | None = None, now: float = 0.0, run_id: int = -1) -> None:
         self._path = None if folder is None else folder / ROSTER
         self._lock = threading.Lock()
-        self._entries = _Entries()
+        self._entries = _Entries(run_id)
         self._confirmed = now
         self._given = 0  # numbers of actors
         self._actors: dict[int, int] = {}  # numbers of the actors known to this learner, by incarnation
         try:
             if self._path is not None and self._path.exists():
-                self._entries = _Entries(**json.loads(self._path.read_text(encoding="utf-8")))
+                self._entries = _Entries(**json.loads(unsealed(self._path.read_bytes())))
+                check_owner(self._path, self._entries.run, run_id)
                 self._given = self._entries.actors
         except (OSError, ValueError, TypeError) as error:
             raise RunError(f"{self._path}: {error}") from error
@@ -112,7 +117,7 @@ class Roster:
                 if entries.serving >= 0 and (entries.serving in there or now - self._confirmed < LEASE):
                     raise AlreadyServed(f"the replay service on {other} serves this run")
                 host, pid = request.origin
-                self._keep(_Entries(entries.actors, entries.replays + 1, request.incarnation, host, pid))
+                self._keep(_Entries(entries.run, entries.actors, entries.replays + 1, request.incarnation, host, pid))
             self._confirmed = now
             return self._entries.replays - 1
 
@@ -126,7 +131,7 @@ class Roster:
         """Save the entries and then use them; raises RunError."""
         if self._path is not None:
             try:
-                write_atomic(self._path, json.dumps(asdict(entries)).encode())
+                write_atomic(self._path, sealed(json.dumps(asdict(entries)).encode()))
             except OSError as error:
                 raise RunError(f"{self._path}: {error.strerror or error}") from error
         self._entries = entries

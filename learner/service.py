@@ -187,7 +187,6 @@ class LearnerService:
         return {
             **self._trainer.state(time.monotonic()),
             "told": self._samples.episodes,  # a name of the file format
-            "sizes": self._directory.sizes(),
         }
 
     def _farewell(self, outcome: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 
-from common.errors import RunError
+from common.errors import UsageError
 from common.messaging.messages.join import Join
 from common.process.lifecycle import Stop
 
@@ -42,13 +42,13 @@ class SharedEpochs:
         """Answer a joining replay service: the epoch to restore, and whether to start from the beginning.
 
         Raises:
-            RunError: no epoch is held by both.
+            UsageError: no epoch is held by both.
         """
         if not self._decided.is_set():
             self._decide(request)
             self._decided.set()
         if self._problem:
-            raise RunError(self._problem)
+            raise UsageError(self._problem)
         return self.newest, request.incarnation == self._began_anew
 
     def finished(self, number: int) -> None:
@@ -59,14 +59,14 @@ class SharedEpochs:
         """Wait for the decision: the epoch to continue from, 0 for the beginning, None if a stop was requested first.
 
         Raises:
-            RunError: no epoch is held by both.
+            UsageError: no epoch is held by both.
         """
         while not self._decided.wait(LOOK_EVERY):
             if stop.is_set():
                 return None
         if self._problem:
             stop.wait(REFUSAL)
-            raise RunError(self._problem)
+            raise UsageError(self._problem)
         return self.newest
 
     def _decide(self, request: Join) -> None:
@@ -79,7 +79,8 @@ class SharedEpochs:
         else:
             self._problem = (
                 f"no epoch to go on from: {self._run} {_listed(self._held)}, the replay service on "
-                f"{request.origin} {_listed(request.epochs)}; with --restart the training begins anew"
+                f"{request.origin} {_listed(request.epochs)}; nothing was changed. With --restart the training begins "
+                "anew, and what there is is moved aside"
             )
 
 

@@ -26,7 +26,7 @@ from common.settings.options import HealthOptions, RoleOptions
 from replay.core import ReplayCore
 from replay.persistence.epochs import ReplayEpochs
 from replay.persistence.folder import ReplayFolder
-from replay.persistence.journal import Journal, drop_journal
+from replay.persistence.journal import Journal
 from replay.persistence.recovery import recover
 from replay.service import ReplayService
 
@@ -67,7 +67,10 @@ def _run() -> None:
             folder = ReplayFolder(options.run_dir or _named(options.run, known.run_id), known.run_id)
             console.event(folder.check(resume=options.resume))
             with folder.lock():
-                held = ReplayEpochs(folder.path, known.run_id).intact()
+                parts = ReplayEpochs(folder.path, known.run_id)
+                held = parts.intact()
+                if problems := parts.passed_over():
+                    console.event(f"passes over {problems}")
                 endpoints = list(options.advertise) or locators(session)
                 request = Join("replay", incarnation, endpoints, epochs=held[-MOST_EPOCHS:])
                 joined = joining(request)
@@ -119,21 +122,23 @@ def _service(
         raise RunError(f"another learner of run {node.run!r} has begun while this one joined")
     core = ReplayCore(joined.config, joined.spec, shared_memory=shared_memory)
     epochs = ReplayEpochs(folder.path, folder.run_id)
-    if joined.anew:
-        epochs.clear()
-        try:
-            drop_journal(folder.journal)
-        except OSError as error:
-            raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
+    try:
+        aside = epochs.go_back(joined.epoch, anew=joined.anew)
+    except OSError as error:
+        raise RunError(f"{folder.path}: {error.strerror or error}") from error
     first, found = epochs.restore(core, joined.epoch)
+    for line in filter(None, (aside, found)):
+        console.event(line)
     if joined.config.replay.journal:
-        number, carried_out = recover(core, folder.journal, first, folder.run_id)
-        found = f"{found}; {carried_out}"
+        number, told = recover(core, folder.journal, first, folder.run_id)
+        for line in told:
+            console.event(line)
         try:
-            journal = Journal(folder.journal, folder.run_id, number, keep=joined.config.replay.journal_keep)
+            settings = joined.config.replay
+            accepted = core.table.inserted
+            journal = Journal(folder.journal, folder.run_id, number, keep=settings.journal_keep, accepted=accepted)
         except OSError as error:
             raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
         core.recorder = journal
         epochs = ReplayEpochs(folder.path, folder.run_id, journal)
-    console.event(found)
     return ReplayService(node, core, epochs, confirmed=0.0)

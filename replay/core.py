@@ -65,6 +65,7 @@ class ReplayCore:
     batch_size: transitions of a draw. segment_steps: of a segment, at most.
     drawn: batches drawn, as the learner counts them: a learner restored from an epoch also resets this count.
     mirrored: what the present learner's mirror holds.
+    damaged: acknowledged transitions that damaged records of the journal held.
     problem: why no segment can be inserted although the limiter admits it, in words; empty if there is no problem.
     """
 
@@ -83,6 +84,7 @@ class ReplayCore:
         self.drawn = 0
         self.mirrored = MirroredFrames()
         self.duplicates = 0
+        self.damaged = 0
         self.problem = ""
         self.inserts_wait_for = ""
         self.samples_wait_for = ""
@@ -99,8 +101,9 @@ class ReplayCore:
 
         At most those of the whole run, whatever the actors claim.
         """
+        # Of the transitions in damaged records, the accounts tell once their actors send others.
         lost = sum(max(0, account.acked - account.accepted) for account in self._accounts.values())
-        return min(lost, self._total_steps)
+        return min(max(lost, self.damaged), self._total_steps)
 
     @property
     def missing_segments(self) -> int:
@@ -123,7 +126,7 @@ class ReplayCore:
         reason = self.limiter.why_not_insert(self.table.inserted, self.drawn)
         if not reason:
             try:
-                self.recorder.insert(payload)
+                self.recorder.insert(payload, segment.steps)
                 self.problem = ""
             except OSError as error:
                 reason = self.problem = f"the journal can't be written: {error.strerror or error}"
@@ -235,6 +238,7 @@ class ReplayCore:
         state = {
             "drawn": self.drawn,
             "duplicates": self.duplicates,
+            "damaged": self.damaged,
             "seen": self._seen.state(),
             "first_episode": self._episodes.first,
             "floors": list(self._episodes.floors.items()),
@@ -260,8 +264,9 @@ class ReplayCore:
         self.table.load_state(meta, arrays)
         self.drawn = state["drawn"]
         self.duplicates = state["duplicates"]
+        self.damaged = state["damaged"]
         self._seen.load_state(state["seen"])
-        self._episodes.load(state["first_episode"], episodes, dict(state.get("floors", [])))
+        self._episodes.load(state["first_episode"], episodes, dict(state["floors"]))
         self._accounts = {actor: _Account(accepted, acked) for actor, accepted, acked in state["accounts"]}
         self._learners = list(state["learners"])
         self.restore_limiter(RateLimiter.from_table(state["limiter"]))

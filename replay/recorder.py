@@ -14,8 +14,8 @@ from replay.limiter import RateLimiter
 class Recorder(Protocol):
     """Records the changes of a core, in order, before the requests are answered."""
 
-    def insert(self, payload: bytes) -> None:
-        """Record an insert request that is about to be applied.
+    def insert(self, payload: bytes, transitions: int) -> None:
+        """Record an insert request that is about to be applied; transitions: how many it adds.
 
         Raises:
             OSError: it could not be recorded, and must not be applied.
@@ -31,7 +31,7 @@ class Recorder(Protocol):
 class NullRecorder:
     """The recorder of a core without a journal."""
 
-    def insert(self, payload: bytes) -> None:
+    def insert(self, payload: bytes, transitions: int) -> None:
         """See `Recorder`."""
 
     def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:

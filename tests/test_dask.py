@@ -59,7 +59,7 @@ def test_a_run_goes_on_after_its_worker_and_stops_at_ctrl_c(cluster: subprocess.
     print(0, file=cluster.stdin, flush=True)
     wait_for(command, lambda: "\nworkers: 0, threads: 0; gone: tcp://127.0.0.1:" in command.output()[0])
     print(1, file=cluster.stdin, flush=True)
-    wait_for(command, lambda: "goes on from epoch" in (run / "run.log").read_text())
+    wait_for(command, lambda: "goes on from checkpoint" in (run / "run.log").read_text())
     command.interrupt()
     done = command.end(200)
     assert (done.returncode, done.stderr) == (

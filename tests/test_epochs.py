@@ -3,6 +3,7 @@
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from table_reference import check_references
 
 from common.errors import RunError
 from common.messaging.messages.sample import DrawRequest, EpisodeRecord
+from common.process.checkpoints import DONE, checkpoint_numbers, go_back, survey
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec
-from learner.records.epochs import complete_epochs, intact_epochs, load_learner, newest_epoch, rewind, save_epoch
+from learner.records.epochs import load_learner, newest_epoch, save_epoch
 from replay.core import ReplayCore, Wait
 from replay.episodes import MOST, EpisodeLog
 from replay.persistence.epochs import ReplayEpochs
@@ -94,7 +96,8 @@ def test_torn_parts_are_passed_over_and_old_ones_go(spec: EnvSpec, tmp_path: Pat
     with (parts[30] / "rewards.npy").open("r+b") as file:
         file.seek(-1, 2)
         file.write(b"\7")
-    assert "rewards.npy: size and checksum" in (found := epochs.restore(twin := ReplayCore(CONFIG, spec), 30)[1])
+    found = epochs.restore(twin := ReplayCore(CONFIG, spec), 30)[1]
+    assert f"passed over {parts[30]}, rewards.npy: wrong checksum; " in found
     assert "restored epoch 20" in found
     assert twin.table.inserted == 60
     assert epochs.restore(ReplayCore(CONFIG, spec), 19) == (1, "no epoch to restore"), "the learner is back before it"
@@ -108,10 +111,14 @@ def test_torn_parts_are_passed_over_and_old_ones_go(spec: EnvSpec, tmp_path: Pat
 def test_a_writer_that_dies_of_anything_has_written_nothing(
     spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    epochs = ReplayEpochs(tmp_path, 2**70)  # more than msgpack can write down
+    def fails(*_: object) -> None:
+        raise OverflowError
+
+    epochs = ReplayEpochs(tmp_path, 5)
+    monkeypatch.setattr("replay.persistence.storage.write_manifest", fails)
     monkeypatch.setattr(threading, "excepthook", lambda args: None)
     epochs.begin(_used_core(spec), threading.Condition(), 10, [])
-    with pytest.raises(RunError, match="10/replay: OverflowError: "):
+    with pytest.raises(RunError, match="10/replay: OverflowError"):
         epochs.written(10, 10)
 
 
@@ -195,27 +202,40 @@ def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
     assert (older.drawn, older.episodes_total) == (30, 11), "also of a learner that it knows"
 
 
+def save_learner(run_dir: Path, number: int, state: dict[str, Any]) -> None:
+    """A checkpoint of a learner whose records are empty."""
+    save_epoch(run_dir, 5, number, state, lambda _: None, records={})
+
+
+def finished(run_dir: Path) -> list[int]:
+    return checkpoint_numbers(run_dir, DONE)
+
+
 def test_learner_epochs(tmp_path: Path) -> None:
     for number in (100, 200, 300):
-        save_epoch(tmp_path, number, {"flat": torch.full((3,), float(number))}, lambda _: None)
-    assert complete_epochs(tmp_path) == [200, 300]
+        save_learner(tmp_path, number, {"flat": torch.full((3,), float(number))})
+    assert finished(tmp_path) == [200, 300]
     torn = tmp_path / "checkpoints" / "400"
     torn.mkdir()
     (torn / "learner.pt").write_bytes(b"half")
-    assert complete_epochs(tmp_path) == [200, 300]
-    newest = newest_epoch(tmp_path)
-    assert newest is not None
-    assert load_learner(newest)["flat"].tolist() == [300.0] * 3
+    assert finished(tmp_path) == [200, 300]
+    newest = tmp_path / "checkpoints" / "300"
     (newest / "learner.pt").write_bytes((newest / "learner.pt").read_bytes()[:-9])
-    state = rewind(tmp_path, intact_epochs(tmp_path)[-1])
-    assert state is not None
-    assert state["flat"].tolist() == [200.0] * 3
-    assert complete_epochs(tmp_path) == [200], "the torn one is gone, and does not count as one of two to keep"
+    found = survey(tmp_path, load=load_learner)
+    assert found.newest is not None
+    assert found.newest.state["flat"].tolist() == [200.0] * 3
+    assert set(found.problems) == {300, 400}
+    told = go_back(found, found.newest.number)
+    assert finished(tmp_path) == [200], "the torn ones count not among the two to keep"
+    (aside,) = (tmp_path / "aside").iterdir()
+    assert told == f"what is younger is in {aside}"
+    assert (aside / "checkpoints" / "400" / "learner.pt").read_bytes() == b"half", "and nothing is deleted"
 
     def fails(folder: str) -> None:
         raise RunError(f"no room for {folder}")
 
     with pytest.raises(RunError):
-        save_epoch(tmp_path, 500, {}, fails)
-    assert complete_epochs(tmp_path) == [200]
+        save_epoch(tmp_path, 5, 500, {}, fails, records={})
+    assert finished(tmp_path) == [200]
     assert not (tmp_path / "checkpoints" / "500").exists()
+    assert newest_epoch(tmp_path) is not None

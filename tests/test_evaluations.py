@@ -25,6 +25,7 @@ from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow
 from common.messaging.messages.join import Joined
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.transport import Node, Refused
+from common.process.checkpoints import Manifest, Start, Survey, Whole
 from common.process.console import Console
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
@@ -127,7 +128,7 @@ class StopsAfter(Stop):
 
 
 def lockstep(config: RunConfig, folder: Path, stop: Stop, *, resume: bool = False) -> str:
-    with closing(LockstepRun(config, folder, "test", resume=resume)) as run:
+    with closing(LockstepRun(config, folder, "test", Start(resume))) as run:
         return run.play(stop).exit
 
 
@@ -180,13 +181,14 @@ def test_what_can_t_be_filmed_is_refused_before_the_run_starts(name: str, tmp_pa
 def test_a_resumed_run_keeps_the_lines_up_to_its_epoch(tmp_path: Path) -> None:
     config = base_config([])
     with RunDirectory(tmp_path, config) as directory:
-        sizes = directory.sizes()
+        sealed = directory.records()
         for step in (100, 200, 300):
             directory.evaluation(msgspec.structs.replace(RESULT, env_step=step))
         assert directory.evaluated == 300
     with (tmp_path / "evaluations.csv").open("a") as file:
         file.write("150,2,1,10,1,1,0,1")  # torn by a kill, in its last number
-    with RunDirectory(tmp_path, config, sizes, 200) as directory:
+    found = Survey(tmp_path, (Whole(tmp_path, Manifest(5, 7, {}, sealed)),))
+    with RunDirectory(tmp_path, config, found, 7, 200) as directory:
         assert directory.evaluated == 200
         directory.evaluation(msgspec.structs.replace(RESULT, env_step=250, return_mean=1234567.25))
     assert [row["env_step"] for row in rows(tmp_path)] == ["100", "200", "250"]

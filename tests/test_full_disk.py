@@ -13,12 +13,12 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from common.errors import RunError
+from common.process.checkpoints import checkpoint_numbers
 from common.process.files import LineFile
 from common.process.lifecycle import Stop
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
 from experiments.lockstep_run import play_lockstep
-from learner.records.epochs import complete_epochs
 from learner.records.run_directory import RunDirectory
 from learner.records.summary import summarise
 
@@ -88,7 +88,7 @@ def test_a_lockstep_run_goes_on_without_its_epochs(small_disk: Path, capsys: pyt
             play_lockstep(run, directory, Stop())
     run.env.close()
     assert run.step == run.config.total_steps
-    assert complete_epochs(path) == []
+    assert checkpoint_numbers(path) == []
     assert "epoch 200 in" in (told := capsys.readouterr().out)
     assert told.count("No space left on device; the run goes on without it\n") == 2
 

@@ -9,7 +9,7 @@ from commands import run_command
 from torch import Tensor
 
 from experiments.reexecute import reexecute
-from learner.records.epochs import load_learner, newest_epoch
+from learner.records.epochs import newest_epoch
 
 FLAGS = ("--learner.learning-rate", "1e-30")  # keeps the networks as they are
 SHORT = ("--total-steps", "300", "--replay.learning-starts", "100")
@@ -18,7 +18,7 @@ SHORT = ("--total-steps", "300", "--replay.learning-starts", "100")
 def networks(path: Path) -> list[Tensor]:
     epoch = newest_epoch(path)
     assert epoch is not None
-    found: list[Tensor] = load_learner(epoch)["agent"]["networks"]
+    found: list[Tensor] = epoch.state["agent"]["networks"]
     return found
 
 
@@ -41,7 +41,7 @@ def test_in_lockstep_and_resumed_without_the_other_run(source: Path, tmp_path: P
     assert begins_with(path, source)
     shutil.rmtree(copied)
     done = run_command("coop-lockstep", "--resume", "--total-steps", "400", "--run-dir", path, check=True)
-    assert "goes on from epoch 200" in done.stdout
+    assert "goes on from checkpoint 200" in done.stdout
     assert begins_with(path, source)
 
 

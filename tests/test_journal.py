@@ -52,24 +52,17 @@ def test_a_kill_loses_nothing(spec: EnvSpec, tmp_path: Path) -> None:
     with (tmp_path / "00000001.log").open("ab") as file:
         file.write(b"half a record, longer than its header")
     twin = ReplayCore(CONFIG, spec)
-    number, found = recover(twin, tmp_path, 1, 5)
-    assert (number, found) == (2, f"36 transitions and {core.drawn} batches from the journal")
+    number, told = recover(twin, tmp_path, 1, 5)
+    taken = f"36 transitions and {core.drawn} batches from the journal, which ends as a kill leaves it"
+    assert (number, told) == (2, [taken])
     _assert_alike(core, twin)
     twin.recorder = Journal(tmp_path, 5, number, keep=False)
     _use(twin, spec, range(9, 12))
     third = ReplayCore(CONFIG, spec)
-    assert recover(third, tmp_path, 1, 5)[0] == 3, "the torn end was cut, and what follows is found"
+    assert recover(third, tmp_path, 1, 5)[0] == 3, "behind the torn end, what follows is found"
     _assert_alike(twin, third)
     with pytest.raises(RunError, match="belongs to another run than the learner's"):
         recover(ReplayCore(CONFIG, spec), tmp_path, 1, 6)
-    content = bytearray((tmp_path / "00000001.log").read_bytes())
-    content[len(content) // 2] ^= 1
-    (tmp_path / "00000001.log").write_bytes(content)
-    with pytest.raises(RunError, match=r"00000001.log: no complete record at byte \d+"):
-        recover(ReplayCore(CONFIG, spec), tmp_path, 1, 5)
-    (tmp_path / "00000001.log").unlink()
-    with pytest.raises(RunError, match=r"has files \[2\], should have every one from 1 on"):
-        recover(ReplayCore(CONFIG, spec), tmp_path, 1, 5)
 
 
 @pytest.mark.parametrize("keep", [False, True])

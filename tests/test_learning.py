@@ -18,7 +18,7 @@ from common.settings.config import RunConfig
 from common.settings.tables import load_tables, resolve
 from experiments.lockstep import Lockstep
 from learner.agent import Agent
-from learner.records.epochs import load_learner, newest_epoch
+from learner.records.epochs import newest_epoch
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 
@@ -96,7 +96,7 @@ def test_coop_finds_optimal_values_over_the_real_topology(config: RunConfig, tmp
     epoch = newest_epoch(tmp_path / "run")
     assert epoch is not None
     run = Lockstep(replace(config, method="coop"))  # for a network of the right shape
-    run.agent.load_state(load_learner(epoch)["agent"])
+    run.agent.load_state(epoch.state["agent"])
     run.env.close()
     for q in values(run.agent):
         np.testing.assert_allclose(q, optimal_values(config.learner.gamma), atol=BOUND)

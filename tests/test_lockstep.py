@@ -1,7 +1,6 @@
 """Lockstep runs: the same bytes for a seed, also through a kill -9, for every method."""
 
 import json
-import shutil
 import subprocess
 import sysconfig
 import time
@@ -9,17 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
-import msgpack
-import numpy as np
 import pytest
-import torch
 from commands import run_command
 from table_reference import whole_state
 
 from common.settings.methods import METHODS
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
-from learner.records.epochs import load_learner
+from learner.records.epochs import newest_epoch
 from learner.records.run_directory import RunDirectory
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
@@ -84,7 +80,7 @@ def test_resume_starts_goes_on_or_refuses(tmp_path: Path) -> None:
     status, out, _ = resume(*short)
     assert (status, out.splitlines()[0]) == (0, f"starts in {tmp_path / 'a'}: there is no run there yet")
     status, out, _ = resume(*short)
-    assert (status, out.splitlines()[0]) == (0, "goes on from epoch 260")
+    assert (status, out.splitlines()[0]) == (0, "goes on from checkpoint 260")
     status, _, err = resume(*short, "--seed", "9")
     assert (status, err.count("\n")) == (1, 1)
     assert "another run's, whose seed is 0; here it is 9" in err
@@ -156,34 +152,6 @@ def test_a_run_that_diverges_ends_and_says_so(program: str, tmp_path: Path) -> N
     assert not list((tmp_path / "run").glob("checkpoints/*/DONE"))
 
 
-def test_an_epoch_of_the_old_format_goes_on_to_the_byte(tmp_path: Path) -> None:
-    """Until all runs shared one format, a lockstep epoch held its table as plain arrays and its actions beside them."""
-    whole, run = _run(tmp_path / "whole", "coop", 500), Lockstep(base_config(["--method", "coop"]))
-    with RunDirectory(tmp_path / "run", run.config) as directory:
-        for _ in range(300):
-            _play(run, directory)
-        run.save(directory)
-        epoch = tmp_path / "run" / "checkpoints" / str(run.agent.updates)
-        state = load_learner(epoch)
-        meta, arrays = whole_state(run.memory.table)
-    shutil.rmtree(epoch / "replay")
-    (epoch / "replay").mkdir()
-    played = state.pop("player")
-    old = {"agent": state["agent"], "telemetry": state["telemetry"], "step": 300, "policy": played["policy"]}
-    torch.save({**old, "sizes": state["sizes"]}, epoch / "learner.pt")
-    (epoch / "replay" / "state.msgpack").write_bytes(msgpack.packb({"table": meta}))
-    for name, array in {**arrays, "played": played["actions"].numpy()}.items():
-        np.save(epoch / "replay" / f"{name}.npy", array)
-    resumed = Lockstep(run.config)
-    sizes = resumed.restore(epoch)
-    with RunDirectory(tmp_path / "run", run.config, sizes) as directory:
-        for _ in range(200):
-            _play(resumed, directory)
-    episodes = [(tmp_path / name / "episodes.csv").read_bytes() for name in ("whole", "run")]
-    assert episodes[0] == episodes[1]
-    assert torch.equal(whole.agent.networks[0].flat, resumed.agent.networks[0].flat)
-
-
 @pytest.mark.parametrize("ratio", [1.0, 0.3])
 def test_steps_that_wait_come_back_with_a_resumed_run(ratio: float, tmp_path: Path) -> None:
     """Steps are not in the table yet that wait for their n-step return, or for the next batch."""
@@ -195,7 +163,9 @@ def test_steps_that_wait_come_back_with_a_resumed_run(ratio: float, tmp_path: Pa
         for _ in range(150):
             _play(first, directory)
         first.save(directory)
-        second.restore(tmp_path / "checkpoints" / str(first.agent.updates))
+        epoch = newest_epoch(tmp_path)
+        assert epoch is not None
+        second.restore(epoch)
         for run in (first, second):
             for _ in range(30):
                 for _ in run.play():
@@ -223,27 +193,6 @@ def test_steps_are_stored_some_at_a_time_before_each_batch(n_step: int) -> None:
     assert run.agent.updates == 39
     assert sum(call.args[0].steps for call in insert.call_args_list) == table.inserted
     assert insert.call_count < 60
-
-
-def test_an_epoch_that_has_every_step_goes_on_alike(tmp_path: Path) -> None:
-    """Earlier versions stored each step at once, so their epochs' tables have those that would still wait."""
-    config = base_config(["--method", "dqn"])
-    config = replace(config, replay=replace(config.replay, learning_starts=40, ratio=0.25))
-    whole, first, second = Lockstep(config), Lockstep(config), Lockstep(config)
-    with RunDirectory(tmp_path, config) as directory:
-        for _ in range(151):
-            _play(first, directory)
-        for segment in first.memory._segments.flush():
-            first.memory.table.insert(segment)
-        first.save(directory)
-    second.restore(tmp_path / "checkpoints" / str(first.agent.updates))
-    for run, steps in ((whole, 351), (second, 200)):
-        for _ in range(steps):
-            for _ in run.play():
-                pass
-        run.env.close()
-    assert second.memory.counters() == whole.memory.counters()
-    assert torch.equal(second.agent.networks[0].flat, whole.agent.networks[0].flat)
 
 
 def test_processes_do_not_go_on_with_a_lockstep_run(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from commands import run_command
 from actors.policy import Policy
 from common.errors import UsageError
 from common.networks.network import FlatNetwork, build_network
+from common.process.checkpoints import survey
 from common.settings.config import NETWORK_KINDS, NetworkSettings, RunConfig
 from common.settings.sources import base_config
 from common.settings.tables import validated
@@ -20,6 +21,7 @@ from common.types import EnvSpec
 from experiments.evaluation import evaluate_checkpoint
 from experiments.lockstep import Lockstep
 from learner.edl.graph import Graph
+from learner.records.epochs import load_learner
 from learner.records.run_directory import RunDirectory
 
 SPEC = EnvSpec("made-up", (4,), "float32", 1, 3)
@@ -109,8 +111,10 @@ def test_every_method_trains_it_the_same_way_for_a_seed_and_after_a_resume(
         torn.save(directory)
     torn.env.close()
     resumed = _lockstep(method, name)
-    sizes = resumed.restore(tmp_path / "torn" / "checkpoints" / "20")
-    with RunDirectory(tmp_path / "torn", resumed.config, sizes) as directory:
+    found = survey(tmp_path / "torn", records=True, load=load_learner)
+    assert found.newest is not None
+    resumed.restore(found.newest)
+    with RunDirectory(tmp_path / "torn", resumed.config, found, 20) as directory:
         _play(resumed, directory, 20)
         resumed.save(directory)
     resumed.env.close()

@@ -20,6 +20,7 @@ from common.process.processes import free_endpoint
 from common.settings.environment import EnvSettings
 from common.settings.sources import base_config
 from experiments.lockstep import Lockstep
+from learner.records.epochs import newest_epoch
 from learner.records.run_directory import RunDirectory
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
@@ -132,7 +133,8 @@ def test_lockstep_goes_on_only_where_the_environment_repeats(tmp_path: Path, wha
             list(first.play())
         first.save(directory)
     again = Lockstep(replace(config, env=replace(config.env, kwargs={**kwargs, "what": what})))
-    epoch = tmp_path / "checkpoints" / "0"
+    epoch = newest_epoch(tmp_path)
+    assert epoch is not None
     if what == "nothing":
         again.restore(epoch)
         return

@@ -14,22 +14,22 @@ from pathlib import Path
 import pytest
 from commands import run_command
 from samples import make_segment
-from test_epochs import CONFIG, save
+from test_epochs import CONFIG, save, save_learner
 
 from common.errors import RunError, UsageError
 from common.messaging.joining import join
 from common.messaging.messages.join import Join
 from common.messaging.session import open_session
 from common.messaging.transport import Node, new_incarnation
-from common.process.files import truncate
+from common.process.checkpoints import Manifest, Survey, Whole, go_back, survey
+from common.process.files import Measured, truncate
 from common.process.lifecycle import Stop
 from common.process.locks import INHERITED, RunLock
-from common.process.run_ids import RUN_ID, claim, draw_run_id, read_run_id
+from common.process.run_ids import RUN_ID, claim, read_run_id
 from common.settings.options import RunOptions
 from common.types import EnvSpec
 from learner.join_service import JoinService
-from learner.records.epochs import intact_epochs, rewind, save_epoch
-from learner.records.run_directory import RunDirectory
+from learner.records.run_directory import RunDirectory, claim_run_directory
 from learner.roster import Roster
 from learner.shared_epochs import SharedEpochs
 from replay.core import ReplayCore
@@ -101,7 +101,7 @@ HOLD = """
 import sys
 from pathlib import Path
 from common.process.locks import RunLock
-with RunLock(Path(sys.argv[1]), "coop-lockstep", ("learner", "replay")):
+with RunLock(Path(sys.argv[1]), "coop-lockstep", ("learner", "replay")).sign():
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -124,7 +124,7 @@ def test_a_live_run_directory_is_locked_and_free_at_death(tmp_path: Path) -> Non
         holder.wait(20)
     with (
         RunLock(tmp_path, "coop-learner", ("learner",)),
-        RunLock(tmp_path, "coop-replay", ("replay",)),
+        RunLock(tmp_path, "coop-replay", ("replay",)).sign(),
         pytest.raises(RunError, match="in use by coop-replay"),
     ):
         RunLock(tmp_path, "coop-local", ("replay", "learner"))
@@ -134,8 +134,8 @@ def test_a_supervisor_s_locks_are_its_children_s_too(tmp_path: Path) -> None:
     command = [sys.executable, "-c", HOLD, str(tmp_path / "run")]
     refused = f"in use by coop-local on {os.uname().nodename} (pid {os.getpid()})"
     with (
-        RunLock(tmp_path / "run", "coop-local", ("learner", "replay")) as lock,
-        RunLock(tmp_path / "other", "coop-local", ("learner", "replay")) as other,
+        RunLock(tmp_path / "run", "coop-local", ("learner", "replay")).sign() as lock,
+        RunLock(tmp_path / "other", "coop-local", ("learner", "replay")).sign() as other,
     ):
         for held, out, problem in (
             (lock.descriptors, "held\n", ""),
@@ -159,7 +159,7 @@ def test_a_supervisor_s_locks_are_its_children_s_too(tmp_path: Path) -> None:
     ],
 )
 def test_commands_respect_the_lock(name: str, flags: list[str], tmp_path: Path) -> None:
-    with RunLock(tmp_path, "coop-learner", ("learner",)):
+    with RunLock(tmp_path, "coop-learner", ("learner",)).sign():
         before = contents(tmp_path)
         done = run_command(name, "--run-dir", tmp_path, "--resume", *flags)
         place = f"coop-learner on {os.uname().nodename} (pid {os.getpid()})"
@@ -169,8 +169,8 @@ def test_commands_respect_the_lock(name: str, flags: list[str], tmp_path: Path) 
 
 
 def test_a_run_id_is_drawn_once(tmp_path: Path) -> None:
-    first = draw_run_id(tmp_path)
-    assert draw_run_id(tmp_path) == first
+    first = claim_run_directory(tmp_path, RunOptions().run_config())
+    assert claim_run_directory(tmp_path, RunOptions().run_config()) == first
     claim(tmp_path, first)
     with pytest.raises(RunError, match="belongs to another run"):
         claim(tmp_path, first + 1)
@@ -222,11 +222,11 @@ def test_no_epoch_in_common() -> None:
     epochs = SharedEpochs((500, 1000), "runs/a")
     words = (
         rf"runs/a holds epochs 500, 1000, the replay service on \S+ \(pid {os.getpid()}\) holds none; "
-        "with --restart the training begins anew"
+        "nothing was changed. With --restart the training begins anew"
     )
-    with pytest.raises(RunError, match=words):
+    with pytest.raises(UsageError, match=words):
         epochs.offered(offer())
-    with pytest.raises(RunError, match=words):
+    with pytest.raises(UsageError, match=words):
         epochs.wait(Stop())
     restarted = SharedEpochs((500, 1000), "runs/a", restart=True)
     assert restarted.offered(offer(1500)) == (0, True)
@@ -239,13 +239,16 @@ def test_no_epoch_in_common() -> None:
 
 def test_the_learner_goes_back_to_the_epoch_that_is_chosen(tmp_path: Path) -> None:
     for number in (500, 1000):
-        save_epoch(tmp_path, number, {"updates": number}, lambda _: None)
+        save_learner(tmp_path, number, {"updates": number})
     (tmp_path / "checkpoints" / "1000" / "learner.pt").write_bytes(b"torn")
-    assert intact_epochs(tmp_path) == [500]
-    assert rewind(tmp_path, 500) == {"updates": 500}
+    found = survey(tmp_path, every=True)
+    assert [each.number for each in found.whole] == [500]
+    go_back(found, 500)
     assert not (tmp_path / "checkpoints" / "1000").exists()
-    assert rewind(tmp_path, 0) is None
+    go_back(found, None)
     assert not list((tmp_path / "checkpoints").iterdir())
+    moved = sorted(path.parent.name for path in (tmp_path / "aside").rglob("learner.pt"))
+    assert moved == ["1000", "500"], "moved aside, not deleted"
 
 
 def serve_replay(endpoint: str, folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
@@ -307,7 +310,7 @@ def test_a_replay_service_refuses_restores_and_begins_anew(
             else:
                 assert done.returncode == 1
                 assert "no epoch to go on from: runs/a holds epochs 1000, the replay service on " in done.stderr
-                assert "holds epochs 500; with --restart" in done.stderr
+                assert "holds epochs 500; nothing was changed. With --restart" in done.stderr
                 assert part_path(ours, 500).exists()
 
 
@@ -335,6 +338,7 @@ def test_a_file_is_never_lengthened(tmp_path: Path) -> None:
     truncate(path, 6)
     assert path.read_bytes() == b"twelve"
     config = RunOptions().run_config()
+    seals = Manifest(5, 100, {}, {"episodes.csv": Measured(99, 0)})
     with pytest.raises(RunError, match="has 6 bytes, and should have at least 99"):
-        RunDirectory(tmp_path, config, {"episodes.csv": 99})
+        RunDirectory(tmp_path, config, Survey(tmp_path, (Whole(tmp_path, seals),)), 100)
     assert path.read_bytes() == b"twelve"

@@ -77,7 +77,7 @@ def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
     assert json.loads((path / "summary.json").read_text())["exit"] == "interrupted"
     done = run_command("coop-lockstep", *flags)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("goes on from epoch ")
+    assert done.stdout.startswith("goes on from checkpoint ")
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -170,6 +170,6 @@ def test_whoever_is_told_to_stop_first_the_closing_epoch_is_saved(first: str, tm
     summary = json.loads((path / "summary.json").read_text())
     saved = newest_epoch(path)
     assert saved is not None
-    assert int(saved.name) == summary["updates"] > 0
-    assert (saved / "replay" / "frames.npy").exists()
+    assert saved.number == summary["updates"] > 0
+    assert (saved.path / "replay" / "frames.npy").exists()
     assert summary["transitions_lost"] in (0, None)

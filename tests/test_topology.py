@@ -44,6 +44,7 @@ SILENT = r"(?m)^\d\d:\d\d:\d\d replay service on \S+ \(pid \d+\) does not answer
 SUMMARY = [
     *("method", "env", "seed", "env_steps", "updates", "episodes", "return_mean_100", "return_sd_100"),
     *("wall_seconds", "transitions_accepted", "transitions_lost", "duplicates_refused", "exit"),
+    *("fallbacks", "records", "crc32"),
 ]
 
 

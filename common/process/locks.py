@@ -24,6 +24,7 @@ from types import TracebackType
 from typing import Self
 
 from common.errors import RunError
+from common.process.files import guard_writes, make_folder
 from common.process.output import keep_standard_files
 from common.process.untrusted import check_links
 
@@ -51,6 +52,8 @@ class FileLock:
             OSError: the file cannot be made.
         """
         self.path = path
+        self.signed = False
+        self._before = b""
         self.inherited = inherited is not None
         self.leased = not _is_local(path.parent)
         self._seen = _now()
@@ -88,6 +91,7 @@ class FileLock:
                 time.sleep(LEASE / 10)
                 if _touched(self.path) != touched or _read(self.path)[1] != token:
                     raise BlockingIOError
+        self._before = os.pread(self.descriptor, 2 * HOLDER_BYTES, 0)
         line = holder.encode()[:HOLDER_BYTES]
         content = b"\n".join([line.replace(b"\n", b" "), self._token.encode(), _place(self.descriptor).encode(), b""])
         os.pwrite(self.descriptor, content, 0)
@@ -124,10 +128,12 @@ class FileLock:
             os.close(self.descriptor)
 
     def release(self) -> None:
-        """Release the lock, unless this process has only inherited it."""
+        """Release the lock, unless this process has only inherited it; the file is as it was if it was not signed."""
         if not self.inherited and (not self.leased or _read(self.path)[1] == self._token):
             with contextlib.suppress(OSError):
-                os.ftruncate(self.descriptor, 0)
+                content = b"" if self.signed else self._before
+                os.pwrite(self.descriptor, content, 0)
+                os.ftruncate(self.descriptor, len(content))
         self.hand_over()
 
 
@@ -171,6 +177,9 @@ def check_held() -> None:
         lock.check()
 
 
+guard_writes(check_held)
+
+
 class RunLock:
     """Locks the roles' places in a run directory for one process and the children that inherit its locks.
 
@@ -178,17 +187,18 @@ class RunLock:
     """
 
     def __init__(self, folder: Path, program: str, roles: Sequence[str]) -> None:
-        """Lock the places of `roles`; create the folder if it does not exist.
+        """Lock the places of `roles`; create the folder if it does not exist. see `sign`.
 
         Raises:
             RunError: another process, which the message names, holds one of them, or the folder cannot be written.
         """
         self._locks: list[FileLock] = []
+        self._holder = f"{program} on {socket.gethostname()} (pid {os.getpid()})"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             check_links(folder)
             for role in roles:
-                self._take(folder, role, program)
+                self._take(folder, role)
         except OSError as error:
             self.release()
             raise RunError(f"run directory {folder}: {error.strerror or error}") from error
@@ -200,6 +210,12 @@ class RunLock:
     def descriptors(self) -> tuple[int, ...]:
         """The descriptors that a child must inherit, and find in the variable `INHERITED`, to hold the locks too."""
         return tuple(lock.descriptor for lock in self._locks)
+
+    def sign(self) -> Self:
+        """Keep this process named in the locks' files; until then, releasing them leaves them as they were."""
+        for lock in self._locks:
+            lock.signed = True
+        return self
 
     def hand_over(self) -> None:
         """Leave all locks to the child processes that have inherited them."""
@@ -213,11 +229,10 @@ class RunLock:
             lock.release()
         self._locks.clear()
 
-    def _take(self, folder: Path, role: str, program: str) -> None:
+    def _take(self, folder: Path, role: str) -> None:
         path = folder / f".{role}.lock"
-        holder = f"{program} on {socket.gethostname()} (pid {os.getpid()})"
         try:
-            self._locks.append(FileLock(path, holder, _inherited(path)))
+            self._locks.append(FileLock(path, self._holder, _inherited(path)))
         except BlockingIOError:
             raise Held(f"run directory {folder}: in use by {_read(path)[0] or 'another process'}") from None
 

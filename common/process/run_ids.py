@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import secrets
 from pathlib import Path
 
 from common.errors import RunError
-from common.process.files import write_atomic
+from common.process.files import make_folder, write_atomic
 
 RUN_ID = "run-id"
 
@@ -25,13 +24,6 @@ def read_run_id(folder: Path) -> int:
         raise RunError(f"{path}: {error}") from error
 
 
-def draw_run_id(folder: Path) -> int:
-    """Read the id of the run in a directory, or draw one if no run has begun in it; raises RunError."""
-    if not has_run_id(folder):
-        claim(folder, secrets.randbits(63))
-    return read_run_id(folder)
-
-
 def claim(folder: Path, run_id: int) -> None:
     """Assign a directory to a run, permanently.
 
@@ -42,7 +34,7 @@ def claim(folder: Path, run_id: int) -> None:
         check_owner(folder, read_run_id(folder), run_id)
         return
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         write_atomic(folder / RUN_ID, f"{run_id}\n".encode())
     except OSError as error:
         raise RunError(f"{folder / RUN_ID}: {error.strerror or error}") from error

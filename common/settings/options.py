@@ -16,6 +16,7 @@ from common.errors import RunError, UsageError
 from common.imports import permit
 from common.places import absolute
 from common.process import cli
+from common.process.checkpoints import LEARNER, RECORDS, Start, checkpoint_numbers, holds_run
 from common.process.extras import check_extra
 from common.process.flags import HttpAddress
 from common.process.notices import note_renamed, warn
@@ -27,7 +28,7 @@ from common.settings.methods import METHODS, table_of
 from common.settings.renamed import current_flags
 from common.settings.resuming import check_resumed
 from common.settings.sources import base_config
-from common.settings.tables import load_tables, preset_names, resolve, validated
+from common.settings.tables import preset_names, read_run_config, validated
 
 # What --help shows of a run's flags, in this order.
 COMMON = (
@@ -79,7 +80,12 @@ class RunOptions(RunConfig):
     run_dir: Path | None = None
     """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
     resume: bool = False
-    """Continue the run in --run-dir, with its config, from its newest epoch; start it if there is none yet."""
+    """Continue the run in --run-dir, with its config, from its newest whole checkpoint; start it if none has begun."""
+    resume_from: int | None = None
+    """As --resume, but go back to the checkpoint with this number (folder checkpoints/NUMBER), even if records are
+    damaged; what is younger is moved to aside/."""
+    overwrite: bool = False
+    """Begin anew in a folder that holds a run, which is moved to aside/ in that folder."""
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
@@ -93,6 +99,11 @@ class RunOptions(RunConfig):
         """The checked config of the run; raises UsageError."""
         return validated(RunConfig(**{each.name: getattr(self, each.name) for each in fields(RunConfig)}))
 
+    @property
+    def start(self) -> Start:
+        """How the run begins in its directory."""
+        return Start(self.resume, self.resume_from, self.overwrite)
+
     def directory(self) -> Path:
         """The run directory.
 
@@ -100,13 +111,15 @@ class RunOptions(RunConfig):
             UsageError: it already holds a run; or, with --resume, flags contradict the run's config.
             RunError: it belongs to another run.
         """
-        if self.resume:
+        if self.start.goes_on and self.overwrite:
+            raise UsageError("--overwrite: begins anew; --resume and --resume-from go on: give one of them")
+        if self.start.goes_on:
             return self._resumed()
         game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
         named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         path = self.run_dir or absolute(Path("runs") / named)
-        if holds_run(path):
-            how = "give another folder, or go on with --resume (resume=True in Python)"
+        if holds_run(path) and not self.overwrite:
+            how = "give another folder, go on with --resume (resume=True in Python), or move it aside with --overwrite"
             raise UsageError(f"run directory {path}: holds a run already; {how}")
         return path
 
@@ -116,21 +129,12 @@ class RunOptions(RunConfig):
             raise UsageError("--resume: give the run's folder too, --run-dir")
         file = path / "config.toml"
         if file.exists():
-            check_resumed(self.run_config(), resolve(load_tables(None, file)), file)
+            check_resumed(self.run_config(), read_run_config(path), file)
+        elif checkpoint_numbers(path, LEARNER) or any((path / name).exists() for name in RECORDS):
+            raise UsageError(f"run directory {path}: holds a run, but its config.toml is missing; nothing was changed")
         elif has_run_id(path):
             raise RunError(f"run directory {path}: a replay service's, of the run with id {read_run_id(path)}")
         return path
-
-
-def holds_run(path: Path) -> bool:
-    """True if a run has begun in a folder."""
-    return has_run_id(path) or (path / "episodes.csv").exists()
-
-
-def beginning(path: Path) -> str:
-    """The line to print if --resume finds no epoch in a run directory."""
-    there = "the run there has no epoch yet" if holds_run(path) else "there is no run there yet"
-    return f"starts in {path}: {there}"
 
 
 @dataclass(frozen=True)

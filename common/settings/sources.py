@@ -12,7 +12,7 @@ from common.imports import hand_over
 from common.process.notices import warn
 from common.process.untrusted import check_links
 from common.settings.config import RunConfig
-from common.settings.tables import load_tables, resolve, shortened
+from common.settings.tables import load_tables, read_run_config, resolve, shortened
 
 _OF_RUNS = ("run-id", "checkpoints", "episodes.csv")  # beside a config.toml
 
@@ -20,7 +20,7 @@ _OF_RUNS = ("run-id", "checkpoints", "episodes.csv")  # beside a config.toml
 def base_config(args: Sequence[str] | None = None) -> RunConfig:
     """The config given by `--preset`, `--config`, `--method` and `--total-steps`; the other flags override it.
 
-    With `--resume` and neither a preset nor a file, it is the config of the run in `--run-dir`.
+    With `--resume` or `--resume-from` and neither a preset nor a file, it is the config of the run in `--run-dir`.
 
     Raises:
         UsageError: an unknown preset, a bad file, or both given.
@@ -32,13 +32,14 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     early.add_argument("--total-steps", "--total_steps", type=int)
     early.add_argument("--run-dir", "--run_dir", type=_path)
     early.add_argument("--resume", action="store_true")
+    early.add_argument("--resume-from", "--resume_from")
     try:
         known, _ = early.parse_known_args(sys.argv[1:] if args is None else args)
     except argparse.ArgumentError as error:
         raise UsageError(str(error)) from error
     if known.preset and known.config:
         raise UsageError("--preset and --config: give one of them")
-    resumed = known.run_dir if known.resume else None
+    resumed = known.run_dir if known.resume or known.resume_from else None
     return chosen_config(known.preset, known.config, known.method, known.total_steps, resumed)
 
 
@@ -57,7 +58,8 @@ def chosen_config(
     if file and any((file.parent / name).exists() for name in _OF_RUNS):
         hand_over(file.parent)
     saved = resumed and not (preset or file) and resumed / "config.toml"
-    if saved and saved.exists():
+    if resumed and saved and saved.exists():
+        read_run_config(resumed)
         file = saved
     tables = load_tables(None if file else preset or "cartpole", file)
     if file is None and total_steps is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from importlib.resources import files
@@ -13,6 +14,7 @@ import pydantic
 import tomli_w
 
 from common.errors import RunError, UsageError
+from common.process.run_ids import has_run_id, read_run_id
 from common.process.untrusted import MAX_SETTINGS, read_text
 from common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from common.settings.methods import METHODS
@@ -22,6 +24,8 @@ from common.settings.rules import check_rules
 from common.suggestions import not_among
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
+CONFIG = "config.toml"
+_SEAL = "# crc32 "
 _FIELDS = [field.name for field in fields(RunConfig) if field.name != "own"]
 
 
@@ -123,6 +127,47 @@ def _own_settings(tables: dict[str, Any]) -> Any:  # noqa: ANN401 (an instance o
 def to_toml(config: RunConfig) -> str:
     """The resolved config as TOML, which `--config` reads."""
     return tomli_w.dumps(to_tables(config))
+
+
+def run_config_text(config: RunConfig, run_id: int | None) -> str:
+    """The text of a run's config.toml: the resolved config, and its checksum with the run's id as a comment."""
+    text = to_toml(config)
+    return text + _seal(text, run_id)
+
+
+def _seal(text: str, run_id: int | None) -> str:
+    return f"{_SEAL}{zlib.crc32(text.encode()):08x}{'' if run_id is None else f' of run {run_id}'}\n"
+
+
+def read_run_config(run_dir: Path) -> RunConfig:
+    """Read a run's config.toml, after a check of its checksum; raises UsageError."""
+    path = run_dir / CONFIG
+    try:
+        text = read_text(path, MAX_SETTINGS)
+    except (OSError, UnicodeDecodeError, RunError) as error:
+        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    try:
+        # Runs of a packed study have no id, and may come from versions that wrote no checksum.
+        return parse_run_config(text, path, read_run_id(run_dir) if has_run_id(run_dir) else None)
+    except RunError as error:
+        raise UsageError(str(error)) from error
+
+
+def parse_run_config(text: str, place: object, run_id: int | None = None) -> RunConfig:
+    """Read the text of a run's config.toml; place: for the error. run_id: of the run, which then must have sealed it.
+
+    Raises UsageError.
+    """
+    content, seal, rest = text.rpartition(_SEAL)
+    _, _, owner = rest.strip().partition(" of run ")
+    if (seal or run_id is not None) and seal + rest != _seal(content, int(owner) if owner.isdecimal() else None):
+        raise UsageError(f"{place}: not what the run wrote (wrong checksum); flags change the settings of a run")
+    if owner and run_id is not None and owner != str(run_id):
+        raise UsageError(f"{place}: belongs to another run")
+    try:
+        return resolve(tomllib.loads(text))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise UsageError(f"{place}: {error}") from error
 
 
 def to_tables(config: RunConfig) -> dict[str, Any]:

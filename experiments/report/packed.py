@@ -2,12 +2,18 @@
 
 Columns: `run`, the folder's name; `config.toml`, `summary.json` and `evaluations.csv`, their text; and a list for each
 column of `episodes.csv` and `metrics.jsonl`, named like `episodes.csv/return`. The schema's metadata hold `sweep.toml`.
+
+Every page has a checksum, and the metadata hold one of the whole file, for what pages don't cover. A file without
+one is looked up in SHA256SUMS beside it; one that is in neither is read with a warning.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import re
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +23,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from common.errors import RunError, UsageError
-from common.process.files import write_atomic
+from common.process.files import sync_folder, write_atomic
+from common.process.notices import warn
+from common.process.summaries import parse_summary, summary_text
 from common.process.untrusted import check_links, check_run_name
 from common.returns import exact
 from experiments.report.columns import (
@@ -46,6 +54,9 @@ SMALLEST = 22  # zstd's level
 # No result: what the machine was doing, and long lists. A thinned file lacks them.
 LEFT_OUT = ("time", "updates_per_s", "env_steps_per_s", "loss", "sample_age_histogram", "reuse_histogram")
 MAX_STUDY = 1 << 30  # bytes of a study in memory
+SUMS = "SHA256SUMS"  # as sha256sum writes it
+SEAL, UNSEALED = "coop", "crc32 of the rest:00000000"  # an entry of the metadata; with its digits the checksum
+_SEALED = re.compile(rb"crc32 of the rest:[0-9a-f]{8}")
 
 
 class PackedStudy:
@@ -53,10 +64,17 @@ class PackedStudy:
 
     def __init__(self, path: Path) -> None:
         try:
-            self._table = _read_bounded(path)
+            if path.stat().st_size > MAX_STUDY:
+                raise ValueError(f"{path.stat().st_size:,} bytes; a study has at most {MAX_STUDY:,}")
+            content = path.read_bytes()
+            check_content(path, content)
+            self._table = _read_bounded(content)
             self.names = [str(name) for name in self._table["run"].to_pylist()]
-        except (OSError, KeyError, pa.ArrowException, ValueError) as error:
-            raise UsageError(f"{path}: not a packed study: {str(error).splitlines()[0]}") from error
+        except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+            text = (str(error).splitlines() or [type(error).__name__])[0]
+            raise UsageError(f"{path}: not a packed study: {text}") from error
+        if SEAL.encode() in (self._table.schema.metadata or {}) and not _SEALED.search(content):
+            raise UsageError(f"{path}: wrong checksum: not what was packed")
         for name in self.names:
             check_run_name(name, str(path))
         self._rows = {name: row for row, name in enumerate(self.names)}
@@ -132,18 +150,21 @@ def pack(folder: Path, path: Path, rows: int | None = None) -> str:
     if rows is not None:
         for run, texts in files.items():
             texts[METRICS] = _thinned(folder / run / METRICS, texts[METRICS], rows)
+            texts[SUMMARY] = _without_seal(texts[SUMMARY], METRICS, folder / run / SUMMARY)
     fields: list[tuple[pa.Field, pa.Array]] = [(pa.field("run", pa.string()), pa.array(runs, pa.string()))]
     for file in TEXTS:
         fields.append((pa.field(file, pa.string()), pa.array([files[run][file] for run in runs], pa.string())))
     for file in READ:
         fields += _lists(file, [_read(folder / run / file, files[run][file]) for run in runs])
     sweep = _file(folder / SWEEP)
-    schema = pa.schema([field for field, _ in fields], None if sweep is None else {SWEEP: sweep})
+    metadata = {SEAL: UNSEALED, **({} if sweep is None else {SWEEP: sweep})}
+    schema = pa.schema([field for field, _ in fields], metadata)
     part = path.with_name(f"{path.name}.part")
     try:
-        _write(pa.table([array for _, array in fields], schema=schema), part)
+        write_atomic(part, _packed(pa.table([array for _, array in fields], schema=schema)))
         _check(PackedStudy(part), folder, files)
         part.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
         raise UsageError(f"--pack {path}: {error.strerror or error}") from error
     finally:
@@ -192,18 +213,28 @@ def _thinned(path: Path, text: str | None, rows: int) -> str | None:
         raise RunError(f"{path}: a torn line; is the run still writing? {error}") from error
 
 
+def _without_seal(text: str | None, name: str, path: Path) -> str | None:
+    """The text of a summary that no longer seals one of the records, which has been changed on purpose."""
+    if not text:
+        return text
+    fields = parse_summary(text, path)
+    if name not in fields.get("records", {}):
+        return text
+    return summary_text({**fields, "records": {each: seal for each, seal in fields["records"].items() if each != name}})
+
+
 def run_names(folder: Path) -> list[str]:
     """The names of the runs in a folder, in order, without hidden folders; raises UsageError as `check_run_name`."""
     found = (path.parent.name for path in folder.glob(f"*/{CONFIG}"))
     return sorted(check_run_name(name, str(folder)) for name in found if not name.startswith("."))
 
 
-def _read_bounded(path: Path) -> pa.Table:
+def _read_bounded(content: bytes) -> pa.Table:
     """Read a table, texts as indices of their different values, and spread these only if the result is not too large.
 
     Raises ValueError for a table that would take more than `MAX_STUDY` bytes, before it takes them.
     """
-    with pq.ParquetFile(path, memory_map=False) as file:
+    with pq.ParquetFile(pa.BufferReader(content)) as file:
         meta, leaves = file.metadata, file.schema
         columns = range(meta.num_columns)
         values = sum(
@@ -213,7 +244,7 @@ def _read_bounded(path: Path) -> pa.Table:
         if 8 * values + packed > MAX_STUDY:
             raise ValueError(f"{values:,} values; a study has at most {MAX_STUDY // 8:,}")
         texts = [leaves.column(n).path for n in columns if leaves.column(n).physical_type == "BYTE_ARRAY"]
-    table = pq.ParquetFile(path, read_dictionary=texts).read()
+    table = pq.ParquetFile(pa.BufferReader(content), read_dictionary=texts, page_checksum_verification=True).read()
     spread = sum(map(_spread, table.columns))
     if spread > MAX_STUDY:
         raise ValueError(f"{spread:,} bytes of text; a study has at most {MAX_STUDY:,}")
@@ -266,7 +297,7 @@ def _lists(file: str, runs: Sequence[Columns]) -> list[tuple[pa.Field, pa.Array]
     return made
 
 
-def _write(table: pa.Table, path: Path) -> None:
+def _packed(table: pa.Table) -> bytes:
     encodings, texts = {}, []
     for field in table.schema:
         leaf = f"{field.name}.list.element" if pa.types.is_list(field.type) else field.name
@@ -275,8 +306,36 @@ def _write(table: pa.Table, path: Path) -> None:
             texts.append(leaf)
         else:
             encodings[leaf] = "DELTA_BINARY_PACKED" if pa.types.is_integer(kind) else "BYTE_STREAM_SPLIT"
-    with path.open("wb") as file:
-        pq.write_table(
-            table, file, compression="zstd", compression_level=SMALLEST, use_dictionary=texts,
-            column_encoding=encodings, write_statistics=False, data_page_size=1 << 30,
-        )  # fmt: skip
+    out = pa.BufferOutputStream()
+    pq.write_table(
+        table, out, compression="zstd", compression_level=SMALLEST, use_dictionary=texts, column_encoding=encodings,
+        write_statistics=False, data_page_size=1 << 30, write_page_checksum=True,
+    )  # fmt: skip
+    content: bytes = out.getvalue().to_pybytes()
+    place = content.rindex(UNSEALED.encode())
+    return content[:place] + _sealed(content).encode() + content[place + len(UNSEALED) :]
+
+
+def check_content(path: Path, content: bytes) -> None:
+    """Check the checksum of a whole packed study, or of a file beside it, which SHA256SUMS holds for older ones.
+
+    Raises UsageError if it differs; warns if there is none.
+    """
+    found = list(_SEALED.finditer(content))
+    if found:
+        start, end = found[-1].span()
+        unsealed = content[:start] + UNSEALED.encode() + content[end:]
+        if found[-1][0].decode() != _sealed(unsealed):
+            raise UsageError(f"{path}: wrong checksum: not what was packed")
+        return
+    sums = path.with_name(SUMS)
+    lines = sums.read_text(encoding="utf-8").splitlines() if sums.exists() else []
+    listed = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+    if path.name not in listed:
+        warn(f"{path}: has no checksum, as earlier versions wrote it")
+    elif listed[path.name] != hashlib.sha256(content).hexdigest():
+        raise UsageError(f"{path}: wrong checksum: not what {sums} lists")
+
+
+def _sealed(content: bytes) -> str:
+    return f"{UNSEALED[:-8]}{zlib.crc32(content):08x}"

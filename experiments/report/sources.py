@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from common.errors import RunError
 from common.process.untrusted import MAX_SETTINGS, check_links, read_text
 from experiments.report.packed import EPISODES, SWEEP, PackedStudy, run_names
+from learner.records.reading import check_records, column, read_csv, read_jsonl
 
 
 class Source(Protocol):
@@ -29,7 +28,7 @@ class Source(Protocol):
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
         """Some columns of a run's episodes or metrics; an optional one has None if a line lacks it.
 
-        Raises KeyError or ValueError if a wanted one is missing.
+        Raises RunError, KeyError or ValueError if a wanted one is missing or can't be read.
         """
         ...
 
@@ -39,6 +38,7 @@ class FolderSource:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._checked: set[str] = set()  # runs whose records are those that they seal
         self.names = run_names(folder)
         check_links(folder)
         for run in self.names:
@@ -47,17 +47,23 @@ class FolderSource:
 
     def text(self, run: str, file: str) -> str | None:
         """See `Source`."""
+        path = self._folder / run / file
         try:
-            return read_text(self._folder / run / file)
+            return read_text(path)
         except FileNotFoundError:
             return None
+        except (OSError, UnicodeDecodeError) as error:
+            raise RunError(f"{path}: can't be read: {getattr(error, 'strerror', None) or error}") from error
 
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
         """See `Source`."""
-        lines = io.StringIO(read_text(self._folder / run / file))
-        rows = list(csv.DictReader(lines) if file == EPISODES else map(json.loads, lines))
-        found = {name: [row[name] for row in rows] for name in wanted}
-        return found | {name: [row.get(name) for row in rows] for name in optional}
+        path = self._folder / run / file
+        if run not in self._checked:
+            check_records(self._folder / run)
+            self._checked.add(run)
+        rows, first = (read_csv(path), 2) if file == EPISODES else (read_jsonl(path), 1)
+        found = {name: column(rows, name, path, first) for name in wanted}
+        return found | {name: column(rows, name, path, first, optional=True) for name in optional}
 
 
 def open_source(path: Path) -> Source:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,10 +13,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
+from common.process.summaries import parse_summary
 from common.returns import METRICS_EVERY
 from common.settings.config import OF_MACHINE, RunConfig, value_of
 from common.settings.methods import METHODS
-from common.settings.tables import identity, load_tables, resolve
+from common.settings.tables import identity, load_tables, parse_run_config, resolve
 from experiments.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
 from experiments.report.sources import Source, open_source
 from experiments.sweep.grid import parse_grid
@@ -47,7 +46,8 @@ class Run:
     of LATER, of "q_share", mean |Q| as a share of its bound, and of "churn_per_100", the share of greedy actions that
     100 updates of a network change; nan where a row lacks it.
     above_bound: number of rows of metrics.jsonl whose mean |Q| exceeds its bound, `q_bound`. evaluated: float64
-    [2, evaluations], environment steps and mean returns of greedy play.
+    [2, evaluations], environment steps and mean returns of greedy play. fallbacks: where it went on from an older
+    checkpoint than its newest, which was not whole.
     """
 
     name: str
@@ -59,6 +59,7 @@ class Run:
     q2_means: Floats
     metrics: Mapping[str, Floats]
     above_bound: int = 0
+    fallbacks: Sequence[str] = ()
     evaluated: Floats = field(default_factory=lambda: np.empty((2, 0)))
 
 
@@ -101,8 +102,9 @@ class Study:
 
     @property
     def warnings(self) -> list[str]:
-        """A line for each finished run whose mean |Q| exceeded its bound at times."""
-        return [
+        """A line for each finished run whose mean |Q| exceeded its bound at times, and for each fallback of a run."""
+        fallen = [f"{run.name}: went on from an older checkpoint: {why}" for run in self.runs for why in run.fallbacks]
+        return fallen + [
             f"{run.name}: mean |Q| is above the largest that the rewards seen allow in {run.above_bound} of "
             f"{len(run.metrics['env_step'])} rows of {METRICS}"
             for run in self.runs
@@ -213,7 +215,7 @@ def _state(source: Source, run: str) -> str:
     if summary is None:
         begun = any(source.text(run, file) is not None for file in (CONFIG, EPISODES))
         return "begun, not finished" if begun else "not begun"
-    outcome = str(json.loads(summary)["exit"])
+    outcome = str(parse_summary(summary, f"{run}/{SUMMARY}").get("exit", ""))
     if outcome.startswith("diverged"):
         return outcome
     return "" if outcome.startswith("complete") else f"begun, not finished: {outcome}"
@@ -233,15 +235,16 @@ def _read(source: Source, run: str, path: Path) -> Run:
     with np.errstate(divide="ignore", invalid="ignore"):  # without rewards the bound is 0
         metrics[Q_SHARE] = size / bound
     metrics[CHURN] = metrics["policy_churn"] * 100 / (METRICS_EVERY / (2 if config.two_networks else 1))
-    return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()), evaluated)
+    fallbacks = parse_summary(source.text(run, SUMMARY) or "{}", path / run / SUMMARY).get("fallbacks", [])
+    return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()), fallbacks, evaluated)
 
 
 def read_config(source: Source, run: str, path: Path) -> RunConfig:
     """The config of a run of the study at `path`; raises RunError."""
     try:
-        return resolve(tomllib.loads(source.text(run, CONFIG) or ""))
-    except (OSError, ValueError, UsageError, RecursionError) as error:
-        raise RunError(f"{path / run}: a run whose config can't be read: {error!r}") from error
+        return parse_run_config(source.text(run, CONFIG) or "", path / run / CONFIG)
+    except UsageError as error:
+        raise RunError(str(error)) from error
 
 
 def _axes(configs: list[RunConfig]) -> tuple[str, ...]:

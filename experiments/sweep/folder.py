@@ -5,19 +5,19 @@ from __future__ import annotations
 import csv
 import io
 import os
-import secrets
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from common.errors import UsageError
+from common.errors import RunError, UsageError
+from common.process.checkpoints import checked_summary
+from common.process.files import make_folder, write_atomic
 from common.process.locks import Held, RunLock
-from common.process.summaries import read_summary
+from common.process.run_ids import has_run_id, read_run_id
 from common.process.untrusted import check_links
 from common.returns import RETURN_WINDOW
-from common.settings.tables import identity, resolve, to_toml
+from common.settings.tables import identity, read_run_config, run_config_text
 from experiments.sweep.grid import Cell, Grid
 
 TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
@@ -53,13 +53,7 @@ class CellFolder:
         """Raise UsageError if the folder holds a run of another config."""
         check_links(self.path)
         held = self.path / "config.toml"
-        text = held.read_text(encoding="utf-8") if held.exists() else ""
-        try:
-            # A kill during writing leaves an empty file.
-            same = not text or identity(resolve(tomllib.loads(text))) == identity(self.cell.config)
-        except (tomllib.TOMLDecodeError, UsageError):
-            same = False
-        if not same:
+        if held.exists() and identity(read_run_config(self.path)) != identity(self.cell.config):
             raise UsageError(f"{held}: not the config of this grid's cell; give another --dir")
 
     def ending(self) -> Ending | None:
@@ -70,34 +64,40 @@ class CellFolder:
         return Ending("diverged", outcome) if outcome.startswith("diverged") else None
 
     def outcome(self) -> str:
-        """How its run ended, from summary.json; empty if that does not exist."""
-        return str(read_summary(self.path).get("exit", ""))
+        """How its run ended, from summary.json; empty if that can't be read, or the records are not those it seals."""
+        try:
+            return str(checked_summary(self.path).get("exit", ""))
+        except RunError:
+            return ""  # resuming the run names what is wrong, or writes them again
 
     def lock(self) -> RunLock | None:
         """The locks of the cell's run; None if another process has them. A child that inherits them keeps them."""
         try:
-            return RunLock(self.path, "coop-sweep", ("learner", "replay"))
+            return RunLock(self.path, "coop-sweep", ("learner", "replay")).sign()
         except Held:
             return None
 
     def prepare(self) -> None:
         """Write the config from which the run starts or continues."""
-        (self.path / "config.toml").write_text(to_toml(self.cell.config), encoding="utf-8")
+        write_atomic(self.path / "config.toml", run_config_text(self.cell.config, self._run_id()).encode())
+
+    def _run_id(self) -> int | None:
+        return read_run_id(self.path) if has_run_id(self.path) else None
 
     def progress(self) -> Progress:
-        """Read the progress from the end of episodes.csv; zeros before the first episode's end."""
+        """Read the progress from the end of episodes.csv; zeros before the first episode's end, or if it is damaged."""
         try:
             with (self.path / "episodes.csv").open("rb") as file:
                 header = file.readline().decode()
                 file.seek(max(len(header), os.fstat(file.fileno()).st_size - TAIL))
                 # The first and the last line of the tail may be incomplete.
                 lines = file.read().decode().rpartition("\n")[0].splitlines()[-RETURN_WINDOW:]
-        except FileNotFoundError:
-            return Progress(0, 0.0)
-        rows = list(csv.DictReader(io.StringIO("\n".join([header.strip(), *lines]))))
-        if not rows:
-            return Progress(0, 0.0)
-        return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
+            rows = list(csv.DictReader(io.StringIO("\n".join([header.strip(), *lines]))))
+            if not rows:
+                return Progress(0, 0.0)
+            return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
+        except (OSError, ValueError, KeyError, TypeError, csv.Error):
+            return Progress(0, 0.0)  # only for the display: who continues or reports the run names what is damaged
 
 
 def default_folder(grid: str | Path, quick: bool) -> Path:
@@ -112,11 +112,9 @@ def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
         UsageError: it holds runs of other configs, or cannot be written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for cell in cells:
             cell.check()
-        part = folder / f"sweep.toml.{secrets.token_hex(8)}"  # several sweeps may write it at once, from any host
-        part.write_text(grid.to_toml(), encoding="utf-8")
-        part.replace(folder / "sweep.toml")
+        write_atomic(folder / "sweep.toml", grid.to_toml().encode())
     except OSError as error:
         raise UsageError(f"--dir {folder}: {error.strerror}") from error

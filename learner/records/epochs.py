@@ -1,81 +1,83 @@
-"""Epochs: consistent checkpoints of learner and replay service, in checkpoints/NUMBER/ of the run directory."""
+"""The learner's part of the checkpoints: `learner.pt`, written before the replay service's part and `DONE`."""
 
 from __future__ import annotations
 
 import io
-import json
-import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from common.process.files import measure, write_atomic
+from common.errors import CoopError, UsageError
+from common.process.checkpoints import (
+    LEARNER,
+    Manifest,
+    Whole,
+    begin,
+    checkpoint_path,
+    finish,
+    remove,
+    remove_old,
+    survey,
+)
+from common.process.files import Measured, write_atomic
+from common.process.notices import warn
 from common.process.untrusted import check_torch_file
 
-DONE = "DONE"
-LEARNER = "learner.pt"
-KEPT = 2
 
-
-def save_epoch(run_dir: Path, number: int, learner_state: dict[str, Any], snapshot: Callable[[str], None]) -> Path:
-    """Save one epoch, and delete epochs that are too old or torn.
-
-    `DONE`, with size and checksum of learner.pt, is written last: an epoch without it is torn.
+def save_epoch(
+    run_dir: Path,
+    run_id: int,
+    number: int,
+    learner_state: dict[str, Any],
+    snapshot: Callable[[str], None],
+    *,
+    records: Mapping[str, Measured],
+    fallbacks: Sequence[str] = (),
+) -> Path:
+    """Save one checkpoint, and delete those that are too old.
 
     snapshot: makes the replay service save its state under the given folder, relative to the run directory.
+    records, fallbacks: see `Manifest`.
 
     Raises:
-        OSError: the run directory cannot be written; nothing is left of this epoch.
+        OSError: the run directory cannot be written; nothing is left of this checkpoint.
     """
-    folder = f"checkpoints/{number}"
-    path = run_dir / folder
+    path = checkpoint_path(run_dir, number)
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        (path / DONE).unlink(missing_ok=True)
+        begin(path)
         content = io.BytesIO()
         torch.save(learner_state, content)
-        data = content.getvalue()
-        checksum = write_atomic(path / LEARNER, data)
-        snapshot(folder)
-        write_atomic(path / DONE, json.dumps({LEARNER: [len(data), checksum]}).encode())
+        files = {LEARNER: write_atomic(path / LEARNER, content.getvalue())}
+        snapshot(str(path.relative_to(run_dir)))
+        finish(run_dir, path, Manifest(run_id, number, files, dict(records), list(fallbacks)))
     except BaseException:
-        shutil.rmtree(path, ignore_errors=True)
+        remove(path)
         raise
-    keep = complete_epochs(run_dir)[-KEPT:]
-    for old in (run_dir / "checkpoints").iterdir():
-        if old.name not in map(str, keep):
-            shutil.rmtree(old, ignore_errors=True)
+    remove_old(run_dir, number)
     return path
 
 
-def complete_epochs(run_dir: Path) -> list[int]:
-    """Numbers of the finished epochs, in ascending order."""
-    return sorted(int(path.parent.name) for path in (run_dir / "checkpoints").glob(f"*/{DONE}"))
+def newest_epoch(run_dir: Path, *, replay: bool = False) -> Whole | None:
+    """The newest whole checkpoint of a run, with the learner's state, for readers; None if there is none.
 
+    A warning names those that were passed over. replay: the replay service's part must be whole too.
 
-def intact_epochs(run_dir: Path) -> list[int]:
-    """Numbers of the finished epochs whose learner.pt is intact, in ascending order."""
-    return [number for number in complete_epochs(run_dir) if _is_intact(run_dir / "checkpoints" / str(number))]
-
-
-def newest_epoch(run_dir: Path) -> Path | None:
-    """The newest whole epoch; None if there is none."""
-    whole = intact_epochs(run_dir)
-    return run_dir / "checkpoints" / str(whole[-1]) if whole else None
-
-
-def rewind(run_dir: Path, number: int) -> dict[str, Any] | None:
-    """Load the learner's state of epoch `number` (0: the beginning, None) and delete newer epochs."""
-    for newer in complete_epochs(run_dir):
-        if newer > number:
-            shutil.rmtree(run_dir / "checkpoints" / str(newer), ignore_errors=True)
-    return load_learner(run_dir / "checkpoints" / str(number)) if number else None
+    Raises:
+        UsageError: there are checkpoints, but none is whole.
+    """
+    found = survey(run_dir, replay=replay, load=load_learner)
+    if found.newest is None and found.problems:
+        raise UsageError(f"{run_dir}: no checkpoint is whole: {found.passed_over}")
+    if found.fallback:
+        warn(f"{run_dir}: takes checkpoint {found.whole[0].number}; passes over {found.fallback}")
+    return found.newest
 
 
 def load_learner(path: Path) -> dict[str, Any]:
-    """Read learner.pt from an epoch's folder, without executing any code in it.
+    """Read learner.pt from a checkpoint's folder, without executing any code in it.
 
     Raises:
         OSError: it cannot be read.
@@ -83,12 +85,18 @@ def load_learner(path: Path) -> dict[str, Any]:
     """
     check_torch_file(path / LEARNER)
     state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
+    if not isinstance(state, dict):
+        raise TypeError("not a learner's state")
     return state
 
 
-def _is_intact(path: Path) -> bool:
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Raise UsageError in place of what fails because a checkpoint, though whole, is not one of this run's agent."""
     try:
-        recorded = json.loads((path / DONE).read_text(encoding="utf-8"))
-        return bool(recorded == {LEARNER: list(measure(path / LEARNER))})
-    except (OSError, ValueError):
-        return False
+        yield
+    except CoopError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError) as error:
+        text = str(error).splitlines()[0] if str(error) else ""
+        raise UsageError(f"{path}: not a state of this run: {type(error).__name__}: {text}") from error

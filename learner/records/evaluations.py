@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.messaging.messages.evaluate import EvaluationRow
-from common.process.files import LineFile
+from common.process.console import say
+from common.process.files import LineFile, aside_folder
 from common.returns import exact
 
 EVALUATIONS = "evaluations.csv"
@@ -33,7 +35,11 @@ class EvaluationsFile(LineFile):
             OSError: it can't be written.
         """
         path = folder / EVALUATIONS
-        kept = [] if env_step is None else [row for row in _rows(path) if int(row[0]) <= env_step]
+        kept, bad = ([], []) if env_step is None else _rows(path, env_step)
+        if bad:
+            to = aside_folder(folder)
+            shutil.copy2(path, to / EVALUATIONS)
+            say(f"{path}: line {bad[0]} can't be read, and is left out; the file as it was is in {to}")
         super().__init__(path, go_on=False)
         self.newest = 0
         self._csv = csv.writer(self, lineterminator="\n")
@@ -59,9 +65,15 @@ def returns_by_step(text: str) -> Floats:
     return np.array(sorted(found), np.float64).reshape(-1, 2).T
 
 
-def _rows(path: Path) -> list[list[str]]:
-    """The whole lines of a file that a kill may have torn."""
+def _rows(path: Path, env_step: int) -> tuple[list[list[str]], list[int]]:
+    """The lines up to `env_step` steps of a file whose last one a kill may have torn, and the numbers of bad lines."""
     if not path.exists():
-        return []
-    whole = path.read_text(encoding="utf-8").rpartition("\n")[0]
-    return [row for row in list(csv.reader(whole.splitlines()))[1:] if len(row) == len(FIELDS)]
+        return [], []
+    kept, bad = [], []
+    lines = path.read_bytes().decode(errors="replace").rpartition("\n")[0].splitlines()
+    for number, row in enumerate(list(csv.reader(lines))[1:], 2):
+        if len(row) == len(FIELDS) and row[0].isdecimal():
+            kept += [row] if int(row[0]) <= env_step else []
+        else:
+            bad.append(number)
+    return kept, bad

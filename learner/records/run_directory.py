@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import secrets
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -13,16 +14,17 @@ from typing import Any, Self
 from common.errors import RunError
 from common.imports import describe, remember
 from common.messaging.messages.evaluate import EvaluationRow
+from common.process.checkpoints import RECORDS, Survey, go_back
 from common.process.console import say
-from common.process.files import LineFile, truncate, write_atomic
-from common.process.run_ids import draw_run_id, read_run_id
-from common.process.summaries import SUMMARY, strict_json
+from common.process.files import LineFile, Measured, make_folder, truncate, write_atomic
+from common.process.run_ids import claim, has_run_id, read_run_id
+from common.process.summaries import SUMMARY, strict_json, summary_text
 from common.returns import exact
 from common.settings.config import RunConfig
 from common.settings.overrides import leaves
-from common.settings.tables import to_tables, to_toml
+from common.settings.tables import CONFIG, run_config_text, to_tables
 from learner.records.curve import draw_learning_curve
-from learner.records.evaluations import EvaluationsFile
+from learner.records.evaluations import EVALUATIONS, EvaluationsFile
 from learner.records.mirror import WandbMirror
 from learner.records.summary import Summary
 from learner.records.tensorboard import Kept, TensorBoardWriter
@@ -41,38 +43,49 @@ class RunDirectory:
         self,
         path: Path,
         config: RunConfig,
-        sizes: dict[str, int] | None = None,
+        found: Survey | None = None,
+        number: int | None = None,
         env_step: int = 0,
         *,
         wandb: bool = False,
     ) -> None:
-        """Create a run's files; or continue them, cut back to `sizes` in bytes, after `env_step` environment steps.
+        """Create a run's files; or continue them from one of its checkpoints, which seals how long they were then.
 
-        wandb: mirror TensorBoard's scalars to Weights & Biases.
+        found, number: what the directory holds, and the whole checkpoint to continue; None if the run begins.
+        env_step: environment steps at that checkpoint. wandb: mirror TensorBoard's scalars to Weights & Biases.
 
         Raises:
             RunError: a file can't be written.
             UsageError: Weights & Biases refuses.
         """
         self.path = path
+        self.fallbacks: list[str] = []
+        self.aside = ""
+        sealed: Mapping[str, Measured] = {}
         try:
-            run_id = claim_run_directory(path, config)
+            newest = None if found is None or number is None else found.of(number)
+            run_id = claim_run_directory(path, config, None if newest is None else newest.manifest.run)
             mirror = WandbMirror(path, run_id) if wandb else None
-            for name, size in (sizes or {}).items():
+            if found is not None:
+                self.aside = go_back(found, number)
+                if newest is not None:
+                    self.fallbacks = [*newest.manifest.fallbacks, *found.fallbacks(newest.number)]
+                    sealed = newest.manifest.records
+            for name, (size, _) in sealed.items():
                 truncate(path / name, size)
             (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
-            self._episodes = LineFile(path / "episodes.csv", go_on=sizes is not None)
-            self._metrics = LineFile(path / "metrics.jsonl", go_on=sizes is not None)
-            self._evaluations = EvaluationsFile(path, None if sizes is None else env_step)
+            goes_on = number is not None
+            self._episodes, self._metrics = (LineFile(path / name, go_on=goes_on) for name in RECORDS)
+            self._evaluations = EvaluationsFile(path, env_step if goes_on else None)
             kept = None
-            if sizes is not None:
-                kept = Kept(_lines(path / "episodes.csv") - 1, _lines(path / "metrics.jsonl"), env_step)
+            if goes_on:
+                kept = Kept(_lines(path / RECORDS[0]) - 1, _lines(path / RECORDS[1]), env_step)
             self._tensorboard = TensorBoardWriter(path / "tb", mirror, kept)
             self._tensorboard.hyperparameters({".".join(place): value for place, value in leaves(to_tables(config))})
         except OSError as error:
             raise RunError(f"run directory {path}: {error.strerror or error}") from error
         self._csv = csv.writer(self._episodes, lineterminator="\n")
-        if sizes is None:
+        if not goes_on:
             self._csv.writerow(EPISODE_FIELDS)
         self._problem = ""
 
@@ -115,7 +128,7 @@ class RunDirectory:
         """Write a film of the acting network after `env_step` steps to videos/, and to TensorBoard."""
         path = self.path / "videos" / f"{env_step}.gif"
         try:
-            path.parent.mkdir(exist_ok=True)
+            make_folder(path.parent)
             write_atomic(path, gif)
         except OSError as error:
             say(f"{path}: {error.strerror or error}")
@@ -130,9 +143,12 @@ class RunDirectory:
             RunError: there is no space for lines or summary; says how the run has ended all the same.
         """
         try:
-            for file in (self._episodes, self._metrics, self._evaluations):
-                file.finish()
-            write_atomic(self.path / SUMMARY, f"{strict_json(asdict(summary), indent=2)}\n".encode())
+            files = (self._episodes, self._metrics, self._evaluations)
+            for file in files:
+                file.sync()
+            sealed = {name: file.measured for name, file in zip((*RECORDS, EVALUATIONS), files, strict=True)}
+            fields = {**asdict(summary), "fallbacks": self.fallbacks, "records": sealed}
+            write_atomic(self.path / SUMMARY, summary_text(fields).encode())
         except OSError as error:
             # The message must also say how the run ended.
             raise RunError(f"{self.path}: {error.strerror or error}; how the run ended: {summary.exit}") from error
@@ -147,9 +163,9 @@ class RunDirectory:
         except Exception as error:  # matplotlib's own settings, and the fonts and programs that they name
             say(f"{self.path}: no learning curve: {describe(error)[:200]}")
 
-    def sizes(self) -> dict[str, int]:
-        """The present sizes of the growing files, in bytes."""
-        return {name: (self.path / name).stat().st_size for name in ("episodes.csv", "metrics.jsonl")}
+    def records(self) -> dict[str, Measured]:
+        """What the growing files hold now, for a checkpoint."""
+        return {name: file.measured for name, file in zip(RECORDS, (self._episodes, self._metrics), strict=True)}
 
     def close(self) -> None:
         """Close all files."""
@@ -180,17 +196,22 @@ def _lines(path: Path) -> int:
         return sum(1 for _ in file)
 
 
-def claim_run_directory(path: Path, config: RunConfig) -> int:
+def claim_run_directory(path: Path, config: RunConfig, known: int | None = None) -> int:
     """Assign a directory to this run, or check that it is assigned; write its config and return the run's id.
+
+    known: the id, if a checkpoint there names it.
 
     Raises:
         RunError: it cannot be written.
     """
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        write_atomic(path / "config.toml", to_toml(config).encode())  # first: an id alone is a replay service's folder
+        make_folder(path)
+        drawn = secrets.randbits(63) if known is None else known
+        run_id = read_run_id(path) if has_run_id(path) else drawn
+        # First, as an id alone makes it a replay service's folder.
+        write_atomic(path / CONFIG, run_config_text(config, run_id).encode())
     except OSError as error:
         raise RunError(f"run directory {path}: {error.strerror or error}") from error
-    run_id = draw_run_id(path)
+    claim(path, run_id)
     remember(path)
     return run_id

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import threading
 from pathlib import Path
 
 from common.errors import RunError
+from common.process.checkpoints import (
+    DONE,
+    FOLDER,
+    LEARNER,
+    REPLAY,
+    Damaged,
+    check_part,
+    checkpoint_numbers,
+    checkpoint_path,
+    read_manifest,
+    remove,
+)
+from common.process.files import aside_folder, move_aside
 from replay.core import ReplayCore
-from replay.persistence.journal import Journal
-from replay.persistence.storage import Mark, TornSnapshot, is_intact, load_snapshot, read_mark, save_snapshot
-
-PART = "replay"
+from replay.persistence.journal import Journal, journal_names
+from replay.persistence.storage import Mark, load_snapshot, save_snapshot
 
 
 class ReplayEpochs:
@@ -42,13 +52,15 @@ class ReplayEpochs:
         path = part_path(self._folder, number)
         with lock:
             try:
-                mark = Mark(self._run_id, 0 if self._journal is None else self._journal.roll())
+                mark = Mark(self._run_id, number, 0 if self._journal is None else self._journal.roll())
             except OSError as error:
                 raise RunError(f"the journal can't be written: {error.strerror or error}") from error
             snapshot = core.snapshot(number, keep)
 
         def write() -> None:
             try:
+                if self._journal is not None:
+                    self._journal.sync(mark.journal)
                 save_snapshot(snapshot, lock, path, mark)
                 self._drop({number, *keep}, covered=keep)
                 self._on_disk = True
@@ -79,7 +91,19 @@ class ReplayEpochs:
 
     def intact(self) -> list[int]:
         """Numbers of the intact parts, in ascending order."""
-        return [number for number in part_numbers(self._folder) if is_intact(part_path(self._folder, number))]
+        return [number for number in part_numbers(self._folder) if not self._problem_of(number)]
+
+    def passed_over(self) -> str:
+        """What is wrong with the parts that are not intact, in one line; empty if nothing is."""
+        problems = ((number, self._problem_of(number)) for number in part_numbers(self._folder))
+        return "; ".join(f"checkpoint {number}: {problem}" for number, problem in problems if problem)
+
+    def _problem_of(self, number: int) -> str:
+        try:
+            check_part(part_path(self._folder, number), number, None)
+        except Damaged as damaged:
+            return f"{REPLAY}/: {damaged}"
+        return ""
 
     def restore(self, core: ReplayCore, number: int) -> tuple[int, str]:
         """Restore a new core from the newest intact part up to epoch `number`, if there is one.
@@ -94,23 +118,43 @@ class ReplayEpochs:
         torn = ""
         for found in reversed([n for n in part_numbers(self._folder) if n <= number]):
             try:
-                mark = load_snapshot(core, part_path(self._folder, found), self._run_id)
-            except TornSnapshot as error:
-                torn += f"passed over a torn snapshot, {error}; "
+                mark = load_snapshot(core, part_path(self._folder, found), self._run_id, found)
+            except Damaged as error:
+                torn += f"passed over {part_path(self._folder, found)}, {error}; "
                 continue
             text = f"restored epoch {found}: {core.table.inserted:,} transitions, {core.drawn:,} batches"
             return mark.journal, torn + text
         return 1, f"{torn}no epoch to restore"
 
-    def clear(self) -> None:
-        """Delete every part."""
-        for number in part_numbers(self._folder):
-            self._remove(number)
+    def go_back(self, number: int, *, anew: bool) -> str:
+        """Move aside what is younger than checkpoint `number`, and everything if the run begins anew.
+
+        A learner that shares the folder moves whole checkpoints. Returns where it is now; empty if there was nothing.
+
+        Raises OSError.
+        """
+        younger = [each for each in part_numbers(self._folder) if anew or (number and each > number)]
+        names = [f"{FOLDER}/{each}/{REPLAY}" for each in younger if not self._is_shared(each)]
+        names += journal_names(self._folder) if anew else []
+        if not names:
+            return ""
+        to = aside_folder(self._folder)
+        move_aside(self._folder, names, to)
+        for each in younger:
+            with contextlib.suppress(OSError):  # something else is there
+                checkpoint_path(self._folder, each).rmdir()
+        return f"what is younger is in {to}"
+
+    def _is_shared(self, number: int) -> bool:
+        return any((checkpoint_path(self._folder, number) / name).exists() for name in (LEARNER, DONE))
 
     def close(self) -> None:
-        """Wait for the part being written."""
+        """Wait for the part being written, and end the journal."""
         if self._writer is not None:
             self._writer.join()
+        if self._journal is not None:
+            with contextlib.suppress(OSError):  # the next process reads it like one that was killed
+                self._journal.close()
 
     def _drop(self, keep: set[int], covered: list[int]) -> None:
         """Delete the parts not in `keep`, and the journal's files that no finished epoch needs.
@@ -121,22 +165,24 @@ class ReplayEpochs:
         for number in set(part_numbers(self._folder)) - keep:
             self._remove(number)
         if self._journal is not None and covered:
-            marks = (read_mark(part_path(self._folder, number)) for number in part_numbers(self._folder))
-            self._journal.drop(min(mark.journal for mark in marks if mark is not None))
+            marks = []
+            for number in part_numbers(self._folder):
+                with contextlib.suppress(Damaged):
+                    marks.append(read_manifest(part_path(self._folder, number)).journal)
+            self._journal.drop(min(marks))
 
     def _remove(self, number: int) -> None:
         path = part_path(self._folder, number)
-        shutil.rmtree(path, ignore_errors=True)
+        remove(path)
         with contextlib.suppress(OSError):  # the folder may contain the learner's part
             path.parent.rmdir()
 
 
 def part_path(folder: Path, number: int) -> Path:
-    """Path of the replay service's part of an epoch in a folder."""
-    return folder / "checkpoints" / str(number) / PART
+    """Path of the replay service's part of a checkpoint in a folder."""
+    return checkpoint_path(folder, number) / REPLAY
 
 
 def part_numbers(folder: Path) -> list[int]:
-    """Numbers of the epochs of which a folder holds parts, in ascending order."""
-    found = (path.parent.name for path in (folder / "checkpoints").glob(f"*/{PART}"))
-    return sorted(int(name) for name in found if name.isdigit())
+    """Numbers of the checkpoints of which a folder holds parts, in ascending order."""
+    return checkpoint_numbers(folder, REPLAY)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from common.errors import RunError, UsageError
+from common.process.checkpoints import Damaged, read_manifest
 from common.process.locks import RunLock
 from common.process.run_ids import check_owner, claim, has_run_id, read_run_id
 from replay.persistence.epochs import part_numbers, part_path
 from replay.persistence.journal import journal_files, read_owner
-from replay.persistence.storage import read_mark
 
 
 class ReplayFolder:
@@ -33,12 +33,12 @@ class ReplayFolder:
         if has_run_id(self.path):
             check_owner(self.path, read_run_id(self.path), self.run_id)
         files = journal_files(self.journal)
-        owners = [(part_path(self.path, number), read_mark(part_path(self.path, number))) for number in self._numbers()]
-        owned = [(path, mark.run_id) for path, mark in owners if mark is not None]
+        parts = [part_path(self.path, number) for number in part_numbers(self.path)]
+        owned = [(path, owner) for path in parts if (owner := _owner(path)) is not None]
         owned += [(self.journal, owner) for number in files if (owner := read_owner(self.journal, number)) is not None]
         for path, owner in owned:
             check_owner(path, owner, self.run_id)
-        if not owners and not files:
+        if not parts and not files:
             return f"starts: there is no table of this run in {self.path} yet"
         if not owned and not has_run_id(self.path):
             raise RunError(f"{self.path}: holds epochs that do not name their run")
@@ -58,7 +58,13 @@ class ReplayFolder:
         except RunError:
             lock.release()
             raise
+        lock.sign()
         return lock
 
-    def _numbers(self) -> list[int]:
-        return part_numbers(self.path)
+
+def _owner(part: Path) -> int | None:
+    """The id of the run of a part; None if that can't be read."""
+    try:
+        return read_manifest(part).run
+    except Damaged:
+        return None

@@ -1,22 +1,27 @@
 """The journal: every accepted segment and every draw, appended to files in order before the request is answered.
 
-A file is a sequence of records `[u32 checksum][u32 kind][u64 number][u64 length][payload]`; the first record names the
-run and the file. Data handed to the operating system survive a kill -9 of this process, so records are written but not
-synced. Files that are no longer needed are overwritten: their pages are in memory already, which halves the time.
+A file is a sequence of records, a header and a payload each; the first one names the run and the file. The
+header has a mark to find it by, checksums of itself and of the payload, the file's and the record's numbers, and how
+many transitions had been accepted after it. So a reader finds the next record behind a damaged one, and knows how many
+transitions are lost.
+
+Data handed to the operating system survive a kill -9 of this process, so records are written but not synced; what a
+checkpoint continues from is. A header is written after its payload: what a kill leaves is no record. Files that are
+no longer needed are overwritten: their pages are in memory already, which halves the time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import itertools
 import os
+import re
 import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import msgpack
 import msgspec
@@ -25,34 +30,54 @@ from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
 from common.messaging.messages.sample import DrawRequest
+from common.process.files import make_folder, sync_file, sync_folder
 from common.process.run_ids import check_owner
 from replay.limiter import RateLimiter
 
-FORMAT = 1
+FORMAT = 2
 BEGIN, SEGMENT, DRAW, LIMITER, END = range(5)
+KINDS = ("the one that names it", "a segment", "a batch", "settings of the limiter", "the last one")
 BEGIN_BYTES = 64  # more than the record that names a file
 ROLL_AT = 1 << 28  # bytes after which the next file begins
+SEARCHED = 1 << 20  # bytes at once
 
-_HEADER = struct.Struct("<IIQQ")
+_MARK = b"\xc6coop\xf0rj"
+_FIELDS = struct.Struct("<IIIQQQ")  # of a Header
+HEADER_BYTES = len(_MARK) + 4 + _FIELDS.size
 _LANES = 1024  # 64-bit columns that a checksum adds up
 _RECORDED = DrawRequest.__struct_fields__.index("memory")  # fields of a request that say what is drawn
 _SPARE = "spare"  # a file to be overwritten
+_NAME = re.compile(r"[0-9]{8}\.log")
 
 
-class TornFile(RunError):
-    """A journal file that ends with an incomplete record; `end` is the offset after the last complete one."""
+class Header(NamedTuple):
+    """What precedes a payload: number of the file and place of the record in it; transitions accepted after it."""
 
-    def __init__(self, path: Path, end: int) -> None:
-        super().__init__(f"{path}: no complete record at byte {end}")
-        self.path = path
-        self.end = end
+    payload_checksum: int
+    kind: int
+    number: int
+    place: int
+    accepted: int
+    length: int
 
 
 class Record(NamedTuple):
-    """One entry of a journal."""
+    """One entry of a journal; accepted: how many transitions the run had accepted after it."""
 
     kind: int
     payload: bytes
+    accepted: int
+
+
+class Lost(NamedTuple):
+    """Records of a file that can't be read; `text` names them.
+
+    accepted: how many transitions the run had accepted after them, if the damaged record says so itself; otherwise
+    the next record tells.
+    """
+
+    text: str
+    accepted: int | None = None
 
 
 class Journal:
@@ -61,20 +86,23 @@ class Journal:
     Args:
         number: of the first file to write.
         keep: never delete files.
+        accepted: transitions that the run has accepted so far.
     """
 
-    def __init__(self, folder: Path, run_id: int, number: int, *, keep: bool) -> None:
+    def __init__(self, folder: Path, run_id: int, number: int, *, keep: bool, accepted: int = 0) -> None:
         """Raise OSError if the file cannot be created."""
         self._folder = folder
         self._run_id = run_id
         self._keep = keep
+        self._accepted = accepted
         self._late: list[tuple[int, bytes]] = []  # records of draws for which there was no space
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self._open(number)
+        self.sync(number)
 
-    def insert(self, payload: bytes) -> None:
+    def insert(self, payload: bytes, transitions: int) -> None:
         """Record an insert request; raises OSError, and then has recorded nothing."""
-        self._append(SEGMENT, payload)
+        self._append(SEGMENT, payload, transitions)
 
     def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
         """Record a draw. If there is no space, it is kept and written before the next record."""
@@ -94,11 +122,25 @@ class Journal:
         try:
             self._open(self._number + 1)
         except OSError:
-            self._end -= _HEADER.size
+            self._end -= HEADER_BYTES
             self._records -= 1
             raise
         os.close(before)
         return self._number
+
+    def close(self) -> None:
+        """End the journal as one that was not killed; raises OSError."""
+        self._append_late()
+        self._write(END, b"")
+        os.fsync(self._file)
+        os.close(self._file)
+
+    def sync(self, number: int) -> None:
+        """Flush what the journal held when file `number` was begun to the disk; raises OSError."""
+        for each in (number - 1, number):
+            with contextlib.suppress(FileNotFoundError):
+                sync_file(_path(self._folder, each))
+        sync_folder(self._folder)
 
     def drop(self, before: int) -> None:
         """Release the files with lower numbers, unless all are to be kept."""
@@ -113,104 +155,168 @@ class Journal:
             (self._folder / _SPARE).rename(path)
         file = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
         try:
-            end = _write(file, 0, BEGIN, number, 0, payload)
+            end = _write(file, 0, Header(_checksum(payload), BEGIN, number, 0, self._accepted, len(payload)), payload)
         except OSError:
             os.close(file)
             path.unlink()
             raise
         self._file, self._number, self._records, self._end = file, number, 1, end
 
-    def _append(self, kind: int, payload: bytes) -> None:
+    def _append(self, kind: int, payload: bytes, transitions: int = 0) -> None:
         if self._end > ROLL_AT:
             self.roll()
         self._append_late()
-        self._write(kind, payload)
+        self._write(kind, payload, transitions)
 
     def _append_late(self) -> None:
         while self._late:
             self._write(*self._late[0])
             del self._late[0]
 
-    def _write(self, kind: int, payload: bytes) -> None:
+    def _write(self, kind: int, payload: bytes, transitions: int = 0) -> None:
+        accepted = self._accepted + transitions
+        header = Header(_checksum(payload), kind, self._number, self._records, accepted, len(payload))
         try:
-            self._end = _write(self._file, self._end, kind, self._number, self._records, payload)
+            self._end = _write(self._file, self._end, header, payload)
         except OSError:
             if not (self._folder / _SPARE).exists():
                 raise
             (self._folder / _SPARE).unlink()
-            self._end = _write(self._file, self._end, kind, self._number, self._records, payload)
+            self._end = _write(self._file, self._end, header, payload)
         self._records += 1
+        self._accepted = accepted
 
 
-def _write(file: int, at: int, kind: int, number: int, place: int, payload: bytes) -> int:
-    """Write one record and return the offset after it. Raises OSError, and then leaves the file's end at `at`."""
-    header = _HEADER.pack(_checksum(kind, number, place, payload), kind, place, len(payload))
+def _write(file: int, at: int, header: Header, payload: bytes) -> int:
+    """Write one record, the header last; return the offset after it. Raises OSError, and then nothing follows `at`."""
     try:
-        written = os.pwritev(file, [header, payload], at)
-        if written < len(header) + len(payload):  # the disk is probably full: writing the rest raises
-            written += os.pwrite(file, (header + payload)[written:], at + written)
-        if written < len(header) + len(payload):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        for data, place in ((payload, at + HEADER_BYTES), (_packed(header), at)):
+            written = os.pwrite(file, data, place)
+            if written < len(data):  # the disk is probably full: writing the rest raises
+                written += os.pwrite(file, data[written:], place + written)
+            if written < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError:
         with contextlib.suppress(OSError):
             os.ftruncate(file, at)
         raise
-    return at + written
+    return at + HEADER_BYTES + len(payload)
 
 
 def journal_files(folder: Path) -> list[int]:
-    """Numbers of a journal's files, in ascending order."""
-    return sorted(int(path.stem) for path in folder.glob("*.log"))
+    """Numbers of a journal's files, in ascending order; other files there are the user's."""
+    try:
+        return sorted(int(path.stem) for path in folder.iterdir() if _NAME.fullmatch(path.name))
+    except OSError:
+        return []
 
 
-def drop_journal(folder: Path) -> None:
-    """Delete every file of a journal; raises OSError."""
-    for number in journal_files(folder):
-        _path(folder, number).unlink()
+def journal_names(folder: Path) -> list[str]:
+    """Paths of the files of the journal in `folder`/journal, relative to `folder`."""
+    return [str(_path(Path("journal"), number)) for number in journal_files(folder / "journal")]
 
 
-def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record]:
-    """Yield the records of one file, except the one that names it.
+def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record | Lost]:
+    """Yield the records of one file, those that begin and end it included, and what is lost between and behind them.
+
+    The file of a process that was killed ends behind its last whole record, which is no loss.
 
     Raises:
         UsageError: the file has another format.
-        TornFile: an incomplete record follows those yielded.
         RunError: it cannot be read, or belongs to another run.
     """
     path = _path(folder, number)
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
-            end = 0
-            for expected in itertools.count():
-                if end == size:
-                    return
-                header = file.read(_HEADER.size).ljust(_HEADER.size)
-                checksum, kind, place, length = _HEADER.unpack(header)
-                payload = file.read(length) if end + _HEADER.size + length <= size else b""
-                if (place, len(payload)) != (expected, length) or _checksum(kind, number, place, payload) != checksum:
-                    raise TornFile(path, end)
-                end = file.tell()
-                if kind == END:
-                    return
-                if kind == BEGIN:
-                    _check_begin(path, payload, run_id)
+            at = expected = 0
+            while True:
+                header = _read_header(file, at, number)
+                if header is None or header.place < expected:
+                    found = _find_header(file, at, number, expected)
+                    if found is None:
+                        if not expected or _is_damaged(file, at):
+                            yield Lost(f"{path}: record {expected} at byte {at:,} can't be read, nor what follows it")
+                        return
+                    at, header = found
+                if header.place > expected:
+                    yield Lost(f"{path}: {_places(expected, header.place)} before byte {at:,} can't be read")
+                payload = file.read(header.length) if at + HEADER_BYTES + header.length <= size else b""
+                if len(payload) == header.length and _checksum(payload) == header.payload_checksum:
+                    if header.kind == BEGIN:
+                        _check_begin(path, payload, run_id)
+                    yield Record(header.kind, payload, header.accepted)
+                    if header.kind == END:
+                        return
+                    at += HEADER_BYTES + header.length
                 else:
-                    yield Record(kind, payload)
+                    kind = KINDS[header.kind] if header.kind < len(KINDS) else "of an unknown kind"
+                    yield Lost(f"{path}: record {header.place} at byte {at:,}, {kind}, is damaged", header.accepted)
+                    at += HEADER_BYTES
+                expected = header.place + 1
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
 
 
+def _places(first: int, after: int) -> str:
+    return f"record {first}" if after == first + 1 else f"records {first} to {after - 1}"
+
+
+def _packed(header: Header) -> bytes:
+    fields = _FIELDS.pack(*header)
+    return _MARK + zlib.crc32(fields).to_bytes(4, "little") + fields
+
+
+def _unpacked(packed: bytes) -> Header | None:
+    """The header in `packed`, if its checksum is right; the mark is only to find it by."""
+    if len(packed) < HEADER_BYTES:
+        return None
+    header = Header(*_FIELDS.unpack(packed[HEADER_BYTES - _FIELDS.size :]))
+    return header if _packed(header)[len(_MARK) :] == packed[len(_MARK) :] else None
+
+
+def _read_header(file: BinaryIO, at: int, number: int) -> Header | None:
+    """The header at byte `at`, if it is one of file `number`, and not the remains of an older file."""
+    file.seek(at)
+    header = _unpacked(file.read(HEADER_BYTES))
+    return header if header is not None and header.number == number else None
+
+
+def _is_damaged(file: BinaryIO, at: int) -> bool:
+    """True if a header at byte `at` has been damaged; False for what a kill leaves, or remains of an older file."""
+    file.seek(at)
+    packed = file.read(HEADER_BYTES)
+    return packed.startswith(_MARK) and _unpacked(packed) is None
+
+
+def _find_header(file: BinaryIO, start: int, number: int, expected: int) -> tuple[int, Header] | None:
+    """Offset and header of the next record of the file from byte `start` on, whose place is at least `expected`.
+
+    The file is left behind the header.
+    """
+    while True:
+        file.seek(start)
+        piece = file.read(SEARCHED)
+        at = piece.find(_MARK)
+        while at >= 0:
+            header = _read_header(file, start + at, number)
+            if header is not None and header.place >= expected:
+                return start + at, header
+            at = piece.find(_MARK, at + 1)
+        if len(piece) < SEARCHED:
+            return None
+        start += SEARCHED - len(_MARK) + 1
+
+
 def read_owner(folder: Path, number: int) -> int | None:
-    """The id of the run to which a file belongs; None if the file's first record is incomplete."""
+    """The id of the run to which a file belongs; None if the file's first record can't be read."""
     try:
         with _path(folder, number).open("rb") as file:
-            header = file.read(_HEADER.size)
-            checksum, kind, place, length = _HEADER.unpack(header.ljust(_HEADER.size))
-            payload = file.read(min(length, BEGIN_BYTES))
+            header = _read_header(file, 0, number)
+            payload = b"" if header is None else file.read(min(header.length, BEGIN_BYTES))
     except OSError as error:
         raise RunError(f"{_path(folder, number)}: {error.strerror or error}") from error
-    if kind != BEGIN or _checksum(kind, number, place, payload) != checksum:
+    if header is None or header.kind != BEGIN or _checksum(payload) != header.payload_checksum:
         return None
     return int(msgpack.unpackb(payload)[1])
 
@@ -237,13 +343,8 @@ def _path(folder: Path, number: int) -> Path:
     return folder / f"{number:08}.log"
 
 
-def _checksum(kind: int, number: int, place: int, payload: bytes) -> int:
-    """CRC-32 over sums of the payload's 64-bit columns, in a tenth of the time of CRC-32 over the whole payload.
-
-    number, place: of the file, and of the record in it, so that remains of an older file do not pass for a record.
-    """
+def _checksum(payload: bytes) -> int:
+    """CRC-32 over sums of the payload's 64-bit columns, in a tenth of the time of CRC-32 over the whole payload."""
     whole = len(payload) // (8 * _LANES) * 8 * _LANES
     lanes = np.frombuffer(payload, np.uint64, whole // 8).reshape(-1, _LANES).sum(axis=0, dtype=np.uint64)
-    return zlib.crc32(
-        payload[whole:], zlib.crc32(lanes.tobytes(), zlib.crc32(struct.pack("<IQQ", kind, number, place)))
-    )
+    return zlib.crc32(payload[whole:], zlib.crc32(lanes.tobytes()))

@@ -1,4 +1,7 @@
-"""Replays a journal on a core: after a kill -9, and to re-execute a run."""
+"""Replays a journal on a core: after a kill -9, and to re-execute a run.
+
+What can't be read is named and counted as lost, and does not end the reading of what follows it.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,14 @@ from common.errors import RunError
 from common.messaging import wire
 from common.messaging.messages.insert import SegmentReader
 from common.messaging.messages.sample import DrawRequest
-from common.process.files import truncate
 from replay.core import ReplayCore
 from replay.persistence.journal import (
+    BEGIN,
     DRAW,
+    END,
     LIMITER,
     SEGMENT,
-    TornFile,
+    Lost,
     journal_files,
     read_draw,
     read_file,
@@ -26,48 +30,84 @@ from replay.persistence.journal import (
 from replay.table.table import PinnedBatch
 
 
-def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[int, str]:
-    """Replay the journal on a core from file `first` to its end; return the next file's number, and a description.
-
-    A file that ends with a torn record, as a kill leaves it, is cut there.
+def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[int, list[str]]:
+    """Replay the journal on a core from file `first` to its end; return the next file's number, and lines to say.
 
     Raises:
-        RunError: the journal belongs to another run, files are missing or too short, or the replay deviates from the
-            record.
+        RunError: the journal belongs to another run, or the replay deviates from an undamaged record.
     """
     before, draws = core.table.inserted, 0
-    numbers = following_files(folder, first)
-    for number in numbers:
-        try:
-            for _ in replay_file(core, folder, number, run_id):
-                draws += 1
-        except TornFile as torn:
-            if number != numbers[-1]:
-                raise
-            truncate(torn.path, torn.end)
-    taken = core.table.inserted - before
-    return first + len(numbers), f"{taken:,} transitions and {draws:,} batches from the journal"
-
-
-def replay_file(core: ReplayCore, folder: Path, number: int, run_id: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
-    """Replay one file; yields every draw, which must be read before the next one. Raises as `recover`."""
-    read = SegmentReader(core.table.spec)
-    for kind, payload in read_file(folder, number, run_id):
-        if kind == SEGMENT:
-            core.apply_insert(read(wire.decode(payload, wire.ON_DISK)))
-        elif kind == DRAW:
-            request, ids = read_draw(payload)
-            batch, _ = core.apply_draw(request)
-            if not np.array_equal(batch.columns["ids"], ids):
-                raise RunError(f"{folder}: file {number}, batch {request.sequence}: other transitions than recorded")
-            yield request, batch
-        elif kind == LIMITER:
-            core.restore_limiter(read_limiter(payload))
-
-
-def following_files(folder: Path, first: int) -> list[int]:
-    """Numbers of a journal's files from `first` on; raises RunError if one is missing."""
+    replaying = Replaying(core, folder, run_id)
     numbers = [number for number in journal_files(folder) if number >= first]
-    if numbers != list(range(first, first + len(numbers))):
-        raise RunError(f"{folder}: has files {numbers}, should have every one from {first} on")
-    return numbers
+    for _ in replaying.draws(first, numbers):
+        draws += 1
+    core.damaged += replaying.transitions_lost
+    taken = f"{core.table.inserted - before:,} transitions and {draws:,} batches from the journal"
+    if numbers and not replaying.ended:
+        taken += ", which ends as a kill leaves it"
+    told = [f"{text}; the journal is read on behind it" for text in replaying.lost]
+    if replaying.lost:
+        told.append(f"the journal lacks {replaying.transitions_lost:,} transitions that had been acknowledged")
+    return max([first, *(number + 1 for number in numbers)]), [taken, *told]
+
+
+class Replaying:
+    """Replays files of a journal on a core.
+
+    lost: what could not be read, in words. transitions_lost: acknowledged transitions among it. ended: the last file
+    read was closed properly.
+    """
+
+    def __init__(self, core: ReplayCore, folder: Path, run_id: int) -> None:
+        self.lost: list[str] = []
+        self.transitions_lost = 0
+        self.ended = True
+        self._core = core
+        self._folder = folder
+        self._run_id = run_id
+        self._accepted = core.table.inserted  # as the journal counts
+
+    def draws(self, first: int, numbers: list[int]) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
+        """Replay files `numbers`, which should follow `first` without a gap.
+
+        Yields every draw, which must be read before the next one. Raises as `recover`.
+        """
+        for expected, number in zip([first, *(each + 1 for each in numbers)], numbers, strict=False):
+            if number != expected:
+                missing = f"file {expected} is" if number == expected + 1 else f"files {expected} to {number - 1} are"
+                self.lost.append(f"{self._folder}: {missing} missing")
+            yield from self._file(number)
+
+    def _file(self, number: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
+        core, read = self._core, SegmentReader(self._core.table.spec)
+        self.ended = False
+        for entry in read_file(self._folder, number, self._run_id):
+            if isinstance(entry, Lost):
+                self.lost.append(entry.text)
+                if entry.accepted is not None:
+                    self._count(entry.accepted)
+                continue
+            kind, payload, accepted = entry
+            if kind == SEGMENT:
+                segment = read(wire.decode(payload, wire.ON_DISK))
+                self._count(accepted - segment.steps)
+                core.apply_insert(segment)
+            elif kind == BEGIN:
+                self._count(accepted)
+            elif kind == DRAW:
+                request, ids = read_draw(payload)
+                batch, _ = core.apply_draw(request)
+                if not self.lost and not np.array_equal(batch.columns["ids"], ids):
+                    text = f"{self._folder}: file {number}, batch {request.sequence}: other transitions than recorded"
+                    raise RunError(text)
+                yield request, batch
+            elif kind == LIMITER:
+                core.restore_limiter(read_limiter(payload))
+            self.ended = kind == END
+            self._accepted = accepted
+
+    def _count(self, accepted: int) -> None:
+        """Count what is lost before a record at which the run had accepted so many transitions."""
+        if self.lost:
+            self.transitions_lost += max(0, accepted - self._accepted)
+        self._accepted = accepted
