@@ -39,7 +39,7 @@ def permit(modules: Iterable[str]) -> None:
 
 def remember(run_dir: Path) -> None:
     """Note for later that this user's run in `run_dir` was trained with the modules that this process has imported."""
-    with contextlib.suppress(OSError):  # only asks the user again
+    with contextlib.suppress(OSError, RuntimeError):  # then the user is only asked again
         known, path = _known(), _memory()
         if lines := [line for line in map(partial(_line, _run_id(run_dir)), _files.values()) if line not in known]:
             path.parent.mkdir(parents=True, exist_ok=True)

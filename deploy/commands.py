@@ -6,10 +6,9 @@ import importlib
 
 from common.places import remember_working_directory
 from common.process.importing import importing
-from common.process.lifecycle import end_on_signals
+from common.process.lifecycle import despite_threads, end_on_signals
 from common.process.limits import limit_threads
 from common.process.output import take_standard_files
-from common.process.threads import despite_threads
 
 
 def actor() -> None:

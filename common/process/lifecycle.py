@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import signal
@@ -9,17 +10,19 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from common.errors import CoopError, PeerLost
 from common.process.files import NO_SPACE
 from common.process.limits import memory_limit
+from common.process.notices import warn
 from common.process.output import complain, flush_at_end, on_output_gone
 
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
 LOOK_EVERY = 0.5  # seconds after which a wait notices a signal that came just before it began
+LEFT = 2.0  # seconds for users' threads to end by themselves
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -206,3 +209,37 @@ def _where(error: BaseException) -> str:
     """Where an exception was raised, in words."""
     frames = traceback.extract_tb(error.__traceback__)
     return f"in {frames[-1].name}, line {frames[-1].lineno} of {frames[-1].filename}" if frames else "somewhere"
+
+
+@contextmanager
+def despite_threads() -> Iterator[None]:
+    """Run a command's body within it, and end the process even if a thread of users' code, not a daemon, does not."""
+    status: object = 0
+    try:
+        yield
+    except SystemExit as end:
+        status = end.code
+        if not _left():
+            raise
+    ends = time.monotonic() + LEFT
+    for thread in _left():
+        thread.join(max(0.0, ends - time.monotonic()))
+    if not (left := _left()):
+        sys.exit(status)  # type: ignore[arg-type] # of the SystemExit
+    warn(f"the thread {left[0].name!r} has not ended; this process ends without it")
+    atexit._run_exitfuncs()  # as the interpreter would
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status if isinstance(status, int) else int(status is not None))
+
+
+def _left() -> list[threading.Thread]:
+    """The threads that the interpreter would wait for, without the idle ones of executors, which it ends."""
+    return [
+        thread
+        for thread in threading.enumerate()
+        if not thread.daemon
+        and thread is not threading.main_thread()
+        and getattr(getattr(thread, "_target", None), "__module__", "") != "concurrent.futures.thread"
+    ]
