@@ -93,7 +93,7 @@ class Chance:
             return torch.tensor(np.asarray(values), dtype=dtype, device=device)
 
         self._settings = settings
-        self._keys = keys_of(runs, device)
+        self.keys = keys_of(runs, device)
         self._lanes = torch.arange(_BATCH + settings.batch_size, device=device)
         self._base = torch.arange(len(runs.seeds), device=device) * (settings.capacity + 1)
         self._epsilons = there(settings.epsilons)
@@ -104,14 +104,14 @@ class Chance:
 
     def first_states(self) -> Tensor:
         """The states with which the runs begin: float64 [K, 4]."""
-        words = bits(self._keys, self._lanes[_RESET:_NORMAL] + (1 << 31))
+        words = bits(self.keys, self._lanes[_RESET:_NORMAL] + (1 << 31))
         return words.double() * (2.0**-32 * 0.1) - 0.05
 
     def draws(self, first: int, count: int) -> Draws:
         """The draws of `count` steps, of which `first` steps are done before; only `first` comes from the host."""
         settings = self._settings
-        step = torch.arange(count, device=self._keys.device) + first
-        words = bits(self._keys, (step * LANES)[:, None, None] + self._lanes)
+        step = torch.arange(count, device=self.keys.device) + first
+        words = bits(self.keys, (step * LANES)[:, None, None] + self._lanes)
         share = words[..., :_NORMAL].double() * 2.0**-32
         random = share[..., _EXPLORES] < self._epsilons[step][:, None]
         # Transition i gets row j of 0..i (reservoir), or i modulo the capacity; the last row holds what is not kept.
@@ -139,5 +139,5 @@ class Chance:
 
     def gaussian(self, update: Tensor, size: int) -> Tensor:
         """Numbers of N(0, 1) for an update, an int64 scalar on the device: float32 [K, size]."""
-        keys = mixed(mixed(update ^ self._keys[2]) ^ self._keys[0])
+        keys = mixed(mixed(update ^ self.keys[2]) ^ self.keys[0])
         return normal(mixed(torch.arange(size, device=keys.device) ^ keys[:, None]))

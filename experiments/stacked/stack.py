@@ -64,7 +64,6 @@ class Stack:
         self.ended = torch.zeros(settings.total_steps, count, dtype=torch.int16, device=self.device)
         self.chance = Chance(settings, runs, self.device)
         self.state = self.chance.first_states()
-        self.obs = self.state.float()
         self.length = torch.zeros(count, dtype=torch.int16, device=self.device)
         if settings.feedback == "random":
             fixed = [networks.fixed_feedback(self.shape, seed) for seed in runs.seeds.tolist()]
@@ -109,7 +108,8 @@ class Stack:
     def act(self, draws: Draws, number: int, role: int) -> None:
         """Step `number` of a block up to its transition's place in the table."""
         settings = self.settings
-        values = networks.forward(self.shape, self.theta[role], self.obs[:, None]).values[:, 0]
+        obs = self.state.float()
+        values = networks.forward(self.shape, self.theta[role], obs[:, None]).values[:, 0]
         drawn = draws.action[number]
         action = torch.where(drawn < 0, (values[:, 1] > values[:, 0]).long(), drawn)
         moved, fell = move(self.state, action)
@@ -117,12 +117,11 @@ class Stack:
         self.length += 1
         over = fell | (self.length >= settings.time_limit)
         terminal = over if settings.time_limit_terminal else fell
-        row = torch.cat((self.obs, next_obs, action[:, None], terminal[:, None]), 1)
+        row = torch.cat((obs, next_obs, action[:, None], terminal[:, None]), 1)
         self.table.index_copy_(0, draws.row[number], row)
         self.ended.index_copy_(0, draws.step[number : number + 1], (self.length * over)[None])
         self.length *= ~over
         torch.where(over[:, None], draws.reset[number], moved, out=self.state)
-        self.obs.copy_(self.state)
 
     def update(self, draws: Draws, number: int, role: int) -> None:
         """Train network `role` towards the other one's targets, with the batch of step `number` of a block."""
