@@ -101,29 +101,30 @@ class Reference:
         index = np.arange(2 * size, dtype=np.int32)[:, None]
         zeros = np.zeros(size, np.int64)
         self.agent._draw_s = lambda: float(self.draws.s[step, 0])  # type: ignore[method-assign]
-        self.agent.update(
-            Batch(
-                np.concatenate((rows[:, :4], rows[:, 4:8])),
-                index[:size],
-                index[size:],
-                rows[:, 8].astype(np.int32),
-                np.ones(size, np.float32),
-                rows[:, 9] > 0,
-                np.ones(size, np.float32),
-                zeros,
-                zeros,
-                zeros,
-                zeros,
-            )  # fmt: skip
+        frames = np.concatenate((rows[:, :4], rows[:, 4:8]))
+        actions, terminated, ones = rows[:, 8].astype(np.int32), rows[:, 9] > 0, np.ones(size, np.float32)
+        columns = (
+            index[:size],
+            index[size:],
+            actions,
+            ones,
+            terminated,
+            ones,
+            zeros,
+            zeros,
+            zeros,
+            zeros.astype(np.int32),
         )
+        self.agent.update(Batch(frames, *columns))
 
 
-CASES = [
-    *[(method, "transform", optimizer, {}) for method in ("dqn", "edql", "g-coop", "coop") for optimizer in ("sgd", "rmsprop", "adam")],
+METHODS, OPTIMIZERS = ("dqn", "edql", "g-coop", "coop"), ("sgd", "rmsprop", "adam")
+CASES: list[tuple[str, str, str, dict[str, object]]] = [
+    *[(method, "transform", optimizer, {}) for method in METHODS for optimizer in OPTIMIZERS],
     *[("edql", "random", optimizer, {}) for optimizer in ("sgd", "rmsprop")],
     ("coop", "transform", "adam", {"loss": "huber", "double": False}),
     ("dqn", "transform", "adam", {"loss": "mse", "reward_bound": 1.0, "gamma": 0.5, "target_update_every": 5}),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("method", "feedback", "optimizer", "learner"), CASES)

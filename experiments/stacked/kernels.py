@@ -6,13 +6,23 @@ GPU, and on a CPU in Triton's interpreter (TRITON_INTERPRET=1), in which the tes
 
 # Triton's functions take pointers and constants in capitals, and have no types that mypy knows.
 # mypy: ignore-errors
-# ruff: noqa: ANN001, ANN201, ANN202, N803, D103
+# ruff: noqa: ANN001, ANN202, N803, PLR0915
 
 import torch
 import triton
 import triton.language as tl
 
-from experiments.stacked.cartpole import FORCE, GRAVITY, HALF_LENGTH, MAX_ANGLE, MAX_X, POLE_MASS, TAU, TOTAL_MASS, Draws
+from experiments.stacked.cartpole import (
+    FORCE,
+    GRAVITY,
+    HALF_LENGTH,
+    MAX_ANGLE,
+    MAX_X,
+    POLE_MASS,
+    TAU,
+    TOTAL_MASS,
+    Draws,
+)
 from experiments.stacked.settings import StackSettings
 
 CODES = {"none": 0, "transform": 1, "random": 2, "noise": 3, "matched": 4}
@@ -78,9 +88,9 @@ def _play_and_propagate(
     d_step, d_action, d_reset, d_row, d_batch, d_s, fixed, hs, sigmas, deltas, xs, es,
     number, runs, limit, bound, hidden, size,
     W: tl.constexpr, BATCH: tl.constexpr, FEEDBACK: tl.constexpr,
-    LOSS: tl.constexpr, DOUBLE: tl.constexpr, GAMMA: tl.constexpr, LIMIT_TERMINAL: tl.constexpr, PRECISION: tl.constexpr,
-    GRAVITY: tl.constexpr, POLE: tl.constexpr, TOTAL: tl.constexpr, HALF: tl.constexpr, FORCE: tl.constexpr,
-    TAU: tl.constexpr, MAX_X: tl.constexpr, MAX_ANGLE: tl.constexpr,
+    LOSS: tl.constexpr, DOUBLE: tl.constexpr, GAMMA: tl.constexpr, LIMIT_TERMINAL: tl.constexpr,
+    PRECISION: tl.constexpr, GRAVITY: tl.constexpr, POLE: tl.constexpr, TOTAL: tl.constexpr, HALF: tl.constexpr,
+    FORCE: tl.constexpr, TAU: tl.constexpr, MAX_X: tl.constexpr, MAX_ANGLE: tl.constexpr,
 ):  # fmt: skip
     """One run's step up to the signals of its layers: sigmas, and es of the last one.
 
@@ -496,8 +506,8 @@ class Kernels:
         blocks = (settings.hidden - 1) * (settings.width // self._rows) + 1
         if code >= 3:
             _lengths[(self._runs, blocks)](
-                self._h, self._sigma, self._delta, self._x, self._e, draws.s, self._sums, number, self._runs, settings.hidden,
-                ROWS=self._rows, num_warps=4, num_stages=1, **self._shape,
+                self._h, self._sigma, self._delta, self._x, self._e, draws.s, self._sums,
+                number, self._runs, settings.hidden, ROWS=self._rows, num_warps=4, num_stages=1, **self._shape,
             )  # fmt: skip
         for optimizer, part in stack.segments:
             _learn[(part.stop - part.start, blocks)](

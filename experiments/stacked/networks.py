@@ -8,6 +8,7 @@ difference, as `learner.edl.transforms` has it.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -39,10 +40,11 @@ class Shape:
         sizes = [INPUTS, *[width] * hidden, ACTIONS]
         self.layers: list[Layer] = []
         start = 0
-        for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+        for inputs, outputs in pairwise(sizes):
             stop = start + outputs * (inputs + 1)
             self.layers.append(Layer(start, outputs, inputs, stop))
             start = stop
+        self._counts: dict[torch.device, Tensor] = {}
         self.parameters = start
         self.size = -(-start // 32) * 32
 
@@ -50,18 +52,22 @@ class Shape:
         """Weight [K, outputs, inputs] and bias [K, outputs] of each layer, as views."""
         return [
             (
-                theta[:, at.start : at.stop - at.outputs].unflatten(1, (at.outputs, at.inputs)),
+                theta[:, at.start : at.stop - at.outputs].view(-1, at.outputs, at.inputs),
                 theta[:, at.stop - at.outputs : at.stop],
             )
             for at in self.layers
         ]
 
+    def counts(self, device: torch.device) -> Tensor:
+        """Parameters of each layer: int64 [layers]."""
+        if device not in self._counts:
+            self._counts[device] = torch.tensor([at.stop - at.start for at in self.layers], device=device)
+        return self._counts[device]
+
     def by_layer(self, values: Tensor) -> Tensor:
-        """A value for each layer, [K, layers], as one for each parameter: [K, size]."""
-        counts = [at.stop - at.start for at in self.layers]
-        counts[-1] += self.size - self.parameters
-        repeats = torch.tensor(counts, device=values.device)
-        return values.repeat_interleave(repeats, 1, output_size=self.size)
+        """A value for each layer, [K, layers], as one for each parameter: [K, size]; 0 behind the parameters."""
+        wide = values.repeat_interleave(self.counts(values.device), 1, output_size=self.parameters)
+        return torch.nn.functional.pad(wide, (0, self.size - self.parameters))
 
     def sums(self, values: Tensor) -> Tensor:
         """The sum of each layer's part of [K, size]: [K, layers]."""
@@ -183,7 +189,7 @@ def transforms(shape: Shape, theta: Tensor, tape: Tape) -> list[Tensor]:
         t = t * mask
         found.insert(0, t)
         if number:
-            t = torch.bmm(t.flatten(1, 2), views[number][0]).unflatten(1, t.shape[1:3])
+            t = torch.bmm(t.flatten(1, 2), views[number][0]).view(*t.shape[:3], -1)
     return found
 
 
@@ -262,7 +268,8 @@ def polar_of_gradient(delta: Tensor, h: Tensor, noise: Tensor) -> Tensor:
     rows, m, n = delta.shape[1], delta.shape[2], h.shape[2]
     if rows >= min(m, n):
         u, _, vh = torch.linalg.svd(torch.bmm(delta.mT, h).double(), full_matrices=False)
-        return (u @ vh).float()
+        factor: Tensor = u @ vh
+        return factor.float()
     q, upper = torch.linalg.qr(delta.mT.double(), mode="complete")
     p, lower = torch.linalg.qr(h.mT.double(), mode="complete")
     u, values, vh = torch.linalg.svd(upper[:, :rows] @ lower[:, :rows].mT)
@@ -273,7 +280,8 @@ def polar_of_gradient(delta: Tensor, h: Tensor, noise: Tensor) -> Tensor:
     sign = torch.where(place[:short] < rank, 1.0, noise[:, long : long + short].sign())
     paired = torch.zeros(len(delta), short, long, dtype=torch.float64, device=delta.device)
     paired.scatter_(2, order[..., None], sign.double()[..., None])
-    factor = paired if m <= n else paired.mT.contiguous()
-    factor[:, :rows] = u @ factor[:, :rows]
-    factor[:, :, :rows] = factor[:, :, :rows] @ vh
-    return (q @ factor @ p.mT).float()
+    core = paired if m <= n else paired.mT.contiguous()
+    core[:, :rows] = u @ core[:, :rows]
+    core[:, :, :rows] = core[:, :, :rows] @ vh
+    whole: Tensor = q @ core @ p.mT
+    return whole.float()

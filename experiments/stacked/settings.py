@@ -174,7 +174,8 @@ def from_config(config: RunConfig) -> tuple[StackSettings, Runs]:
     """
     learner, edl, replay, actor, network = config.learner, config.edl, config.replay, config.actor, config.network
     fixed = (
-        ("env.id", config.env.id, "CartPole-v0"), ("network.kind", network.kind, "mlp"), ("replay.ratio", replay.ratio, 1.0),
+        ("env.id", config.env.id, "CartPole-v0"), ("network.kind", network.kind, "mlp"),
+        ("replay.ratio", replay.ratio, 1.0),
         ("network.dtype", network.dtype, "float32"), ("replay.sampling", replay.sampling, "uniform"),
         ("replay.replacement", replay.replacement, True), ("replay.n_step", replay.n_step, 1),
         ("learner.momentum", learner.momentum, 0.0), ("learner.weight_decay", learner.weight_decay, ()),

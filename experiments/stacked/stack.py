@@ -4,13 +4,15 @@
     stack.advance(settings.total_steps)
     stack.episodes()
 
-A step is the same few tensor operations for every run, and reads nothing back; on a GPU a block of steps is a CUDA graph.
+A step is the same few operations for every run, and reads nothing back. On a GPU a block of steps is a CUDA graph, of
+Triton's kernels (`experiments.stacked.kernels`) where they fit and of PyTorch's operations otherwise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,9 +23,6 @@ from experiments.stacked import networks
 from experiments.stacked.cartpole import Chance, Draws, move
 from experiments.stacked.networks import Shape, Tape
 from experiments.stacked.settings import Runs, StackSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 COLUMNS = 10  # of the table: obs, next_obs, action, terminated
 BLOCK = 32  # steps, at most, of a captured block
@@ -45,7 +44,16 @@ class Stack:
         table: float32 [K (capacity + 1), 10], the runs' transitions end to end; a table's last row holds none.
     """
 
-    def __init__(self, settings: StackSettings, runs: Runs, device: str = "cpu") -> None:
+    def __init__(
+        self,
+        settings: StackSettings,
+        runs: Runs,
+        device: str = "cpu",
+        *,
+        kernels: bool = True,
+        precision: str = "tf32x3",
+    ) -> None:
+        """kernels: use Triton's on a GPU. precision: of their products, "tf32x3", "ieee" or "tf32"."""
         self.settings, self.runs, self.device = settings, runs, torch.device(device)
         self.shape = Shape(settings.hidden, settings.width)
         self.step = self.updates = 0
@@ -73,6 +81,24 @@ class Stack:
         for name, many in runs.optimizers:
             self.segments.append((name, slice(start, start + many)))
             start += many
+        self._every = max(n for n in range(1, BLOCK + 1) if settings.swap_every % n == 0)
+        self._draws: Draws | None = None  # of a captured block
+        self._replays: dict[int, Callable[[], None]] = {}
+        self._kernel_step, self.path = self._choose(kernels, precision)
+
+    def _choose(self, kernels: bool, precision: str) -> tuple[Callable[[Draws, int, int], None] | None, str]:
+        """A step by Triton's kernels, or None, and what a block of steps is made of, in words."""
+        if self.device.type != "cuda":
+            return None, "PyTorch's operations"
+        if not kernels:
+            return None, "CUDA graphs of PyTorch's operations"
+        try:
+            from experiments.stacked import kernels as ours  # noqa: PLC0415 (Triton is there on a GPU only)
+        except ImportError as error:
+            return None, f"CUDA graphs of PyTorch's operations: {error}"
+        if (reason := ours.why_not(self.settings)) is not None:
+            return None, f"CUDA graphs of PyTorch's operations: {reason}"
+        return ours.Kernels(self, precision).step, f"CUDA graphs of Triton's kernels, {precision}"
 
     def advance(self, steps: int) -> None:
         """Play `steps` more steps of every run."""
@@ -89,8 +115,12 @@ class Stack:
             if learning
             else settings.learning_starts - self.step
         )
-        count = min(most, before, BLOCK)
-        self.play(self.chance.draws(self.step, count), learning, settings.role(self.updates))
+        count = min(most, before, self._every)
+        draws, role = self.chance.draws(self.step, count), settings.role(self.updates)
+        if learning and count == self._every and self._captures:
+            self._replay(draws, role)
+        else:
+            self.play(draws, learning, role)
         self.step += count
         if learning:
             self.updates += count
@@ -98,9 +128,37 @@ class Stack:
                 self.theta[1].copy_(self.theta[0])
         return count
 
+    @property
+    def _captures(self) -> bool:
+        """Whether blocks become graphs; the decompositions of a weight gradient can't."""
+        return self.device.type == "cuda" and self.settings.feedback != "weight-gradient"
+
+    def _replay(self, draws: Draws, role: int) -> None:
+        """Play a block of `_every` steps as a graph; the first block of a role is played without one, and warms up."""
+        if self._draws is None:
+            self._draws = Draws(*(each.clone() for each in draws))
+        for kept, new in zip(self._draws, draws, strict=True):
+            kept.copy_(new)
+        if role in self._replays:
+            self._replays[role]()
+            return
+        stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            self.play(self._draws, True, role)
+        torch.cuda.current_stream().wait_stream(stream)
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self.play(self._draws, True, role)
+        self._replays[role] = graph.replay
+
     def play(self, draws: Draws, learning: bool, role: int) -> None:
         """Play the steps of a block; network `role` acts, and is trained if `learning`."""
         for number in range(len(draws.step)):
+            if learning and self._kernel_step is not None:
+                self._kernel_step(draws, number, role)
+                continue
             self.act(draws, number, role)
             if learning:
                 self.update(draws, number, role)
@@ -173,11 +231,9 @@ class Stack:
         if kind == "matched":
             ratio = (shape.sums(other.square()) / shape.sums(self.gradient.square()).clamp_min(_TINY)).sqrt()
             return shape.by_layer(ratio)
-        sizes = torch.tensor([at.stop - at.start for at in shape.layers], device=self.device)
-        length = (shape.sums((other - self.gradient).square()) / sizes).sqrt()
+        length = (shape.sums((other - self.gradient).square()) / shape.counts(self.device)).sqrt()
         noise = self.chance.gaussian(draws.update[number], shape.size)
         self.gradient.add_(shape.by_layer(length) * noise)
-        self.gradient[:, shape.parameters :].zero_()
         return None
 
     def episodes(self) -> list[Episodes]:
