@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-from common.settings.config import ActorSettings, EdlSettings, LearnerSettings
+if TYPE_CHECKING:  # `experiments.stacked` runs where the settings' checks are not installed
+    from common.settings.config import ActorSettings, EdlSettings, LearnerSettings
 
 
 def epsilon(settings: ActorSettings, env_step: int) -> float:

@@ -1,0 +1,351 @@
+"""The dissection of error-driven learning: which part of it does what, by optimizer and depth, on CartPole.
+
+    python -m experiments.stacked.dissect --out runs/dissect --device cuda --minutes 6
+
+Conditions x optimizers x depths, each cell with the learning rate that the tuning chose for it. It goes on where it
+stopped: every stack of runs is a file in --out. The rules are those of results/dissection/plan.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from common.returns import running_mean
+from experiments.stacked.diagnostics import NAMES, measure
+from experiments.stacked.settings import OPTIMIZERS, Runs, StackSettings
+from experiments.stacked.stack import Episodes, Stack
+
+S = 0.1
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "none": {"method": "dqn", "feedback": "none"},
+    "transform": {"method": "edql", "feedback": "transform"},
+    "matched": {"method": "dqn", "feedback": "matched"},
+    "noise": {"method": "dqn", "feedback": "noise"},
+    "transform-normal": {"method": "edql", "feedback": "transform", "noise": "normal"},
+    "random": {"method": "edql", "feedback": "random"},
+    "weight-gradient": {"method": "edql", "feedback": "weight-gradient"},
+}
+RATES = {
+    "sgd": (3e-4, 1e-3, 3e-3, 1e-2, 3e-2),
+    "rmsprop": (3e-5, 1e-4, 3e-4, 1e-3, 3e-3),
+    "adam": (3e-5, 1e-4, 3e-4, 1e-3, 3e-3),
+}
+TUNING_SEEDS = 1000  # the first of them
+FINAL = 0.93  # the learning rate is multiplied by this every 1,000 steps, as in the preset cartpole-paper
+POINTS = 20  # measurements of a run
+AGREE = 1e-2  # of the way that parameters have come: a condition whose kernels are farther off runs without them
+RATE_FILE = "rates.json"
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What runs: of each depth, the seeds of its cells; and the sizes of a run."""
+
+    out: Path
+    device: str
+    depths: tuple[int, ...]
+    seeds: tuple[int, ...]
+    tuning_seeds: int
+    steps: int
+    width: int
+    conditions: tuple[str, ...]
+    precision: str
+    without_kernels: tuple[str, ...] = ()
+
+    def settings(self, condition: str, depth: int) -> StackSettings:
+        """The settings of a condition's runs: preset cartpole-paper with one optimizer for all and a constant s."""
+        return StackSettings(
+            **CONDITIONS[condition], hidden=depth, width=self.width, total_steps=self.steps,
+            learning_rate_final=FINAL ** (self.steps / 1000), learning_starts=min(128, self.steps // 10),
+        )  # fmt: skip
+
+    def tuning(self) -> Runs:
+        """Every rate of every optimizer, with each tuning seed."""
+        seeds = range(TUNING_SEEDS, TUNING_SEEDS + self.tuning_seeds)
+        cells = [(rate, seed) for name in OPTIMIZERS for rate, seed in product(RATES[name], seeds)]
+        return _runs(cells, [(name, len(RATES[name]) * len(seeds)) for name in OPTIMIZERS])
+
+    def study(self, depth: int, rates: dict[str, float]) -> Runs:
+        """Every seed of the study with each optimizer at its rate."""
+        seeds = range(self.seeds[self.depths.index(depth)])
+        cells = [(rates[name], seed) for name in OPTIMIZERS for seed in seeds]
+        return _runs(cells, [(name, len(seeds)) for name in OPTIMIZERS])
+
+
+def _runs(cells: Sequence[tuple[float, int]], optimizers: Sequence[tuple[str, int]]) -> Runs:
+    rates, seeds = (np.array(column) for column in zip(*cells, strict=True))
+    return Runs(seeds, rates, np.full(len(seeds), S), tuple(optimizers))
+
+
+def area(episodes: Episodes, steps: int) -> float:
+    """The mean over environment steps of the running mean of 100 episodes, as `coop-report` has it."""
+    if not len(episodes.returns):
+        return float(steps)
+    lengths = np.diff(episodes.env_step, prepend=0)
+    latest = np.concatenate((episodes.returns[:1], running_mean(episodes.returns)[:-1]))
+    return float(np.average(latest, weights=lengths))
+
+
+def chosen(areas: Floats, common: int | None) -> int:
+    """The index of a cell's rate, from the areas [rates, seeds] of its tuning.
+
+    The rate with the largest mean; but `common`, that of the plain gradient with this optimizer and depth, unless the
+    best one's lead over it, paired by seed, is more than one standard error.
+    """
+    best = int(areas.mean(1).argmax())
+    if common is None or best == common:
+        return best
+    lead = areas[best] - areas[common]
+    error = lead.std(ddof=1) / len(lead) ** 0.5 if len(lead) > 1 else 0.0
+    return best if lead.mean() > error else common
+
+
+def play(plan: Plan, condition: str, depth: int, runs: Runs, path: Path, deadline: float) -> dict[str, Any] | None:
+    """Play a stack of runs and write it to `path`; None if the deadline comes first."""
+    began = time.monotonic()
+    settings = plan.settings(condition, depth)
+    kernels = condition not in plan.without_kernels
+    stack = Stack(settings, runs, plan.device, kernels=kernels, precision=plan.precision)
+    every = max(1, settings.updates // POINTS // settings.swap_every) * settings.swap_every
+    points, found = [], []
+    stack.advance(settings.learning_starts)
+    while stack.step < plan.steps:
+        stack.advance(min(every, plan.steps - stack.step))
+        if stack.updates % every == 0:
+            points.append(stack.step)
+            found.append(measure(stack).cpu().numpy())
+        if time.monotonic() > deadline:
+            return None
+    episodes = stack.episodes()
+    seconds = time.monotonic() - began
+    names = np.concatenate([[name] * count for name, count in runs.optimizers])
+    areas = np.array([area(each, plan.steps) for each in episodes])
+    about = {
+        "condition": condition, "depth": depth, "steps": plan.steps, "width": plan.width, "s": S, "seconds": seconds,
+        "path": stack.path, "device": _device(plan.device), "torch": torch.__version__, "names": NAMES,
+    }  # fmt: skip
+    _write(
+        path,
+        about=np.array(json.dumps(about)),
+        optimizer=names,
+        seed=runs.seeds,
+        rate=runs.rates,
+        area=areas,
+        finite=stack.finite(),
+        counts=np.array([len(each.returns) for each in episodes]),
+        env_step=np.concatenate([each.env_step for each in episodes]).astype(np.int32),
+        returns=np.concatenate([each.returns for each in episodes]).astype(np.int16),
+        points=np.array(points),
+        measures=np.stack(found) if found else np.empty(0),
+    )
+    rate = len(runs.seeds) * plan.steps / seconds
+    means = {name: round(float(areas[names == name].mean()), 1) for name in OPTIMIZERS}
+    print(f"{path.stem}: {len(runs.seeds)} runs, {seconds:.1f} s, {rate:,.0f} steps/s, mean area {means}", flush=True)
+    return {"area": areas, "optimizer": names, "rate": runs.rates}
+
+
+def _write(path: Path, **arrays: Any) -> None:  # noqa: ANN401
+    part = path.with_suffix(".part.npz")
+    np.savez_compressed(part, **arrays)
+    part.replace(path)
+
+
+def _device(device: str) -> str:
+    return torch.cuda.get_device_name() if device == "cuda" else "cpu"
+
+
+def choose(plan: Plan, condition: str, depth: int, tuned: dict[str, Any]) -> None:
+    """Add the cells' rates to rates.json, with what they were chosen from; "none" of the depth must be there first."""
+    file = plan.out / RATE_FILE
+    known = json.loads(file.read_text()) if file.exists() else {}
+    for name in OPTIMIZERS:
+        areas = tuned["area"][tuned["optimizer"] == name].reshape(len(RATES[name]), -1)
+        common = None if condition == "none" else RATES[name].index(known[f"{depth} none {name}"]["rate"])
+        index = chosen(areas, common)
+        known[f"{depth} {condition} {name}"] = {
+            "rate": RATES[name][index],
+            "best": RATES[name][int(areas.mean(1).argmax())],
+            "areas": dict(zip(map(str, RATES[name]), areas.mean(1).round(2).tolist(), strict=True)),
+        }
+    part = file.with_suffix(".part")
+    part.write_text(json.dumps(known, indent=1))
+    part.replace(file)
+
+
+def stacks(plan: Plan) -> Iterator[tuple[str, int, str]]:
+    """(condition, depth, "tuning" or "study") of every stack in order: the tuning of a depth before its study."""
+    for depth, phase in product(plan.depths, ("tuning", "study")):
+        for condition in plan.conditions:
+            yield condition, depth, phase
+
+
+def run(plan: Plan, minutes: float) -> int:
+    """Play what is not there yet; return how many stacks are left."""
+    deadline = time.monotonic() + 60 * minutes
+    plan.out.mkdir(parents=True, exist_ok=True)
+    left = 0
+    longest: dict[tuple[int, str], float] = {}  # seconds of a stack by depth and phase
+    for condition, depth, phase in stacks(plan):
+        path = plan.out / f"{phase}-{depth}-{condition}.npz"
+        if path.exists():
+            continue
+        file = plan.out / RATE_FILE
+        known = json.loads(file.read_text()) if file.exists() else {}
+        needed = [f"{depth} {condition} {name}" for name in OPTIMIZERS] if phase == "study" else []
+        if phase == "tuning" and condition != "none":
+            needed = [f"{depth} none {name}" for name in OPTIMIZERS]
+        wait = longest.get((depth, phase), 0.0)
+        if any(key not in known for key in needed) or time.monotonic() + wait > deadline:
+            print(f"{path.stem}: left, for want of {'time' if wait else 'time or rates'}", flush=True)
+            left += 1
+            continue
+        began = time.monotonic()
+        runs = plan.tuning()
+        if phase == "study":
+            runs = plan.study(depth, {name: known[f"{depth} {condition} {name}"]["rate"] for name in OPTIMIZERS})
+        done = play(plan, condition, depth, runs, path, deadline)
+        if done is None:
+            print(f"{path.stem}: stopped, the time is up", flush=True)
+            left += 1
+            continue
+        longest[depth, phase] = max(wait, time.monotonic() - began)
+        if phase == "tuning":
+            choose(plan, condition, depth, done)
+        gc.collect()
+        if plan.device == "cuda":
+            torch.cuda.empty_cache()
+    return left
+
+
+def agreement(condition: str, width: int, precision: str, updates: int = 32) -> float:
+    """How far apart kernels and PyTorch's operations are on the GPU after some updates: the median over runs.
+
+    Of each run, the distance of the parameters as a share of the way that they have come.
+    """
+    runs = Runs(np.arange(12), np.full(12, 1e-3), np.full(12, S), (("sgd", 4), ("rmsprop", 4), ("adam", 4)))
+    settings = StackSettings(**CONDITIONS[condition], width=width, total_steps=400, swap_every=updates // 2)
+    one, other, start = (Stack(settings, runs, "cuda", kernels=k, precision=precision) for k in (True, False, False))
+    for stack in (one, other):
+        stack.advance(settings.learning_starts + updates)
+    apart, way = (one.theta[0] - other.theta[0]).norm(dim=1), (other.theta[0] - start.theta[0]).norm(dim=1)
+    return float((apart / way).median())
+
+
+def warm(plan: Plan) -> list[str]:
+    """Compile and check the kernels of all conditions at once, each in a process of its own; return those that fail.
+
+    The compiled kernels are on the disk then.
+    """
+    began = time.monotonic()
+    code = f"from experiments.stacked.dissect import *; print(agreement(sys.argv[1], {plan.width}, {plan.precision!r}))"
+    names = [name for name in plan.conditions if name not in ("weight-gradient", "transform-normal")]
+    started = {
+        name: subprocess.Popen(
+            [sys.executable, "-c", code, name],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for name in names
+    }
+    failed = []
+    for name, process in started.items():
+        out, errors = process.communicate()
+        try:
+            apart = float(out.split()[-1])
+        except (IndexError, ValueError):
+            apart = float("inf")
+            print(f"{name}: its kernels failed\n{errors[-3000:]}", flush=True)
+        if not apart < AGREE:
+            failed.append(name)
+        print(f"{name}: kernels and PyTorch's operations are {apart:.1e} apart", flush=True)
+    if "transform" in failed:
+        failed.append("transform-normal")
+    print(f"kernels compiled and checked in {time.monotonic() - began:.1f} s; failed: {failed or 'none'}", flush=True)
+    return failed
+
+
+def pack(out: Path, path: Path) -> int:
+    """Write all runs into one Parquet file, a row for each run; return their number."""
+    import pandas as pd  # noqa: PLC0415 (only here)
+
+    rows: list[dict[str, Any]] = []
+    for file in sorted(out.glob("*-*.npz")):
+        if file.name.endswith(".part.npz"):
+            continue
+        with np.load(file) as held:
+            data = {name: held[name] for name in held.files}
+        about = json.loads(str(data["about"]))
+        ends = np.cumsum(data["counts"])
+        measures = data["measures"]  # [points, names, K, layers]
+        for row, (start, end) in enumerate(zip(ends - data["counts"], ends, strict=True)):
+            found = {
+                name: measures[:, number, row].ravel() for number, name in enumerate(about["names"]) if measures.size
+            }
+            rows.append(
+                {
+                    "phase": file.name.split("-")[0], "condition": about["condition"], "depth": about["depth"],
+                    "optimizer": str(data["optimizer"][row]), "seed": int(data["seed"][row]),
+                    "rate": float(data["rate"][row]), "area": float(data["area"][row]),
+                    "finite": bool(data["finite"][row]), "device": about["device"], "path": about["path"],
+                    "env_step": data["env_step"][start:end], "returns": data["returns"][start:end],
+                    "points": data["points"].astype(np.int32), **found,
+                }
+            )  # fmt: skip
+    rates = (out / RATE_FILE).read_text() if (out / RATE_FILE).exists() else "{}"
+    frame = pd.DataFrame(rows)
+    frame.attrs["rates"] = json.loads(rates)
+    frame.to_parquet(path, compression="zstd", compression_level=19, index=False)
+    return len(rows)
+
+
+def main() -> None:
+    """Read the arguments, play, and pack what there is."""
+    parse = argparse.ArgumentParser(prog="dissect", description=(__doc__ or "").split("\n", maxsplit=1)[0])
+    parse.add_argument("--out", type=Path, default=Path("runs/dissect"))
+    parse.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
+    parse.add_argument("--minutes", type=float, default=float("inf"), help="play no longer than this")
+    parse.add_argument("--depths", type=int, nargs="+", default=[3, 8, 16], help="numbers of hidden layers")
+    parse.add_argument("--seeds", type=int, nargs="+", default=[100], help="seeds of the study, for all depths or each")
+    parse.add_argument("--tuning-seeds", type=int, default=8)
+    parse.add_argument("--steps", type=int, default=20_000)
+    parse.add_argument("--width", type=int, default=128)
+    parse.add_argument("--conditions", nargs="+", default=list(CONDITIONS), choices=list(CONDITIONS))
+    parse.add_argument("--precision", default="tf32x3", choices=("tf32x3", "ieee", "tf32"), help="of products on a GPU")
+    parse.add_argument("--threads", type=int, default=1, help="of PyTorch on the CPU")
+    parse.add_argument("--cold", action="store_true", help="compile kernels when they are needed, not all at the start")
+    args = parse.parse_args()
+    began = time.monotonic()
+    seeds = args.seeds * len(args.depths) if len(args.seeds) == 1 else args.seeds
+    if len(seeds) != len(args.depths):
+        parse.error("--seeds: give one number, or one for each of --depths")
+    torch.set_num_threads(args.threads)
+    plan = Plan(
+        args.out, args.device, tuple(args.depths), tuple(seeds), args.tuning_seeds, args.steps, args.width,
+        tuple(args.conditions), args.precision,
+    )  # fmt: skip
+    if args.device == "cuda" and not args.cold:
+        plan = replace(plan, without_kernels=tuple(warm(plan)))
+    left = run(plan, args.minutes - (time.monotonic() - began) / 60)
+    packed = args.out / "dissection.parquet"
+    print(f"{packed}: {pack(args.out, packed)} runs; {left} stacks left", flush=True)
+
+
+if __name__ == "__main__":
+    main()
