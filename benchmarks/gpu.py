@@ -1,7 +1,7 @@
 """What a GPU makes of updates, acting and a whole run, in a few minutes: `make gpu`.
 
-Each part is a process of its own with a time limit; it writes its figures as lines of JSON while it goes, so that a part
-that fails, or is cut off, costs its own figures only. On a CPU, for a rehearsal: --device cpu --quick.
+Each part is a process of its own with a time limit; it writes its figures as lines of JSON while it goes, so that a
+part that fails, or is cut off, costs its own figures only. On a CPU, for a rehearsal: --device cpu --quick.
 
     gpu.py [--out FOLDER] [--device cuda] [--seconds 235] [--parts updates profile ...] [--quick]
     gpu.py --part NAME ...      (one part, in this process)
@@ -14,6 +14,7 @@ import importlib.util
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -30,6 +31,7 @@ PARTS = {  # with its limit in seconds
     "facts": 15,
     "accuracy": 40,
     "updates": 75,
+    "pieces": 40,
     "jax": 50,
     "profile": 40,
     "tests": 90,
@@ -71,26 +73,30 @@ def main() -> None:
 
 def run_part(part: str, command: list[str], environment: dict[str, str], limit: float, figures: Path) -> None:
     """Run a part; pass its lines of JSON on, and keep the rest of what it prints in a log."""
-    started, log = time.monotonic(), figures.parent / f"{part}.log"
-    with log.open("w") as errors:
+    started, log = time.monotonic(), figures.parent / "log.txt"
+    with log.open("a+") as errors:
+        errors.write(f"=== {part}\n")
+        errors.flush()
+        before = log.stat().st_size
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment, cwd=ROOT, start_new_session=True
         )
-        cut = threading.Timer(limit, lambda: os.killpg(process.pid, 9))
+        late = threading.Event()
+        cut = threading.Timer(limit, lambda: (late.set(), os.killpg(process.pid, signal.SIGKILL)))
         cut.start()
         assert process.stdout is not None
         for line in process.stdout:
             if line.startswith("{"):
                 say(figures, {"part": part, **json.loads(line)})
             else:
-                errors.write(line)
+                print(line, end="", flush=True)
         status = process.wait()
-        late = not cut.is_alive()
         cut.cancel()
     taken = round(time.monotonic() - started, 1)
-    say(figures, {"part": part, "seconds": taken, **({"status": status, "cut off": late} if status else {})})
+    say(figures, {"part": part, "seconds": taken, **({"status": status, "cut off": late.is_set()} if status else {})})
     if status:
-        print("\n".join(f"    {line}" for line in log.read_text().strip().splitlines()[-8:]), flush=True)
+        said = log.read_bytes()[before:].decode(errors="replace").strip().splitlines()
+        print("\n".join(f"    {line}" for line in said[-8:]), flush=True)
 
 
 def say(figures: Path, row: dict[str, Any]) -> None:
@@ -196,10 +202,9 @@ def part_accuracy(options: argparse.Namespace) -> None:
                     e = (error.cpu().double() @ _host(transforms._basis).T)[:, None]
                     want = (e @ (t + u @ vh))[:, 0]
                     # The whole error, and that of the algebra on the T at hand.
-                    figure(
-                        what="error of feedback", actions=actions, precision=name, layer=4 - layer,
-                        fused=kernels.fits(transforms._ts, batch), whole=_relative(got, want), algebra=_relative(got, own),
-                    )  # fmt: skip
+                    row = {"actions": actions, "precision": name, "layer": 4 - layer}
+                    errors = {"whole": _relative(got, want), "algebra": _relative(got, own)}
+                    figure(what="error of feedback", **row, fused=kernels.fits(transforms._ts, batch), **errors)
 
 
 def _host(array: Any) -> Any:
@@ -231,7 +236,7 @@ def _rate(update: Callable[[], object], seconds: float, device: str, each: int =
         update()
     wait()
     count, began = 0, time.perf_counter()
-    while (taken := time.perf_counter() - began) < seconds or not count:
+    while time.perf_counter() - began < seconds or not count:
         for _ in range(20 if device != "cpu" else 1):
             update()
             count += each
@@ -260,8 +265,7 @@ def drawn_updates(agent: Any, spec: Any, count: int, recorded: bool) -> Callable
     if recorded and agent.device.type == "cuda":
         with torch.inference_mode():
             torch.backends.cudnn.benchmark = True
-            repeat = cuda_graph(update, agent.device)
-            return repeat
+            return cuda_graph(update, agent.device)
 
     def led() -> None:
         with torch.inference_mode():
@@ -281,7 +285,7 @@ def part_updates(options: argparse.Namespace) -> None:
 
     use_threads(1)
     device, seconds = options.device, 0.1 if options.quick else 0.8
-    sizes = (32,) if options.quick else (32, 512)
+    sizes = (4,) if options.quick else (32, 512)
     cases = [(m, b, "float32", True) for b in sizes for m in METHODS]
     cases += [(m, b, "bfloat16", True) for b in sizes for m in ("dqn", "coop")]
     cases += [(m, b, "float32", False) for b in sizes for m in ("dqn", "coop")]
@@ -342,7 +346,7 @@ def part_profile(options: argparse.Namespace) -> None:
 
     activities = [ProfilerActivity.CUDA if options.device != "cpu" else ProfilerActivity.CPU]
     lines: list[str] = []
-    for method, batch in (("dqn", 32), ("coop", 32), ("dqn", 512), ("coop", 512))[: 1 if options.quick else 4]:
+    for method, batch in (("coop", 4),) if options.quick else (("dqn", 32), ("coop", 32), ("dqn", 512), ("coop", 512)):
         with _kept({"what": "profile", "method": method, "batch": batch}):
             agent = Agent(_config(method, batch, options.device), ATARI)
             update = drawn_updates(agent, ATARI, 2, True)
@@ -360,7 +364,68 @@ def part_profile(options: argparse.Namespace) -> None:
             figure(what="profile", method=method, batch=batch, microseconds=round(total, 1), kernels=kernels)
             lines.append(f"\n{method}, batch {batch}: {total:.1f} us and {kernels:.1f} kernels an update")
             lines += [f"{micro(e) / 10:9.2f} us  {e.count / 10:5.1f} x  {e.key[:150]}" for e in ordered[:60]]
-    (options.out / "profile.txt").write_text("\n".join(lines))
+        (options.out / "profile.txt").write_text("\n".join(lines))
+
+
+def part_pieces(options: argparse.Namespace) -> None:
+    """Microseconds of the pieces of an update, each recorded 20 times in a row and repeated."""
+    import torch
+    from work import ATARI
+
+    from learner.agent import Agent
+    from learner.device_table import DeviceTable
+    from learner.edl.transforms import Transforms
+    from learner.losses import output_error, td_errors
+    from learner.recorded import cuda_graph
+
+    on_gpu, count = options.device != "cpu", 20 if options.device != "cpu" else 1
+    for batch in (4,) if options.quick else (32, 512):
+        agent = Agent(_config("coop", batch, options.device), ATARI)
+        torch.backends.cudnn.benchmark = True
+        online, target = agent._networks
+        table = DeviceTable(ATARI, 10_000, 16, 3, 0.99, agent.device)
+        table.steps.fill_(10_000)
+        table._obs.random_(0, 256)
+        s, rate = torch.tensor(0.1, device=agent.device), torch.tensor(1e-4, device=agent.device)
+        with torch.inference_mode():
+            given = table.sample(batch, s, rate)
+            inputs = online.inputs(given.frames, given.index)
+            tape = online.forward(inputs)
+            head, next_values = tape.head(batch), target.values(inputs[batch:])
+
+            def loss() -> Any:
+                bootstrap = agent.rule.bootstrap(next_values, tape.output[batch:])
+                errors = td_errors(given.columns, tape.output[:batch], bootstrap, None)
+                return output_error(given.columns, agent.loss.slope(errors), next_values)
+
+            error = loss()
+            chain, out = online._passes.chain, online._passes.gradients
+            transforms = Transforms(chain, head)
+            deltas = [(index, delta[:, 0].contiguous()) for index, delta in chain.walk(head, error[:, None])]
+            sigmas = list(transforms.apply_feedback(error, s))
+            pieces: dict[str, Callable[[], object]] = {
+                "sample": lambda: table.sample(batch, s, rate),
+                "inputs": lambda: online.inputs(given.frames, given.index),
+                "forward of obs and next_obs": lambda: online.forward(inputs),
+                "forward of the target": lambda: target.values(inputs[batch:]),
+                "loss": loss,
+                "backpropagation alone": lambda: list(chain.walk(head, error[:, None])),
+                "gradients of parameters": lambda: [chain.write(head, i, d, out) for i, d in deltas],
+                "gradients of parameters, EDL": lambda: [chain.write(head, i, d, out) for i, d in sigmas],
+                "transforms": lambda: Transforms(chain, head),
+                "feedback through transforms": lambda: list(transforms.apply_feedback(error, s)),
+                "optimizer": lambda: agent.optimizers[0].step(rate),
+            }
+            for index, delta in deltas:
+                pieces[f"gradient of layer {chain.names[index]}"] = lambda i=index, d=delta: chain.write(
+                    head, i, d, out
+                )
+            for name, piece in pieces.items():
+                with _kept({"what": "microseconds", "piece": name, "batch": batch}):
+                    many = lambda piece=piece: [piece() for _ in range(count)]  # noqa: E731
+                    repeat = cuda_graph(many, agent.device) if on_gpu else many
+                    value = round(1e6 / _rate(repeat, 0.05 if options.quick else 0.15, options.device, count), 1)
+                    figure(what="microseconds", piece=name, batch=batch, value=value)
 
 
 def part_jax(options: argparse.Namespace) -> None:
@@ -383,7 +448,7 @@ def part_jax(options: argparse.Namespace) -> None:
     frames = jax.random.randint(keys[0], (10_000, 84, 84), 0, 256).astype(jnp.uint8)
     blank = jnp.zeros((1, 84, 84, 4))
     online, target = network.init(keys[1], blank), network.init(keys[2], blank)
-    for batch in (32,) if options.quick else (32, 512):
+    for batch in (4,) if options.quick else (32, 512):
 
         def update(state, key, batch=batch):
             parameters, moments = state
@@ -402,7 +467,7 @@ def part_jax(options: argparse.Namespace) -> None:
             return (optax.apply_updates(parameters, updates), moments), 0.0
 
         count = 2 if options.quick else 200
-        many = jax.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, count))[0])  # noqa: B023
+        many = jax.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, count))[0])
         state = jax.block_until_ready(many((online, optimizer.init(online)), keys[0]))
         done, began = 0, time.perf_counter()
         while time.perf_counter() - began < (0.1 if options.quick else 2.5):
@@ -424,14 +489,14 @@ def part_sb3(options: argparse.Namespace) -> None:
         observation_space = gymnasium.spaces.Box(0, 255, (4, 84, 84), np.uint8)
         action_space = gymnasium.spaces.Discrete(6)
 
-    for batch in (32,) if options.quick else (32, 512):
+    for batch in (4,) if options.quick else (32, 512):
         model = DQN("CnnPolicy", Spaces(), buffer_size=1024, batch_size=batch, device=options.device, seed=0)
         model.set_logger(Logger(None, []))
         rng = np.random.default_rng(0)
         for _ in range(1024):
             obs, next_obs = rng.integers(0, 256, (2, 1, 4, 84, 84)).astype(np.uint8)
             model.replay_buffer.add(obs, next_obs, np.array([rng.integers(6)]), np.zeros(1), np.zeros(1), [{}])
-        update = lambda: model.train(gradient_steps=1, batch_size=batch)  # noqa: B023, E731
+        update = lambda: model.train(gradient_steps=1, batch_size=batch)  # noqa: E731
         row = {"what": "updates/s", "method": "Stable-Baselines3", "batch": batch}
         figure(**row, way="batches of the host", value=_rate(update, 0.1 if options.quick else 2, options.device))
 
@@ -488,7 +553,7 @@ def part_run(options: argparse.Namespace) -> None:
             flags += ["--network.kind", "nips2013"]
         command = [sys.executable, "-m", "deploy.commands", "coop-local", *flags, "--run-dir", f"{folder}/run"]
         process = subprocess.Popen(command, stdout=sys.stderr, stderr=subprocess.STDOUT)
-        busy, rows, last = [], [], 0.0
+        busy, rows = [], []
         began = time.monotonic()
         metrics = Path(folder, "run", "metrics.jsonl")
         while time.monotonic() - began < seconds and process.poll() is None:
@@ -509,7 +574,7 @@ def part_run(options: argparse.Namespace) -> None:
         figure(
             what="run", rows=len(rows), actors=actors,
             **{name: mean(name) for name in ("updates_per_s", "env_steps_per_s", "weight_lag_mean") if later},
-            gpu_busy=round(sum(busy[len(busy) // 2 :]) / max(1, len(busy[len(busy) // 2 :])), 1) if busy else last,
+            gpu_busy=round(sum(busy[len(busy) // 2 :]) / len(busy[len(busy) // 2 :]), 1) if busy else None,
         )  # fmt: skip
 
 

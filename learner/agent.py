@@ -136,7 +136,7 @@ class Agent:
             # With `double` the acting network chooses the next actions, so one pass covers obs and next_obs.
             tape = online.forward(inputs if settings.double else inputs[:size])
             values, next_values = as_float32(tape.output), target.values(inputs[size:])
-            bootstrap = self.rule.bootstrap(next_values, values[size:] if settings.double else next_values)
+            bootstrap = self._bootstrap(next_values, values[size:] if settings.double else next_values)
             errors = td_errors(given.columns, values[:size], bootstrap, settings.value_bound)
             error = output_error(given.columns, self.loss.slope(errors), next_values)
             online.backward(tape.head(size), error, given.s)
@@ -148,6 +148,12 @@ class Agent:
             self.rule.after_update(online, target)
             first = errors if first is None else first
         return first
+
+    def _bootstrap(self, next_values: Any, preferred: Any) -> Any:  # noqa: ANN401
+        """V(x') by the method's rule, in the networks' arrays: float32 [batch]."""
+        if self.rule.on_device:
+            return self.rule.bootstrap(next_values, preferred)
+        return convert_like(self.rule.bootstrap(on_host(next_values), on_host(preferred)), next_values)
 
     def _led(self, batch: Batch, s: float, rate: float) -> Values:
         """Do an update step by step."""
@@ -172,7 +178,7 @@ class Agent:
             return "the network is small and runs in numpy"
         if not self._networks[0].plain:
             return f"network.kind = {self.config.network.kind!r} is no plain stack of layers"
-        if not self.rule.fixed:
+        if not self.rule.on_device:
             return f"the rule of {self.config.method} uses the host"
         if self.config.feedback == "weight-gradient":
             return "edl.feedback = 'weight-gradient' decomposes matrices on the host"

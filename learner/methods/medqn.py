@@ -24,8 +24,6 @@ class Consolidation(Rule):
         low, high: float32 [*input], the smallest and the largest input seen in each dimension; empty at first.
     """
 
-    fixed = False  # lambda and the drawn states are the host's
-
     def __init__(self, config: RunConfig, rng: np.random.Generator) -> None:
         super().__init__(config, rng)
         assert isinstance(config.own, MedqnSettings)

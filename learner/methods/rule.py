@@ -14,18 +14,23 @@ from learner.qnetwork import QNetwork
 class Rule:
     """What a method changes in the update; this one, of the paper's four methods, changes nothing.
 
-    Arrays are those of the networks: of numpy for small ones on a CPU, tensors on the networks' device for others.
+    A rule of its own class gets the values in numpy. With `on_device = True` it gets the arrays of the networks, numpy's
+    or tensors on their device, and depends on nothing but their values: a GPU then repeats recorded updates, in which
+    the host has no part.
 
     Attributes:
         config: of the run.
         rng: the agent's generator, whose state it saves.
         passes: steps of the optimizer that one update makes with its batch.
-        fixed: what the rule computes depends on nothing but its arguments' values, which stay on their device. A GPU
-            then repeats the recorded update; for other rules the host leads it through each one.
+        on_device: see above; False for a class that does not say so itself.
     """
 
     passes = 1
-    fixed = True
+    on_device = True
+
+    def __init_subclass__(cls) -> None:
+        """Let a class that does not know of devices keep to numpy."""
+        cls.on_device = vars(cls).get("on_device", False)
 
     def __init__(self, config: RunConfig, rng: np.random.Generator) -> None:
         self.config = config
