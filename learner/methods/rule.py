@@ -14,7 +14,7 @@ from learner.qnetwork import QNetwork
 class Rule:
     """What a method changes in the update; this one, of the paper's four methods, changes nothing.
 
-    A rule of its own class gets the values in numpy. With `on_device = True` it gets the arrays of the networks, numpy's
+    A class of its own gets the values in numpy. With `on_device = True` it gets the arrays of the networks, numpy's
     or tensors on their device, and depends on nothing but their values: a GPU then repeats recorded updates, in which
     the host has no part.
 
