@@ -11,7 +11,7 @@ STAMP = $(shell date +%Y%m%d-%H%M%S)
 # The tests start hundreds of processes: they share what Python has compiled, also where it is told not to keep it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants bench docs dist
+.PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants bench gpu docs dist
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -67,6 +67,11 @@ mutants: $(READY)
 bench:
 	@PYTHON=$(PYTHON) benchmarks/rivals.sh
 	@PYTHONPATH=benchmarks .bench/bench/bin/python -m bench $(AREAS) $(if $(AGAINST),--against $(AGAINST))
+
+# What a GPU makes of updates, acting and a whole run, in four minutes. On a machine without network, deploy/gpu_wheels.sh
+# has put what is missing into .whl/ before.
+gpu:
+	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) benchmarks/gpu.py --out $(or $(OUT),runs/gpu)
 
 # The documentation as a site, build/site/index.html; a broken link is an error. Says how many code blocks the tests run.
 docs: $(READY)

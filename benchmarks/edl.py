@@ -39,7 +39,7 @@ def settings(kind: str, method: str, double: bool) -> RunConfig:
     """The config of a run whose learner uses the feedback `method`."""
     feedback, _, dtype = method.partition(" ")
     gradient = method == "none" or feedback == "autograd" or dtype == "svd"
-    edl = {"rate": RATE, "polar_dtype": "bfloat16" if dtype == "bf16" else "float32"}
+    edl = {"rate": RATE}
     return validated(
         {
             "method": "g-coop" if gradient else "coop",

@@ -63,8 +63,8 @@ class Lockstep:
         drawn = msgspec.structs.replace(self.trainer.drawn, inserted=self.step, **self.memory.counters())
         for batch in self.memory.batches(self.step):
             effects = self.trainer.train(batch, drawn, time.monotonic())
-            if effects.priorities is not None:
-                self.memory.update_priorities(batch.ids, effects.priorities)
+            if effects.ids is not None and effects.priorities is not None:
+                self.memory.update_priorities(effects.ids, effects.priorities)
             yield effects
         ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in turn.ended.items())
         yield self.trainer.receive(msgspec.structs.replace(drawn, episodes=ended))

@@ -26,30 +26,42 @@ from torch import Tensor
 
 from common.errors import UsageError
 from common.networks.network import FlatNetwork
+from common.process.notices import warn
 from common.process.randomness import generator_state, set_generator_state
 from common.registry import loaded
 from common.settings import schedules
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS
 from common.types import Array, Batch, EnvSpec
-from learner.edl.arrays import AnyArray
+from learner.edl.arrays import convert_like
+from learner.given import Given
 from learner.losses import LOSSES, Values, output_error, td_errors
 from learner.methods.rule import Rule
 from learner.optimizers import make_optimizer
-from learner.qnetwork import QNetwork, make_q_network, on_host
+from learner.qnetwork import as_float32, make_q_network, on_host
+from learner.recorded import Capture, Late, Recorded, cuda_graph
+
+LAG = 16  # updates of a GPU after which their TD errors are read
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
     """The measurements of one update.
 
-    td_errors: float32 [batch], e of the taken actions before clipping and weighting, and before the update.
-    s: the value of s in this update. swapped: the roles changed after it.
+    errors: `td_errors`, or where they will be. s: the value of s in this update. swapped: the roles changed after it.
     """
 
-    td_errors: NDArray[np.float32]
+    errors: NDArray[np.float32] | Late
     s: float
     swapped: bool
+
+    @property
+    def td_errors(self) -> NDArray[np.float32]:
+        """The TD error e of each action taken, before clipping and weighting, and before the update: float32 [batch].
+
+        Waits for a GPU that is not yet there.
+        """
+        return self.errors.read() if isinstance(self.errors, Late) else self.errors
 
 
 class Agent:
@@ -63,13 +75,20 @@ class Agent:
         updates: number of updates done.
         networks: the parameters of both networks. versions: `updates` at each network's last change.
         loss: the loss of a TD error. rule: what the method changes in the update.
+        lag: updates after which TD errors should be read; earlier, the host waits for the GPU.
+        eager: why updates are not recorded and repeated as a whole; empty if they are.
     """
 
-    def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
-        """Raise UsageError for a missing device, a method that can't be loaded, or a weight decay for other layers."""
+    def __init__(self, config: RunConfig, spec: EnvSpec, capture: Capture | None = None) -> None:
+        """capture: makes a function repeatable; CUDA graphs on a GPU, and none elsewhere, if not given.
+
+        Raises UsageError for a missing device, a method that can't be loaded, or a weight decay for other layers.
+        """
         self.config = config
         self.spec = spec
         self.device = _device(config.learner.device)
+        if self.device.type == "cuda":
+            torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = config.learner.tf32
         self.loss = LOSSES[config.learner.loss]
         self.acting = 0
         self.updates = 0
@@ -80,7 +99,15 @@ class Agent:
         self.optimizers = [make_optimizer(config.learner, one.theta, one.gradient) for one in trained]
         rule = loaded(METHODS.get(config.method).rule, f"method {config.method!r}")
         self.rule: Rule = rule(config, self._noise)
-        self._weight_decay = _decay_vector(config.learner.weight_decay, self.networks[0].layout)
+        decay = _decay_vector(config.learner.weight_decay, self.networks[0].layout)
+        self._weight_decay = None if decay is None else convert_like(decay, self._networks[0].theta)
+        if capture is None and self.device.type == "cuda":
+            capture = cuda_graph
+        self.lag = LAG if self.device.type == "cuda" else 0
+        self.eager = "" if capture is None else self._obstacle()
+        self._recorded = None
+        if capture is not None and not self.eager:
+            self._recorded = Recorded(self._learn, config, spec, self.device, capture, self)
 
     @property
     def networks(self) -> list[FlatNetwork]:
@@ -89,29 +116,73 @@ class Agent:
 
     def update(self, batch: Batch) -> Update:
         """One step of Algorithm 1: train the acting network towards the other one's targets, then count the step."""
-        online, target = self._networks[self.acting], self._networks[1 - self.acting]
-        s = self._draw_s()
+        s, rate = self._draw_s(), self._learning_rate()
         # The trainer finds TD errors that are not finite; numpy, like PyTorch, does not warn of them here.
         with torch.inference_mode(), np.errstate(all="ignore"):
-            inputs = online.inputs(batch, self.spec)
-            first, *_ = [self._step(online, target, batch, inputs, s) for _ in range(self.rule.passes)]
-        return Update(first, s, swapped=self._count())
+            errors: Values | Late | None = self._repeated(batch, s, rate)
+            if errors is None:
+                errors = self._led(batch, s, rate)
+        return Update(errors, s, swapped=self._count())
 
-    def _step(self, online: QNetwork, target: QNetwork, batch: Batch, inputs: AnyArray, s: float) -> Values:
-        """Make one step of the optimizer; returns the TD errors before it, float32 [batch]."""
-        settings, size = self.config.learner, len(batch)
-        # With `double` the acting network chooses the next actions, so one pass covers obs and next_obs.
-        tape = online.forward(inputs if settings.double else inputs[:size])
-        values, next_values = on_host(tape.output), target.values(inputs[size:])
-        bootstrap = self.rule.bootstrap(next_values, values[size:] if settings.double else next_values)
-        errors = td_errors(batch, values, bootstrap, settings.gamma, settings.value_bound)
-        online.backward(tape.head(size), output_error(batch, self.loss.slope(errors), next_values), s)
-        self.rule.add_cost(online, target, inputs, self.updates)
-        if self._weight_decay is not None:
-            online.decay(self._weight_decay)
-        self.optimizers[self.acting].step(self._learning_rate())
-        online.changed()
-        return errors
+    def _learn(self, acting: int, given: Given) -> Any:  # noqa: ANN401
+        """Train the acting network with a batch; returns the TD errors before that, float32 [batch].
+
+        It stays with one array library on one device, and no value decides what it does.
+        """
+        online, target, settings = self._networks[acting], self._networks[1 - acting], self.config.learner
+        inputs, size = online.inputs(given.frames, given.index), len(given.columns.actions)
+        first = None
+        for _ in range(self.rule.passes):
+            # With `double` the acting network chooses the next actions, so one pass covers obs and next_obs.
+            tape = online.forward(inputs if settings.double else inputs[:size])
+            values, next_values = as_float32(tape.output), target.values(inputs[size:])
+            bootstrap = self._bootstrap(next_values, values[size:] if settings.double else next_values)
+            errors = td_errors(given.columns, values[:size], bootstrap, settings.value_bound)
+            error = output_error(given.columns, self.loss.slope(errors), next_values)
+            online.backward(tape.head(size), error, given.s)
+            self.rule.add_cost(online, target, inputs, self.updates)
+            if self._weight_decay is not None:
+                online.decay(self._weight_decay)
+            self.optimizers[acting].step(given.rate)
+            online.changed()
+            self.rule.after_update(online, target)
+            first = errors if first is None else first
+        return first
+
+    def _bootstrap(self, next_values: Any, preferred: Any) -> Any:  # noqa: ANN401
+        """V(x') by the method's rule, in the networks' arrays: float32 [batch]."""
+        if self.rule.on_device:
+            return self.rule.bootstrap(next_values, preferred)
+        return convert_like(self.rule.bootstrap(on_host(next_values), on_host(preferred)), next_values)
+
+    def _led(self, batch: Batch, s: float, rate: float) -> Values:
+        """Do an update step by step."""
+        device = None if self._networks[0].in_numpy else self.device
+        return on_host(self._learn(self.acting, Given.of(batch, self.config.learner.gamma, s, rate, device)))
+
+    def _repeated(self, batch: Batch, s: float, rate: float) -> Late | None:
+        """Repeat the recorded update; None if none is, the batch does not fit it, or recording fails."""
+        if self._recorded is None or not self._recorded.fits(batch):
+            return None
+        try:
+            return self._recorded.run(self.acting, batch, s, rate)
+        except RuntimeError as error:
+            self.eager = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            self._recorded = None
+            warn(f"updates are not recorded as CUDA graphs, and take longer: {self.eager}")
+            return None
+
+    def _obstacle(self) -> str:
+        """Why updates can't be recorded; empty if they can."""
+        if self._networks[0].in_numpy:
+            return "the network is small and runs in numpy"
+        if not self._networks[0].plain:
+            return f"network.kind = {self.config.network.kind!r} is no plain stack of layers"
+        if not self.rule.on_device:
+            return f"the rule of {self.config.method} uses the host"
+        if self.config.feedback == "weight-gradient":
+            return "edl.feedback = 'weight-gradient' decomposes matrices on the host"
+        return ""
 
     def swap(self) -> None:
         """Change the acting role; for the one-network methods, copy the network to its target."""

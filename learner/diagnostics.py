@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from common.networks.inputs import preprocess
 from common.types import Batch
-from learner.losses import td_errors
+from learner.losses import columns, td_errors
 from learner.protocol import Agent
 from learner.qnetwork import on_host
 
@@ -65,7 +65,7 @@ class Diagnostics:
         bootstrap = agent.rule.bootstrap(next_values, preferred)
         generator.state = before
         q = q[:, :size]
-        errors = td_errors(archive, q[acting], bootstrap, settings.gamma, settings.value_bound)
+        errors = td_errors(columns(archive, settings.gamma), q[acting], bootstrap, settings.value_bound)
         return {
             "q_gap": float(np.linalg.norm(q[0] - q[1], axis=1).mean()),
             "q1_mean": float(q[0].mean()),

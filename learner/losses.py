@@ -1,14 +1,15 @@
-"""The TD errors of a batch, their loss, and the output error for the backward pass; in numpy, as they are few."""
+"""The TD errors of a batch, their loss, and the output error for the backward pass, in the arrays of the network."""
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Protocol
+from typing import Any, Generic, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.types import Batch
+from learner.edl.arrays import ArrayT, chosen, namespace, placed
 
 Values = NDArray[np.float32]
 
@@ -16,21 +17,22 @@ Values = NDArray[np.float32]
 class Loss(Protocol):
     """A loss of single TD errors."""
 
-    def cost(self, errors: Values) -> Values:
+    def cost(self, errors: ArrayT) -> ArrayT:
         """The loss of each TD error, float32 [batch]."""
 
-    def slope(self, errors: Values) -> Values:
+    def slope(self, errors: ArrayT) -> ArrayT:
         """The derivative of the loss at each TD error, float32 [batch]."""
 
 
 class SquaredError:
     """1/2 e^2."""
 
-    def cost(self, errors: Values) -> Values:
+    def cost(self, errors: ArrayT) -> ArrayT:
         """See `Loss`."""
-        return np.float32(0.5) * errors * errors
+        costs: ArrayT = 0.5 * errors * errors
+        return costs
 
-    def slope(self, errors: Values) -> Values:
+    def slope(self, errors: ArrayT) -> ArrayT:
         """See `Loss`."""
         return errors
 
@@ -38,24 +40,26 @@ class SquaredError:
 class MeanSquaredError:
     """e^2, like PyTorch's MSELoss: its slope is twice that of the squared error."""
 
-    def cost(self, errors: Values) -> Values:
+    def cost(self, errors: ArrayT) -> ArrayT:
         """See `Loss`."""
-        return errors * errors
+        costs: ArrayT = errors * errors
+        return costs
 
-    def slope(self, errors: Values) -> Values:
+    def slope(self, errors: ArrayT) -> ArrayT:
         """See `Loss`."""
-        return np.float32(2) * errors
+        slopes: ArrayT = 2 * errors
+        return slopes
 
 
 class Huber:
     """1/2 e^2 where |e| < 1, and |e| - 1/2 beyond: the squared error with its slope clipped to [-1, 1]."""
 
-    def cost(self, errors: Values) -> Values:
+    def cost(self, errors: ArrayT) -> ArrayT:
         """See `Loss`."""
-        size = np.abs(errors)
-        return np.where(size < 1, np.float32(0.5) * size * size, size - np.float32(0.5))
+        size = abs(errors)
+        return namespace(errors).where(size < 1, 0.5 * size * size, size - 0.5)
 
-    def slope(self, errors: Values) -> Values:
+    def slope(self, errors: ArrayT) -> ArrayT:
         """See `Loss`."""
         return errors.clip(-1, 1)
 
@@ -63,32 +67,44 @@ class Huber:
 LOSSES: dict[str, Loss] = {"squared": SquaredError(), "mse": MeanSquaredError(), "huber": Huber()}
 
 
-def td_errors(
-    batch: Batch, values: Values, bootstrap: Values, gamma: float, value_bound: float | None = None
-) -> Values:
-    """e[a] = y[a] - (r + gamma^k (1 - terminated) V(x')) of the actions taken, float32 [batch].
+class Columns(NamedTuple, Generic[ArrayT]):
+    """What the loss needs of a batch's transitions, in arrays of one library.
 
-    k: the steps that a transition spans, 1 except for n-step returns.
+    actions: int64 [batch]. rewards: float32 [batch]. discounts: float32 [batch], gamma^k of the k steps that a
+    transition spans, 0 for a terminal next state. weights: float32 [batch], of importance sampling.
+    """
+
+    actions: ArrayT
+    rewards: ArrayT
+    discounts: ArrayT
+    weights: ArrayT
+
+
+def columns(batch: Batch, gamma: float) -> Columns[NDArray[Any]]:
+    """The columns of a batch, in numpy."""
+    discounts = _powers(gamma)[batch.span] * ~batch.terminated
+    return Columns(batch.actions.astype(np.int64), batch.rewards, discounts, batch.weights)
+
+
+def td_errors(batch: Columns[ArrayT], values: ArrayT, bootstrap: ArrayT, value_bound: float | None = None) -> ArrayT:
+    """e[a] = y[a] - (r + gamma^k (1 - terminated) V(x')) of the actions taken, float32 [batch].
 
     values: y = Q(x), float32 [batch, actions]. bootstrap: V(x'), float32 [batch], clipped to +-value_bound.
     """
     if value_bound is not None:
         bootstrap = bootstrap.clip(-value_bound, value_bound)
-    discounts = _powers(gamma)[batch.span] * ~batch.terminated
-    errors: Values = values[np.arange(len(batch)), batch.actions] - (batch.rewards + discounts * bootstrap)
+    errors: ArrayT = chosen(values, batch.actions) - (batch.rewards + batch.discounts * bootstrap)
     return errors
 
 
-def output_error(batch: Batch, slopes: Values, outputs: Values) -> Values:
+def output_error(batch: Columns[ArrayT], slopes: ArrayT, outputs: ArrayT) -> ArrayT:
     """The gradient of the batch's mean weighted loss with respect to the outputs, float32 [batch, actions].
 
     Only the entries of the actions taken are not 0.
 
     slopes: float32 [batch], of each transition's loss. outputs: an array of the result's shape and memory layout.
     """
-    error = np.zeros_like(outputs)
-    error[np.arange(len(batch)), batch.actions] = slopes * batch.weights / np.float32(len(batch))
-    return error
+    return placed(slopes * batch.weights / len(slopes), batch.actions, outputs)
 
 
 @cache

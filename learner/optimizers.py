@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from common.settings.config import LearnerSettings
+from learner.edl import kernels
 from learner.edl.arrays import ArrayT, Namespace, assign, namespace
 
 _TINY = 1e-37  # below any square that matters, above the denormals
@@ -25,12 +26,15 @@ class Optimizer(ABC, Generic[ArrayT]):
 
     theta, gradient: float32 [P], of PyTorch or numpy, read and written in place. buffers: running means by name,
     float32 [P]. steps: number of steps taken. PyTorch has fused operations, numpy has not.
+
+    On a GPU a step needs nothing of the host: the rate may be a tensor, and the steps are counted on the device too.
     """
 
     theta: ArrayT
     gradient: ArrayT
     buffers: dict[str, ArrayT] = field(init=False)
     steps: int = field(init=False, default=0)
+    _count: Tensor | None = field(init=False, default=None)
     _xp: Namespace[ArrayT] = field(init=False)
     _scratch: ArrayT = field(init=False)
 
@@ -39,10 +43,16 @@ class Optimizer(ABC, Generic[ArrayT]):
         self._xp = namespace(self.theta)
         self.buffers = {name: self._xp.zeros_like(self.gradient) for name in self._means()}
         self._scratch = self._xp.zeros_like(self.gradient)
+        if isinstance(self.theta, Tensor) and self.theta.is_cuda:
+            self._count = torch.zeros((), device=self.theta.device)
 
-    def step(self, rate: float) -> None:
-        """Apply one update with learning rate `rate`."""
+    def step(self, rate: float | Tensor) -> None:
+        """Apply one update with learning rate `rate`, a number, or a tensor of one on theta's device."""
         self.steps += 1
+        if self._count is not None:
+            self._count += 1
+            self._step(rate)
+            return
         # Running means of parameters without gradient become denormals, with which an update takes 30 times as long.
         # PyTorch sets the processor's mode, which is numpy's too.
         torch.set_flush_denormal(True)
@@ -56,7 +66,7 @@ class Optimizer(ABC, Generic[ArrayT]):
         """The names of the running means."""
 
     @abstractmethod
-    def _step(self, rate: float) -> None: ...
+    def _step(self, rate: float | Tensor) -> None: ...
 
     def state(self) -> dict[str, Tensor | int]:
         """The state for `load_state`; torch.load reads it with weights_only."""
@@ -66,6 +76,8 @@ class Optimizer(ABC, Generic[ArrayT]):
     def load_state(self, state: dict[str, Tensor | int]) -> None:
         """Restore a state from `state`."""
         self.steps = int(state["steps"])
+        if self._count is not None:
+            self._count.fill_(self.steps)
         for name, buffer in self.buffers.items():
             assign(buffer, torch.as_tensor(state[name]))
 
@@ -89,14 +101,19 @@ class Optimizer(ABC, Generic[ArrayT]):
         square += scratch
         return square
 
-    def _descend(self, direction: ArrayT, rate: float, denominator: ArrayT | None = None) -> None:
+    def _descend(self, direction: ArrayT, rate: float | Tensor, denominator: ArrayT | None = None) -> None:
         """Apply theta <- theta - rate direction / denominator; both arguments may be in the scratch memory."""
         if isinstance(self.theta, Tensor):
-            if denominator is None:
+            if isinstance(rate, Tensor):
+                if denominator is not None:
+                    direction = torch.div(direction, denominator, out=self._scratch)
+                self.theta.addcmul_(direction, rate, value=-1)
+            elif denominator is None:
                 self.theta.add_(direction, alpha=-rate)
             else:
                 self.theta.addcdiv_(direction, denominator, value=-rate)
         else:
+            assert not isinstance(rate, Tensor)
             if denominator is not None:
                 direction = self._xp.divide(direction, denominator, out=self._scratch)
             self.theta -= self._xp.multiply(direction, rate, out=self._scratch)
@@ -123,7 +140,7 @@ class SGD(Optimizer[ArrayT]):
     def _means(self) -> Sequence[str]:
         return ["velocity"] if self.momentum else []
 
-    def _step(self, rate: float) -> None:
+    def _step(self, rate: float | Tensor) -> None:
         moved: ArrayT = self.gradient
         if self.momentum:
             moved = self.buffers["velocity"]
@@ -146,7 +163,7 @@ class RMSProp(Optimizer[ArrayT]):
     def _means(self) -> Sequence[str]:
         return ["square", "velocity"] if self.momentum else ["square"]
 
-    def _step(self, rate: float) -> None:
+    def _step(self, rate: float | Tensor) -> None:
         root: ArrayT = self._root(self._average_square(self.alpha))
         root += self.eps
         if self.momentum:
@@ -177,7 +194,7 @@ class MnihRMSProp(Optimizer[ArrayT]):
     def _means(self) -> Sequence[str]:
         return ["square", "mean"]
 
-    def _step(self, rate: float) -> None:
+    def _step(self, rate: float | Tensor) -> None:
         mean: ArrayT = self._average("mean", self.gradient_alpha)
         square = self._average_square(self.alpha)
         root: ArrayT = self._variance(square, mean)
@@ -200,21 +217,25 @@ class Adam(Optimizer[ArrayT]):
     def _means(self) -> Sequence[str]:
         return ["mean", "square"]
 
-    def _step(self, rate: float) -> None:
+    def _step(self, rate: float | Tensor) -> None:
         beta1, beta2 = self.betas
         if isinstance(self.theta, Tensor):
             # One pass over the memory; it takes a third of the time of the operations one by one.
-            count = torch.tensor(float(self.steps), device=self.theta.device)
+            mean, square = self.buffers["mean"], self.buffers["square"]
+            if kernels.usable(self.theta):
+                kernels.adam(self.theta, self.gradient, mean, square, self._count, rate, self.betas, self.eps)
+                return
+            count = torch.tensor(float(self.steps)) if self._count is None else self._count
             torch._fused_adam_(
-                [self.theta], [self.gradient], [self.buffers["mean"]], [self.buffers["square"]], [], [count],
+                [self.theta], [self.gradient], [mean], [square], [], [count],
                 lr=rate, beta1=beta1, beta2=beta2, weight_decay=0.0, eps=self.eps, amsgrad=False, maximize=False,
             )  # fmt: skip
             return
-        mean: ArrayT = self._average("mean", beta1)
+        average: ArrayT = self._average("mean", beta1)
         correction = (1 - beta2**self.steps) ** 0.5
         root: ArrayT = self._root(self._average_square(beta2))
         root += self.eps * correction
-        self._descend(mean, rate * correction / (1 - beta1**self.steps), root)
+        self._descend(average, rate * correction / (1 - beta1**self.steps), root)
 
 
 def make_optimizer(settings: LearnerSettings, theta: ArrayT, gradient: ArrayT) -> Optimizer[ArrayT]:

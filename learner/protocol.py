@@ -23,6 +23,7 @@ class Agent(Protocol):
     loss: Loss
     device: torch.device
     rule: Rule
+    lag: int
 
     @property
     def acting(self) -> int:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,14 +15,13 @@ from common.networks.network import FlatNetwork, sample_inputs
 from common.registry import loaded
 from common.settings.config import RunConfig
 from common.settings.methods import METHODS
-from common.types import Batch, EnvSpec
+from common.types import EnvSpec
+from learner.edl import kernels
 from learner.edl.arrays import AnyArray, assign, convert_like
 from learner.edl.feedback import FeedbackRule
 from learner.edl.graph import Graph
 from learner.edl.passes import Tape, UnsupportedLayerError
 from learner.edl.trainable import Trainable
-
-FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 
 class QNetwork:
@@ -41,6 +39,7 @@ class QNetwork:
 
     Attributes:
         theta, gradient: float32 [P], of PyTorch or numpy, for the optimizer.
+        in_numpy: the passes take arrays of numpy. plain: the network is a plain stack, with hand-written passes.
     """
 
     def __init__(
@@ -51,55 +50,62 @@ class QNetwork:
         spec: EnvSpec,
         rng: np.random.Generator,
     ) -> None:
-        polar_dtype = torch.bfloat16 if half is None and config.edl.polar_dtype == "bfloat16" else None
-        in_numpy = polar_dtype is None and not config.learner.compile
         self.network = network
         self._half = half
         example = None if config.feedback == "none" else sample_inputs(spec, 8).to(network.flat.device)
         try:
-            self._trained = Trainable(network, in_numpy, example)
+            self._trained = Trainable(network, True, example)
         except UnsupportedLayerError as error:
             raise UsageError(f"network.kind = {config.network.kind!r}: {error}") from error
-        if isinstance(self._trained.chain, Graph):
-            _check_plain(config)
-        self._passes = self._trained if half is None else Trainable(half, in_numpy, None)
-        rule = FeedbackRule(self._passes.chain, config.feedback, config.seed, polar_dtype, rng)
-        ready = torch.compile if config.learner.compile else _as_it_is
-        self._forward = ready(self._passes.chain.forward)
-        self._values = ready(self._passes.values)
-        self._backward = ready(rule.backward)
+        self.plain = not isinstance(self._trained.chain, Graph)
+        if not self.plain and config.network.dtype != "float32":
+            kind, stacks = config.network.kind, "only stacks of Linear, Conv2d, ReLU and Flatten have others"
+            raise UsageError(
+                f"network.dtype = {config.network.dtype!r}: allowed: 'float32' with network.kind = {kind!r}; {stacks}"
+            )
+        self._passes = self._trained if half is None else Trainable(half, True, None)
+        self.in_numpy = self._passes.in_numpy
+        self._rule = FeedbackRule(self._passes.chain, config.feedback, config.seed, rng)
+        self._spec = spec
         self.theta: Any
         self.gradient: Any
         self.theta, self.gradient = self._trained.theta, self._trained.gradient
 
-    def inputs(self, batch: Batch, spec: EnvSpec) -> AnyArray:
-        """The input of both networks for a batch: [2 batch, *input], obs before next_obs, pictures channels last."""
-        index = np.concatenate((batch.obs_index, batch.next_index)).reshape(-1)
-        if self._passes.in_numpy:
-            return preprocess(batch.frames.take(index, axis=0).reshape(-1, *spec.obs_shape), spec)
-        device = self.network.flat.device
-        # Copies, because arrays from the wire are read-only and PyTorch warns about views of those.
-        frames, places = torch.tensor(batch.frames, device=device), torch.tensor(index, device=device)
-        obs = frames.index_select(0, places).view(-1, *spec.obs_shape)
+    def inputs(self, frames: AnyArray, index: AnyArray) -> AnyArray:
+        """The input of both networks: [n, *input], pictures channels last.
+
+        frames: <frame_dtype>[unique, *frame_shape]. index: int32 [n * stack], their rows in observations, oldest first.
+        """
+        shape = (-1, *self._spec.obs_shape)
+        if not isinstance(frames, Tensor):
+            return preprocess(frames.take(index, axis=0).reshape(shape), self._spec)
+        if self._passes.gradient.dtype == torch.float32 and self._spec.stack == 4 and len(self._spec.frame_shape) == 2:
+            stacked = kernels.stacks(frames, torch.as_tensor(index), len(index) // 4)
+            if stacked is not None:
+                return stacked
+        obs = frames.index_select(0, torch.as_tensor(index)).view(shape)
         if obs.dim() == 4:
             obs = obs.contiguous(memory_format=torch.channels_last)
-        return preprocess(obs, spec, self._passes.gradient.dtype)
+        return preprocess(obs, self._spec, self._passes.gradient.dtype)
 
     def forward(self, inputs: AnyArray) -> Tape[Any]:
         """Run a forward pass and record its activations for `backward`."""
-        return self._forward(self._passes.cast(inputs))
+        return self._passes.chain.forward(self._passes.cast(inputs))
 
-    def values(self, inputs: AnyArray) -> NDArray[np.float32]:
-        """Q-values for the targets, float32 [batch, actions] on the CPU."""
-        return on_host(self._values(self._passes.cast(inputs)))
+    def values(self, inputs: AnyArray) -> Any:  # noqa: ANN401
+        """Q-values for the targets, float32 [batch, actions]."""
+        return as_float32(self._passes.values(self._passes.cast(inputs)))
 
-    def backward(self, tape: Tape[Any], output_error: NDArray[np.float32], s: float) -> None:
-        """Compute `gradient` from an output error, float32 [batch, actions], through the method's feedback."""
-        self._backward(tape, self._passes.cast(output_error), s, self._passes.gradients)
+    def backward(self, tape: Tape[Any], output_error: AnyArray, s: Any) -> None:  # noqa: ANN401
+        """Compute `gradient` from an output error, float32 [batch, actions], through the method's feedback.
+
+        s: a number, or a tensor of one on the network's device.
+        """
+        self._rule.backward(tape, self._passes.cast(output_error), s, self._passes.gradients)
         if self._passes is not self._trained:
             assign(self.gradient, self._passes.gradient)
 
-    def add_gradient(self, tape: Tape[Any], output_error: NDArray[np.float32]) -> None:
+    def add_gradient(self, tape: Tape[Any], output_error: AnyArray) -> None:
         """Add the gradient of another cost to `gradient`; s is 0 in it. Arguments as `backward`'s."""
         before = self.gradient * 1  # a copy, in either library
         self.backward(tape, output_error, 0.0)
@@ -120,21 +126,6 @@ class QNetwork:
             self._half.load(self.network.flat)
 
 
-def _check_plain(config: RunConfig) -> None:
-    """Raise UsageError for settings that only the passes of plain stacks know."""
-    settings = (
-        ("network.dtype", config.network.dtype, "float32"),
-        ("edl.polar_dtype", config.edl.polar_dtype, "float32"),
-        ("learner.compile", config.learner.compile, False),
-    )
-    for name, value, allowed in settings:
-        if value != allowed:
-            stacks = "only stacks of Linear, Conv2d, ReLU and Flatten have others"
-            raise UsageError(
-                f"{name} = {value!r}: allowed: {allowed!r} with network.kind = {config.network.kind!r}; {stacks}"
-            )
-
-
 def make_network(
     config: RunConfig, spec: EnvSpec, number: int, device: torch.device, dtype: torch.dtype = torch.float32
 ) -> FlatNetwork:
@@ -153,10 +144,11 @@ def make_q_network(
     return QNetwork(make_network(config, spec, number, device), half, config, spec, rng)
 
 
+def as_float32(values: Any) -> Any:  # noqa: ANN401
+    """Values of either library in float32, on their device."""
+    return values.float() if isinstance(values, Tensor) else values
+
+
 def on_host(values: AnyArray) -> NDArray[np.float32]:
     """Convert values of either library to a float32 numpy array."""
     return values.float().cpu().numpy() if isinstance(values, Tensor) else values
-
-
-def _as_it_is(function: FunctionT) -> FunctionT:
-    return function

@@ -97,8 +97,8 @@ class LearnerService:
         if got is not None:
             batch, drawn = got
             effects = trainer.train(batch, drawn, time.monotonic())
-            if effects.priorities is not None:
-                self._samples.prioritise(batch, effects.priorities)
+            if effects.ids is not None and effects.priorities is not None:
+                self._samples.prioritise(effects.ids, effects.priorities)
             self._apply(effects)
             if trainer.epoch_due() and self._checkpoints.begin(self._state):
                 trainer.epoch_begun()

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from common.messaging.messages.sample import Drawn
 from common.returns import RETURN_WINDOW
 from common.types import Array, Batch
-from learner.agent import Update
 from learner.diagnostics import Diagnostics
+from learner.losses import Values
 from learner.protocol import Agent
 from learner.return_history import ReturnHistory
 
@@ -36,10 +36,13 @@ class Telemetry:
         self._batches: list[tuple[Array, Array, Array, Array]] = []
         self._began = (now, 0, 0)
 
-    def add(self, agent: Agent, batch: Batch, update: Update) -> None:
+    def add_errors(self, errors: Values) -> None:
+        """Note the TD errors of one update, float32 [batch], before the next row."""
+        self._errors.append(errors)
+
+    def add(self, agent: Agent, batch: Batch) -> None:
         """Note one update."""
         self.diagnostics.add(batch)
-        self._errors.append(update.td_errors)
         self.largest_reward = max(self.largest_reward, float(np.abs(batch.rewards).max()))
         # Copies, because views would keep a whole message alive.
         lag = agent.updates - batch.param_version

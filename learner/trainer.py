@@ -7,6 +7,7 @@ carried out.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from common.messaging.messages.sample import Drawn, EpisodeRecord
 from common.returns import METRICS_EVERY
 from common.types import Batch
+from learner.agent import Update
 from learner.protocol import Agent
 from learner.telemetry import Telemetry
 
@@ -38,12 +40,14 @@ class Effects:
     """The effects of one batch, for the caller to carry out.
 
     broadcast: send the networks and the role to the actors.
-    priorities: float32 [batch], new priorities of the batch's transitions; None if the table does not use them.
+    priorities: float32 [n], new priorities of the transitions numbered ids, int64 [n]; None if the table does not use
+        them, or they are not yet known.
     episodes: rows for episodes.csv. metrics: the row of an interval that ends here, or None.
     """
 
     broadcast: bool = False
     priorities: NDArray[np.float32] | None = None
+    ids: NDArray[np.int64] | None = None
     episodes: Sequence[EpisodeRow] = ()
     metrics: dict[str, Any] | None = None
 
@@ -58,6 +62,9 @@ class Trainer:
         drawn: the replay side's counters as last received, without episodes.
         metrics: the newest row of an interval; None before the first.
         diverged: which values are no longer finite, in words; empty if all are finite.
+
+    What a GPU measures in an update is read `agent.lag` updates later, so that neither waits for the other; where a
+    broadcast, a row or an epoch is due it is read at once.
     """
 
     def __init__(self, agent: Agent, now: float) -> None:
@@ -68,24 +75,42 @@ class Trainer:
         self.metrics: dict[str, Any] | None = None
         self._began = now
         self.diverged = ""
+        self._unread: deque[tuple[int, NDArray[np.int64], Update]] = deque()
         self._next_epoch = agent.updates + self._epoch_every
 
     def train(self, batch: Batch, drawn: Drawn, now: float) -> Effects:
         """Update the acting network from a batch, with the counters and episodes in `drawn`."""
         agent = self.agent
         update = agent.update(batch)
-        self.telemetry.add(agent, batch, update)
-        if not np.isfinite(update.td_errors).all():
-            self.diverged = f"diverged: TD errors are not finite at update {agent.updates}"
+        self.telemetry.add(agent, batch)
+        self._unread.append((agent.updates, batch.ids, update))
         broadcast = update.swapped or agent.updates % self.config.learner.publish_every == 0
+        row = agent.updates % METRICS_EVERY == 0
+        ids, priorities = self._read(0 if broadcast or row or agent.updates >= self._next_epoch else agent.lag)
         if broadcast and not self.diverged and not agent.finite():
             self.diverged = f"diverged: parameters are not finite at update {agent.updates}"
         return Effects(
             broadcast=broadcast and not self.diverged,
-            priorities=np.abs(update.td_errors) if self.config.replay.prioritized and not self.diverged else None,
+            priorities=priorities,
+            ids=ids,
             episodes=self._number_episodes(drawn),
-            metrics=self._metrics(now) if agent.updates % METRICS_EVERY == 0 else None,
+            metrics=self._metrics(now) if row else None,
         )
+
+    def _read(self, keep: int) -> tuple[NDArray[np.int64] | None, NDArray[np.float32] | None]:
+        """Read what updates have measured, but the newest: transitions' numbers, and their new priorities."""
+        ids, priorities = [], []
+        while len(self._unread) > keep:
+            number, drawn, update = self._unread.popleft()
+            errors = update.td_errors
+            self.telemetry.add_errors(errors)
+            if not self.diverged and not np.isfinite(errors).all():
+                self.diverged = f"diverged: TD errors are not finite at update {number}"
+            ids.append(drawn)
+            priorities.append(np.abs(errors))
+        if not priorities or not self.config.replay.prioritized or self.diverged:
+            return None, None
+        return (ids[0], priorities[0]) if len(ids) == 1 else (np.concatenate(ids), np.concatenate(priorities))
 
     def receive(self, drawn: Drawn) -> Effects:
         """Process counters and episodes that arrived without a batch."""
@@ -121,6 +146,7 @@ class Trainer:
 
     def saveable(self) -> bool:
         """True while the agent may be saved; a diverged state must not be resumed."""
+        self._read(0)
         if not self.diverged and not self.agent.finite():
             self.diverged = f"diverged: parameters are not finite at update {self.agent.updates}"
         return not self.diverged

@@ -1,6 +1,5 @@
 """The four methods: who is trained, who gives the targets, and what happens every C updates."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +13,6 @@ from common.types import Batch, EnvSpec
 from learner.agent import Agent, _decay_vector
 from learner.qnetwork import make_network
 from replay.table.table import Table
-
-pytestmark = pytest.mark.timeout(300)  # PyTorch's compiler, also on a busy machine
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 
@@ -251,16 +248,3 @@ def test_a_run_that_diverges_goes_on_quietly(method: str) -> None:
     for batch in batches(3):  # pytest makes an error of every warning
         result = agent.update(batch)
     assert not np.isfinite(result.td_errors).all()
-
-
-@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="needs a C++ compiler")
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("method", ["dqn", "coop"])
-def test_compiled_updates_are_the_same_updates(method: str) -> None:
-    # So wide that no sample's Jacobian lacks rank: where one does, the completion is arbitrary and rounding decides it.
-    wide = NetworkSettings(hidden=(32, 32))
-    plain, compiled = (Agent(replace(_config(method, compile=on), network=wide), SPEC) for on in (False, True))
-    for batch in batches(5):
-        np.testing.assert_allclose(compiled.update(batch).td_errors, plain.update(batch).td_errors, atol=1e-4)
-    for one, other in zip(plain.networks, compiled.networks, strict=True):
-        torch.testing.assert_close(one.flat, other.flat, rtol=1e-4, atol=1e-5)

@@ -13,6 +13,8 @@ from samples import make_segment
 from common.settings.tables import resolve
 from common.types import Batch, EnvSpec
 from learner.agent import Agent
+from learner.edl import kernels
+from learner.edl.completed import Jacobians
 from replay.table.table import Table
 
 pytestmark = [
@@ -34,14 +36,14 @@ KINDS = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def full_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Convolutions of float32 use TF32, with 10 bits of mantissa, unless told otherwise."""
-    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
-
-
 def _agent(device: str, kind: str, spec: EnvSpec, method: str, **tables: dict[str, Any]) -> Agent:
-    tables["learner"] = {"swap_every": 3, "learning_rate": 1e-4, "device": device, **tables.get("learner", {})}
+    tables["learner"] = {
+        "swap_every": 3,
+        "learning_rate": 1e-4,
+        "device": device,
+        "tf32": False,
+        **tables.get("learner", {}),
+    }
     tables["network"] = {"kind": kind, "hidden": [32, 32], **tables.get("network", {})}
     return Agent(resolve(tables, method), spec)
 
@@ -105,11 +107,71 @@ def test_every_feedback(feedback: str) -> None:
     _assert_same(device, host)
 
 
-@pytest.mark.parametrize("tables", [{"network": {"dtype": HALF}}, {"edl": {"polar_dtype": HALF}}], ids=str)
-def test_bfloat16(tables: dict[str, dict[str, Any]]) -> None:
-    host, device = _agent("cpu", "nature", PICTURES, "coop"), _agent("cuda", "nature", PICTURES, "coop", **tables)
+def test_bfloat16() -> None:
+    host = _agent("cpu", "nature", PICTURES, "coop")
+    device = _agent("cuda", "nature", PICTURES, "coop", network={"dtype": HALF})
     for batch in _batches(PICTURES, 3):
         np.testing.assert_allclose(device.update(batch).td_errors, host.update(batch).td_errors, atol=0.05)
+
+
+@pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
+def test_a_thousand_recorded_updates_are_the_eager_ones(method: str) -> None:
+    """The same up to rounding, for as long as rounding does not grow: SGD with a small rate."""
+    tables = {"learner": {**SGD, "learning_rate": 1e-5, "swap_every": 100}}
+    recorded, eager = (_agent("cuda", "nature", PICTURES, method, **tables) for _ in range(2))
+    eager._recorded = None
+    begun = [network.snapshot() for network in eager.networks]
+    batches = _batches(PICTURES, 20)
+    for number in range(1000):
+        expected, found = (agent.update(batches[number % 20]) for agent in (eager, recorded))
+        assert (found.s, found.swapped) == (expected.s, expected.swapped)
+    assert recorded.eager == ""
+    np.testing.assert_allclose(found.td_errors, expected.td_errors, rtol=1e-2, atol=1e-3)
+    for one, other, start in zip(recorded.networks, eager.networks, begun, strict=True):
+        went, apart = other.snapshot() - start, one.snapshot() - other.snapshot()
+        assert np.linalg.norm(apart) < 1e-2 * np.linalg.norm(went)
+
+
+def test_adam_is_recorded_with_its_steps_and_its_rate() -> None:
+    adam = {"optimizer": "adam", "eps": 1e-3, "learning_rate_final": 0.1, "learning_rate": 1e-4}
+    recorded, eager = (_agent("cuda", "nature", PICTURES, "coop", learner=adam) for _ in range(2))
+    host = _agent("cpu", "nature", PICTURES, "coop", learner=adam)
+    eager._recorded = None
+    for batch in _batches(PICTURES, 8):
+        for agent in (recorded, eager, host):
+            agent.update(batch)
+    assert [each.steps for each in recorded.optimizers] == [each.steps for each in host.optimizers] == [5, 3]
+    for optimizer in recorded.optimizers:
+        assert float(optimizer._count) == optimizer.steps
+    _assert_same(recorded, eager)
+    _assert_same(recorded, host)
+
+
+def test_the_kernels_are_compiled_and_are_the_plain_ways() -> None:
+    assert kernels.usable(torch.ones(1, device="cuda"))
+    generator = torch.Generator().manual_seed(0)
+    for actions in (2, 6, 18):
+        shapes = ((3, actions, actions), (3, actions, 40), (3, actions, 5000))
+        ts = [torch.randn(shape, generator=generator) for shape in shapes]
+        ts[1][0] = 0
+        e = torch.randn(3, actions, generator=generator)
+        expected = Jacobians(ts, [None] * 3, torch.eye(actions), 3).apply(e, 0.3)
+        on_gpu = [t.cuda() for t in ts]
+        assert kernels.fits(on_gpu, 3)
+        for found in (
+            kernels.feedback(on_gpu, e.cuda(), torch.tensor(0.3, device="cuda")),
+            Jacobians([t.double() for t in on_gpu], [None] * 3, torch.eye(actions).cuda(), 3).apply(
+                e.cuda().double(), 0.3
+            ),
+        ):
+            for one, other in zip(found, expected, strict=True):
+                torch.testing.assert_close(one.float().cpu(), other, rtol=1e-4, atol=1e-5)
+    frames = torch.randint(256, (9, 84, 84), dtype=torch.uint8, generator=generator)
+    index = torch.randint(9, (12,), dtype=torch.int32, generator=generator)
+    stacked = kernels.stacks(frames.cuda(), index.cuda(), 3)
+    assert stacked is not None
+    assert stacked.is_contiguous(memory_format=torch.channels_last)
+    assert torch.equal(stacked.cpu(), frames[index.long()].view(3, 4, 84, 84) * (1 / 255))
 
 
 def test_a_state_moves_between_processor_and_gpu() -> None:

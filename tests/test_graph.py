@@ -12,7 +12,6 @@ from learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
 from learner.edl.graph import Graph
 from learner.edl.layers import _examined, make_passes
 from learner.edl.passes import UnsupportedLayerError
-from learner.edl.polar import whitened
 from learner.edl.transforms import Transforms
 
 
@@ -150,16 +149,16 @@ def test_what_no_weight_can_reach_gets_no_feedback(actions: int) -> None:
 
 
 @pytest.mark.parametrize("actions", [2, 6])
-def test_a_dueling_network_needs_no_svd(actions: int) -> None:
+def test_a_dueling_network_needs_no_completion(actions: int) -> None:
     """Not even one whose values differ little between actions."""
     network, shape = _networks(actions)[0]
     with torch.no_grad():
         network.get_parameter("value.2.weight").mul_(30)
-    x, error = (part.float() for part in _inputs(shape, actions, 32))
+    x = _inputs(shape, actions, 32)[0].float()
     passes = make_passes(network.float(), x)
-    grams = Transforms(passes, passes.forward(x))._grams()
-    assert grams.shape == (5, 32, actions, actions)
-    assert whitened(grams, error)[1] is None
+    completed = [layer.completed() for layer in Transforms(passes, passes.forward(x))._jacobians()._layers]
+    assert len(completed) == 5
+    assert not any(mixing.any() for _, mixing in completed)
 
 
 def test_dead_units_are_completed_within_the_range() -> None:
@@ -169,7 +168,7 @@ def test_dead_units_are_completed_within_the_range() -> None:
         network.get_parameter("advantage.0.bias").fill_(-100.0)
     for b in (feedback_matrices(network, x, 0.25)[name] for name in ("advantage.0", "advantage.2")):
         values = torch.linalg.svdvals(b)
-        assert (values[:, :2] >= 0.25 * (1 - 1e-6)).all()
+        assert (values[:, :2] >= 0.25 * (1 - 1e-5)).all()
         assert (values[:, 2:] < 1e-9).all()
         assert float(b.sum(1).abs().max()) < 1e-9
     assert all(torch.isfinite(g).all() for g in edl_gradients(network, x, error, 0.25).values())

@@ -5,7 +5,7 @@ import pytest
 
 from common.settings.config import LearnerSettings
 from common.types import Batch
-from learner.losses import LOSSES, output_error, td_errors
+from learner.losses import LOSSES, columns, output_error, td_errors
 
 ERRORS = np.array([-3.0, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5], np.float32)
 
@@ -50,7 +50,7 @@ def test_td_errors() -> None:
         actions=[0, 1, 1, 0], rewards=[1.0, 2.0, -1.0, 0.0], terminated=[False, True, False, False], span=[1, 1, 3, 2]
     )
     values = np.array([[1.0, 9.0], [9.0, 3.0], [9.0, 0.5], [4.0, 9.0]], np.float32)
-    errors = td_errors(batch, values, np.array([2.0, 9.0, 8.0, 4.0], np.float32), gamma=0.5)
+    errors = td_errors(columns(batch, 0.5), values, np.array([2.0, 9.0, 8.0, 4.0], np.float32))
     assert errors.dtype == np.float32
     # 1 - (1 + 2/2); 3 - 2, without a future; 0.5 - (-1 + 8/8); 4 - 4/4
     assert errors.tolist() == [-1.0, 1.0, 0.5, 3.0]
@@ -60,7 +60,7 @@ def test_targets_take_no_value_beyond_the_bound() -> None:
     """r + 0.5 V with V clipped to +-4: 1 + 2, 1 - 2, 1 + 1; the network's own value, 9, is not clipped."""
     batch = make_batch(actions=[0, 0, 0], rewards=[1.0, 1.0, 1.0])
     values, bootstrap = np.full((3, 1), 9, np.float32), np.array([6.0, -6.0, 2.0], np.float32)
-    errors = td_errors(batch, values, bootstrap, gamma=0.5, value_bound=4.0)
+    errors = td_errors(columns(batch, 0.5), values, bootstrap, value_bound=4.0)
     assert errors.dtype == np.float32
     assert errors.tolist() == [6.0, 10.0, 7.0]
 
@@ -74,6 +74,6 @@ def test_rewards_bound_values() -> None:
 
 def test_only_the_actions_taken_have_an_error() -> None:
     batch = make_batch(actions=[1, 0], weights=[1.0, 0.5])
-    error = output_error(batch, np.array([4.0, 6.0], np.float32), np.empty((2, 3), np.float32))
+    error = output_error(columns(batch, 0.5), np.array([4.0, 6.0], np.float32), np.empty((2, 3), np.float32))
     assert error.dtype == np.float32
     assert error.tolist() == [[0.0, 2.0, 0.0], [1.5, 0.0, 0.0]]

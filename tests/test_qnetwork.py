@@ -9,9 +9,11 @@ import torch
 
 from common.errors import UsageError
 from common.networks.network import build_network
-from common.settings.config import EdlSettings, LearnerSettings, NetworkSettings, RunConfig
+from common.settings.config import EdlSettings, NetworkSettings, RunConfig
 from common.types import Batch, EnvSpec
+from learner.edl.arrays import AnyArray
 from learner.edl.feedback import edl_gradients
+from learner.given import Given
 from learner.qnetwork import QNetwork, make_network, make_q_network
 
 CPU = torch.device("cpu")
@@ -25,7 +27,7 @@ def _q_network(config: RunConfig, spec: EnvSpec = VECTOR, number: int = 0) -> QN
 
 def _config(kind: str, method: str = "coop", feedback: Any = "transform", **changes: Any) -> RunConfig:
     network = NetworkSettings(kind, hidden=(16,), dtype=changes.pop("dtype", "float32"))
-    edl = EdlSettings(feedback=feedback, polar_dtype=changes.pop("polar_dtype", "float32"))
+    edl = EdlSettings(feedback=feedback)
     return RunConfig(method=method, seed=3, network=network, edl=edl, **changes)
 
 
@@ -64,7 +66,7 @@ def test_the_gradient_is_that_of_the_module(kind: str, spec: EnvSpec, in_numpy: 
     with torch.inference_mode():
         values = network.network.module(_inputs(spec)).numpy()
         np.testing.assert_allclose(network.values(_inputs(spec)), values, rtol=1e-5, atol=1e-6)
-    assert isinstance(network.inputs(_batch(spec), spec), np.ndarray) == in_numpy
+    assert network.in_numpy == isinstance(_network_inputs(network, _batch(spec)), np.ndarray) == in_numpy
 
 
 def test_the_gradient_of_another_cost_is_added_without_s() -> None:
@@ -88,13 +90,18 @@ def _batch(spec: EnvSpec) -> Batch:
     )  # fmt: skip
 
 
+def _network_inputs(network: QNetwork, batch: Batch) -> AnyArray:
+    given = Given.of(batch, 0.9, 0.0, 0.1, None if network.in_numpy else CPU)
+    return network.inputs(given.frames, given.index)
+
+
 @pytest.mark.parametrize("kind", ["minatar", "mlp"])
 def test_inputs_are_channels_of_stacked_frames_obs_before_next_obs(kind: str) -> None:
     """minatar has its inputs in numpy, a picture's mlp in PyTorch."""
     batch = _batch(PICTURES)
     order = [[0, 1, 2], [3, 2, 0], [1, 2, 4], [5, 5, 1]]
     expected = [np.concatenate([batch.frames[i].transpose(2, 0, 1) for i in stack]) / 255 for stack in order]
-    found = _q_network(_config(kind), PICTURES).inputs(batch, PICTURES)
+    found = _network_inputs(_q_network(_config(kind), PICTURES), batch)
     np.testing.assert_allclose(found, np.stack(expected), rtol=1e-6)
 
 
@@ -117,13 +124,6 @@ def test_every_pass_can_run_in_half_precision(method: str, feedback: str) -> Non
     assert 1e-3 < rounding < 0.03
 
 
-def test_a_polar_part_in_half_precision_is_nearly_the_same() -> None:
-    network = _q_network(_config("mlp", polar_dtype="bfloat16"))
-    found, wanted = _gradient(network, VECTOR), _expected(network, VECTOR)
-    assert 1e-4 < float((found - wanted).norm() / wanted.norm()) < 0.03
-    torch.testing.assert_close(_gradient(network, VECTOR, 0.0), _expected(network, VECTOR, 0.0))
-
-
 @pytest.mark.parametrize(("method", "seeds"), [("coop", (0, 1)), ("dqn", (0, 0))])
 def test_initial_parameters_are_those_of_the_runs_seed(method: str, seeds: tuple[int, int]) -> None:
     for number, entry in enumerate(seeds):
@@ -140,8 +140,6 @@ STACKS = "with network.kind = 'custom_networks:duel'; only stacks of Linear, Con
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"learner": LearnerSettings(compile=True)}, f"learner.compile = True: allowed: False {STACKS}"),
-        ({"edl": EdlSettings(polar_dtype="bfloat16")}, f"edl.polar_dtype = 'bfloat16': allowed: 'float32' {STACKS}"),
         ({"network": NetworkSettings("custom_networks:duel", dtype="bfloat16")},
          f"network.dtype = 'bfloat16': allowed: 'float32' {STACKS}"),
         ({"network": NetworkSettings("custom_networks:twice")},

@@ -283,6 +283,6 @@ def test_a_learner_sets_priorities_with_its_next_draw(nodes: tuple[Node, Node], 
         batch = got[0]
         if number == 0:
             chosen = int(batch.ids[0])
-        samples.prioritise(batch, np.where(batch.ids == chosen, 1e6, 1e-3).astype(np.float32))
+        samples.prioritise(batch.ids, np.where(batch.ids == chosen, 1e6, 1e-3).astype(np.float32))
         if number > 3:  # two requests were under way before the first priorities were known
             assert (batch.ids == chosen).all()

@@ -75,13 +75,12 @@ def test_tables_of_methods_are_checked(text: str, words: str) -> None:
     ("flags", "names"),
     [
         (["--method", "dqn", "--edl.rate", "0.1"], ["edl.rate"]),
-        (["--method", "g-coop", "--edl.polar-dtype=bfloat16", "--edl.decay", "1"], ["edl.decay", "edl.polar-dtype"]),
+        (["--method", "g-coop", "--edl.noise=normal", "--edl.decay", "1"], ["edl.decay", "edl.noise"]),
         (["--method", "coop", "--edl.rate", "0.1", "--edl.decay-every", "5"], []),
         (["--edl.feedback", "random", "--edl.rate", "1"], ["edl.rate"]),
         (["--edl.rate", "0", "--edl.noise", "normal"], ["edl.noise"]),
         (["--edl.decay", "1", "--edl.decay-every", "5"], ["edl.decay-every"]),
-        (["--edl.feedback", "weight-gradient", "--edl.polar_dtype", "float32"], ["edl.polar-dtype"]),
-        (["--network.dtype", "bfloat16", "--edl.polar-dtype", "bfloat16"], ["edl.polar-dtype"]),
+        (["--learner.tf32", "false"], ["learner.tf32"]),
         (["--preset", "catch", "--network.hidden", "3", "4"], ["network.hidden"]),
         (["--method", "dqn", "--learner.target-update-every", "5"], []),
         (

@@ -42,8 +42,8 @@ def _updates() -> Iterator[Comparison]:
 
 
 def _update_subjects(kind: str, batch: int, device: str) -> dict[str, Subject]:
-    def ours(method: str, dtype: str, *compiled: str) -> Subject:
-        return Subject("update_coop", (kind, method, str(batch), dtype, device, *compiled))
+    def ours(method: str, dtype: str) -> Subject:
+        return Subject("update_coop", (kind, method, str(batch), dtype, device))
 
     subjects = {
         "Stable-Baselines3": Subject("update_sb3", (kind, str(batch), device)),
@@ -53,8 +53,6 @@ def _update_subjects(kind: str, batch: int, device: str) -> dict[str, Subject]:
     quick = batch == 32 or device != "cpu" or fast_bfloat16()
     if kind in ("nips2013", "nature") and quick:
         subjects |= {f"{method} bfloat16": ours(method, "bfloat16") for method in ("dqn", "coop")}
-    if device != "cpu":
-        subjects |= {f"{method} compiled": ours(method, "float32", "compiled") for method in ("dqn", "coop")}
     return subjects
 
 

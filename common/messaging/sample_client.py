@@ -108,9 +108,9 @@ class SampleClient:
         """End `pin`."""
         self._pinned = None
 
-    def prioritise(self, batch: Batch, priorities: NDArray[np.float32]) -> None:
-        """Set the priorities, float32 [batch], of a batch's transitions with the next request."""
-        self._trained.extend(zip(batch.ids.tolist(), priorities.tolist(), strict=True))
+    def prioritise(self, ids: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
+        """Set the priorities, float32 [n], of the transitions numbered ids, int64 [n], with the next request."""
+        self._trained.extend(zip(ids.tolist(), priorities.tolist(), strict=True))
 
     def next(self) -> tuple[Batch, Drawn] | None:
         """The next batch and the episodes that ended since the last one; None if no batch is available yet.

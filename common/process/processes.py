@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -12,7 +13,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from common.errors import RunError
 from common.places import working_directory
 from common.process.lifecycle import SIGNALS, SUPERVISED, status_after
 from common.process.limits import memory_kills, memory_limit
@@ -144,15 +144,13 @@ class ChildProcess:
 
 
 def command(name: str, *flags: str) -> list[str]:
-    """The command line of a console command of this installation.
+    """The command line of a console command: the script beside the interpreter, or on PATH, or else its module.
 
-    Raises:
-        RunError: it is not installed.
+    Scripts of packages that are installed with --target lie in none of these places.
     """
     path = Path(sysconfig.get_path("scripts")) / name
-    if not path.exists():
-        raise RunError(f"{path}: not installed beside {sys.executable}")
-    return [str(path), *flags]
+    found = str(path) if path.exists() else shutil.which(name)
+    return [*([found] if found else [sys.executable, "-m", "deploy.commands", name]), *flags]
 
 
 def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:

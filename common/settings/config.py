@@ -102,8 +102,8 @@ class LearnerSettings:
     """Folder of a run, with whose newest networks this run begins; empty: random weights."""
     device: str = "cpu"
     """PyTorch device of the networks, for example cpu or cuda."""
-    compile: bool = False
-    """Run the passes through torch.compile, on a CPU by a C++ compiler; no gain was measured there or on an H100."""
+    tf32: bool = True
+    """Let a GPU's matrix units read float32 numbers with 10 bits of mantissa; not where exactness needs more."""
     threads: Positive = 1
     """CPU threads that PyTorch uses in the learner."""
     prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 4
@@ -136,8 +136,6 @@ class EdlSettings:
     """normal: s is the rate times one draw from N(0, 1) per update."""
     feedback: Literal["transform", "weight-gradient", "random"] = "transform"
     """U, S and V: of each layer's Jacobian (transform), of its weight gradient, or a fixed random B instead."""
-    polar_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Precision of the s U V^T part of the transform feedback; T^T e has that of network.dtype."""
 
 
 @dataclass(frozen=True)

@@ -18,20 +18,8 @@ _CONDITIONS = (
         lambda c: c.edl.feedback != "random",
         "the matrices of edl.feedback = 'random' have no s",
     ),
-    Condition(
-        ("edl.decay", "edl.decay_every", "edl.noise", "edl.polar_dtype"), lambda c: c.edl.rate > 0, "edl.rate = 0"
-    ),
+    Condition(("edl.decay", "edl.decay_every", "edl.noise"), lambda c: c.edl.rate > 0, "edl.rate = 0"),
     Condition(("edl.decay_every",), lambda c: c.edl.decay < 1, "edl.decay = 1"),
-    Condition(
-        ("edl.polar_dtype",),
-        lambda c: c.edl.feedback == "transform",
-        "edl.feedback = {c.edl.feedback!r} has no such part",
-    ),
-    Condition(
-        ("edl.polar_dtype",),
-        lambda c: c.network.dtype == "float32",
-        "network.dtype = {c.network.dtype!r} has it in that precision too",
-    ),
     Condition(("network.hidden",), lambda c: c.network.kind == "mlp", "{c.network.kind} has layers of its own"),
     Condition(
         ("learner.swap_every",),
@@ -49,6 +37,7 @@ _CONDITIONS = (
     Condition(("learner.alpha",), lambda c: c.learner.optimizer in ("rmsprop", "rmsprop-mnih"), _OPTIMIZER),
     Condition(("learner.gradient_alpha",), lambda c: c.learner.optimizer == "rmsprop-mnih", _OPTIMIZER),
     Condition(("learner.beta1", "learner.beta2"), lambda c: c.learner.optimizer == "adam", _OPTIMIZER),
+    Condition(("learner.tf32",), lambda c: c.learner.device != "cpu", "learner.device = 'cpu'"),
     Condition(("learner.eps",), lambda c: c.learner.optimizer != "sgd", _OPTIMIZER),
     Condition(
         ("replay.priority_exponent", "replay.importance_exponent"),

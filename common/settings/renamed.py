@@ -14,6 +14,8 @@ _RENAMED = {
     "replay": {"start": "learning_starts"},
     "learner": {"denominator": "eps", "swap_by": "swap_unit"},
 }
+# These chose between ways that have become one; files may still name them.
+_GONE = {"learner": {"compile"}, "edl": {"polar_dtype"}}
 # The meaning of these depended on the optimizer; a name that is not listed keeps its meaning.
 _OF_OPTIMIZER = {
     "sgd": {"squared_decay": "alpha"},
@@ -87,7 +89,7 @@ def _sections(tables: Mapping[str, Any], optimizer: str, found: dict[str, str]) 
     if isinstance(learner, Mapping):
         optimizer = str(learner.get("optimizer", optimizer))
     renamed = dict(tables)
-    for section in _RENAMED:
+    for section in _RENAMED | _GONE:
         if isinstance(table := tables.get(section), Mapping):
             renamed[section] = _section(section, table, optimizer, found)
     if isinstance(methods := tables.get("methods"), Mapping):
@@ -104,6 +106,8 @@ def _section(section: str, table: Mapping[str, Any], optimizer: str, found: dict
         names.pop("momentum", None)
     renamed: dict[str, Any] = {}
     for former, value in table.items():
+        if former in _GONE.get(section, ()):
+            continue
         name = names.get(former, former)
         if name != former and name in table:
             raise UsageError(f"{section}.{former} and {section}.{name}: two names of one setting; give the second")

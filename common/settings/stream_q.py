@@ -34,7 +34,7 @@ _UNUSED = (
     *("learner.learning_rate_final", "learner.learning_rate_decay", "learner.learning_rate_decay_every"),
     *("learner.momentum", "learner.alpha"),
     *("learner.gradient_alpha", "learner.beta1", "learner.beta2", "learner.eps", "learner.weight_decay"),
-    *("learner.device", "learner.compile"),
+    *("learner.device", "learner.tf32"),
 )
 
 STREAM_Q = Method(

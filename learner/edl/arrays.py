@@ -36,7 +36,7 @@ class Namespace(Protocol[ArrayT]):
     def zeros_like(self, array: ArrayT, /) -> ArrayT: ...
     def broadcast_to(self, array: ArrayT, shape: Sequence[int], /) -> ArrayT: ...
     def concatenate(self, arrays: Sequence[ArrayT], /) -> ArrayT: ...
-    def where(self, condition: ArrayT, array: ArrayT, other: float, /) -> ArrayT: ...
+    def where(self, condition: ArrayT, array: ArrayT, other: ArrayT | float, /) -> ArrayT: ...
     def isfinite(self, array: ArrayT, /) -> ArrayT: ...
     def amin(self, array: ArrayT, axis: int, /) -> ArrayT: ...
     def amax(self, array: ArrayT, axis: int, /) -> ArrayT: ...
@@ -79,3 +79,20 @@ def at_least_float32(array: ArrayT) -> ArrayT:
 def assign(array: ArrayT, values: AnyArray) -> None:
     """Overwrite `array` with `values`, of either library and any dtype, in one pass."""
     array[:] = values if type(values) is type(array) else convert_like(values, array)
+
+
+def chosen(values: ArrayT, actions: ArrayT) -> ArrayT:
+    """values[i, actions[i]] of each row i: values [batch, actions], actions int64 [batch] -> [batch]."""
+    if isinstance(values, Tensor):
+        return values.gather(1, actions[:, None])[:, 0]
+    picked: ArrayT = values[np.arange(len(actions)), actions]
+    return picked
+
+
+def placed(values: ArrayT, actions: ArrayT, like: ArrayT) -> ArrayT:
+    """`values` [batch] at the columns `actions`, int64 [batch], of zeros shaped like `like` [batch, n]."""
+    zeros = namespace(like).zeros_like(like)
+    if isinstance(zeros, Tensor):
+        return zeros.scatter_(1, actions[:, None], values[:, None])
+    zeros[np.arange(len(actions)), actions] = values
+    return zeros

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Generic
+from typing import Any, Generic
 
 import numpy as np
 import torch
@@ -44,8 +44,6 @@ class FeedbackRule(Generic[ArrayT]):
         U (S + s I) V^T of each weight gradient; biases plain) or "random" (fixed B(i), direct feedback alignment).
     seed: of the fixed matrices of "random".
     rng: draws the completion of rank-deficient gradients for "weight-gradient" (default: a generator from `seed`).
-    polar_dtype: dtype of the passes that only the polar part needs; T(i)^T e always has the network's. None: the
-        network's. Only for plain stacks in PyTorch.
     """
 
     chain: Passes[ArrayT]
@@ -55,7 +53,6 @@ class FeedbackRule(Generic[ArrayT]):
         chain: Passes[ArrayT],
         feedback: str = "transform",
         seed: int = 0,
-        polar_dtype: torch.dtype | None = None,
         rng: np.random.Generator | None = None,
     ) -> None:
         if feedback not in FEEDBACKS:
@@ -64,39 +61,33 @@ class FeedbackRule(Generic[ArrayT]):
         self.chain = chain
         self.feedback = feedback
         self._seed = seed
-        self._polar_dtype = polar_dtype
         self._rng = rng or np.random.default_rng(seed)
         self._fixed: dict[int, ArrayT] = {}
 
-    def backward(self, tape: Tape[ArrayT], error: ArrayT, s: float, out: Mapping[str, ArrayT]) -> None:
+    def backward(self, tape: Tape[ArrayT], error: ArrayT, s: Any, out: Mapping[str, ArrayT]) -> None:  # noqa: ANN401
         """Write one gradient per named parameter into `out`.
 
         tape: of the chain's forward pass. error: [batch, actions], the output error e, already divided by the batch
-        size. s: the exploration rate. The caller disables autograd and numpy's warnings of non-finite values.
+        size. s: the exploration rate, a number, or a tensor of one on the network's device, whose value then decides
+        nothing. The caller disables autograd and numpy's warnings of non-finite values.
         """
         if self.feedback == "random":
             for index in self.chain.parametrised:
                 self.chain.write(tape, index, self._aligned(tape, index, error), out)
-        elif self.feedback == "transform" and s != 0:
+        elif self.feedback == "transform" and _given(s):
             self._transform(tape, error, s, out)
         else:
             for index, delta in self.chain.walk(tape, error[:, None]):
                 self.chain.write(tape, index, delta[:, 0], out)
-                if self.feedback == "weight-gradient" and s != 0:
+                if self.feedback == "weight-gradient" and _given(s):
                     gradient = out[self.chain.names[index] + "weight"]
                     gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index], self._rng)
         self.chain.write_rest(tape, error, out)
 
-    def _transform(self, tape: Tape[ArrayT], error: ArrayT, s: float, out: Mapping[str, ArrayT]) -> None:
+    def _transform(self, tape: Tape[ArrayT], error: ArrayT, s: Any, out: Mapping[str, ArrayT]) -> None:  # noqa: ANN401
         """Compute sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e and the gradients of every layer."""
-        transforms = Transforms(self.chain, tape, self._polar_dtype)
-        if self._polar_dtype is None:
-            for index, sigma in transforms.apply_feedback(error, s):
-                self.chain.write(tape, index, sigma, out)
-        else:
-            polar_parts = dict(transforms.apply_feedback(error, s, polar_only=True))
-            for index, delta in self.chain.walk(tape, error[:, None]):
-                self.chain.write(tape, index, delta[:, 0] + polar_parts[index], out)
+        for index, sigma in Transforms(self.chain, tape).apply_feedback(error, s):
+            self.chain.write(tape, index, sigma, out)
 
     def _aligned(self, tape: Tape[ArrayT], index: int, error: ArrayT) -> ArrayT:
         """B(i)^T e with the fixed B(i) of layer `index`; that of a last layer is the identity, like T(d)."""
@@ -111,6 +102,11 @@ class FeedbackRule(Generic[ArrayT]):
             self._fixed[index] = convert_like(draw, error)
         delta: ArrayT = (error @ self._fixed[index]).reshape(shape)
         return delta
+
+
+def _given(s: Any) -> bool:  # noqa: ANN401
+    """Whether there may be an s U V^T."""
+    return isinstance(s, Tensor) or s != 0
 
 
 def _polar_of_gradient(gradient: ArrayT, delta: ArrayT, h: ArrayT, rng: np.random.Generator) -> ArrayT:
@@ -132,18 +128,17 @@ def edl_gradients(
     feedback: str = "transform",
     *,
     seed: int = 0,
-    polar_dtype: torch.dtype | None = None,
 ) -> dict[str, Tensor]:
     """One gradient per named parameter of `network`, in the parameter's shape and dtype.
 
     obs: float [batch, *input]. output_error: [batch, actions], e, already divided by the batch size. s: the
-    exploration rate. feedback, seed, polar_dtype: see FeedbackRule. Raises UnsupportedLayerError, which names the
+    exploration rate. feedback, seed: see FeedbackRule. Raises UnsupportedLayerError, which names the
     layer, for a network on which the feedback has no meaning.
     """
     chain = make_passes(network, None if feedback == "none" else obs)
     out = {name: torch.empty_like(p) for name, p in network.named_parameters()}
     with torch.no_grad():
-        FeedbackRule(chain, feedback, seed, polar_dtype).backward(chain.forward(obs), output_error, s, out)
+        FeedbackRule(chain, feedback, seed).backward(chain.forward(obs), output_error, s, out)
     return out
 
 

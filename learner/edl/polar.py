@@ -115,6 +115,47 @@ def _whitened_by_eigh(g: ArrayT, e: ArrayT, limits: _Limits) -> tuple[ArrayT, Ar
     return white, None if safe.all() else ~safe
 
 
+def inverse_root(grams: Tensor) -> Tensor:
+    """G^(-1/2) of symmetric positive matrices, float64 [..., m, m]; nan if a matrix is not finite.
+
+    On a processor LAPACK takes a tenth of the time of the products; on a GPU it would wait for the host.
+    """
+    if grams.is_cuda:
+        return newton_schulz(grams)
+    units = torch.eye(grams.shape[-1], dtype=grams.dtype)
+    finite = grams.isfinite().all(-1).all(-1)[..., None, None]
+    values, vectors = torch.linalg.eigh(torch.where(finite, grams, units))
+    root: Tensor = (vectors * values.clamp_min(1e-300).rsqrt()[..., None, :]) @ vectors.mT
+    return root.masked_fill(~finite, torch.nan)
+
+
+def newton_schulz(grams: Tensor) -> Tensor:
+    """G^(-1/2) of symmetric positive matrices, float64 [..., m, m], whose eigenvalues are above 1e-10 of their sum.
+
+    The coupled Newton-Schulz iteration y <- y t, z <- t z with t = rho (3 I - rho^2 z y) / 2, from y = G / tr G and
+    z = I, scaled (Chen and Chow 2014): with x the root of the smallest eigenvalue of z y, rho is what brings it closest
+    to 1, but no more than is stable. x is known of the worst case, so rho is the same for all matrices.
+    """
+    units = torch.eye(grams.shape[-1], dtype=grams.dtype, device=grams.device)
+    trace = grams.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    y, z = grams / trace, units
+    for rho in SCALES:
+        t = 1.5 * rho * units - 0.5 * rho**3 * (z @ y)
+        y, z = y @ t, t @ z
+    return z * trace.rsqrt()
+
+
+def _scales() -> list[float]:
+    x, scales = 1e-5, []
+    while 1 - x > 1e-9:
+        scales.append(min((3 / (1 + x + x * x)) ** 0.5, 1.6977))
+        x = 0.5 * scales[-1] * x * (3 - scales[-1] ** 2 * x * x)
+    return [*scales, 1.0]
+
+
+SCALES = _scales()
+
+
 def polar(matrix: Tensor, rng: np.random.Generator) -> Tensor:
     """U V^T of one matrix [m, n], by the Gram matrix of its shorter side, computed in float64; nan if not finite.
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from learner.edl.arrays import ArrayT, Namespace, at_least_float32, convert_like, in_dtype, namespace, widened
+from learner.edl.completed import Jacobians
 from learner.edl.passes import Passes, Tape
 from learner.edl.polar import polar_by_svd, whitened
 
@@ -25,6 +26,9 @@ class Transforms(Generic[ArrayT]):
     the network's own dtype. T of a final Linear layer is the identity and is not held.
 
     The polar factor of a T that lacks rank by construction (see `Range`) is the thin one, which stays in T's range.
+
+    For arrays of numpy, samples without an accurate Gram matrix are found and get an SVD each. For tensors no value
+    decides what is computed (see `learner.edl.completed`).
     """
 
     _chain: Passes[ArrayT]
@@ -34,16 +38,13 @@ class Transforms(Generic[ArrayT]):
     _actions: int
     _ts: list[ArrayT]
 
-    def __init__(self, chain: Passes[ArrayT], tape: Tape[ArrayT], dtype: torch.dtype | None = None) -> None:
-        """dtype: of the computation of T(i), the network's if None; the algebra on them uses at least float32.
-
-        What goes back to the layers has the network's dtype.
-        """
+    def __init__(self, chain: Passes[ArrayT], tape: Tape[ArrayT]) -> None:
+        """T(i) has the network's dtype; the algebra on them uses at least float32."""
         self._chain = chain
         self._batch, self._actions = tape.output.shape
         self._dtype = tape.output.dtype
         self._basis = _basis(chain.output_weight, at_least_float32(tape.output))
-        walk = chain.walk(tape, in_dtype(self._basis[None], dtype or self._dtype), dtype)
+        walk = chain.walk(tape, in_dtype(self._basis[None], self._dtype))
         self._linear_end = next(walk)[0] if chain.output_weight is not None else None
         # The layers held, last first: step, shape of its output, and T as [batch or 1, A, n].
         self._layers: list[tuple[int, tuple[int, ...]]] = []
@@ -54,18 +55,23 @@ class Transforms(Generic[ArrayT]):
             self._ts.append(flat if flat.dtype == self._basis.dtype else convert_like(flat, self._basis))
         self._ranges = [chain.range_of(index) for index, _ in self._layers]
 
-    def apply_feedback(self, error: ArrayT, s: float, polar_only: bool = False) -> Iterator[tuple[int, ArrayT]]:
+    def apply_feedback(self, error: ArrayT, s: Any) -> Iterator[tuple[int, ArrayT]]:  # noqa: ANN401
         """Yield (step, B(i)^T e) for each layer, last first: error [batch, A] -> [batch, *shape].
 
-        polar_only: compute s (U V^T)^T e instead of (T(i) + s U V^T)^T e.
+        s: a number, or a tensor of one where the arrays are tensors.
         """
         if self._linear_end is not None:
-            yield self._linear_end, error * (s if polar_only else 1 + s)
+            yield self._linear_end, error * (1 + s)
         if not self._ts:
             return
         e = at_least_float32(error) @ self._basis.T
+        if isinstance(e, Tensor):
+            sigmas: list[Any] = list(self._jacobians().apply(e, s))
+            for (index, shape), one in zip(self._layers, sigmas, strict=True):
+                yield index, in_dtype(_shaped(one, shape), self._dtype)
+            return
         white, doubtful = whitened(self._grams(), e)
-        weights = s * white if polar_only else e + s * white
+        weights = e + s * white
         for i, (index, shape) in enumerate(self._layers):
             sigma = self._chain.combine(weights[i], self._ts[i])
             if doubtful is not None and doubtful[i].any():
@@ -82,15 +88,26 @@ class Transforms(Generic[ArrayT]):
             found.append((self._linear_end, namespace(units).broadcast_to(units * (1 + s), whole)))
         if not self._ts:
             return found
-        roots, doubtful = whitened(self._grams()[:, :, None], units)
-        for i, (index, shape) in enumerate(self._layers):
-            b = self._ts[i] + s * (roots[i] @ self._ts[i])
-            if doubtful is not None:
-                where = doubtful[i, :, 0]
-                b[where] += s * self._by_svd(i, where)
-            b = self._basis.mT @ b
+        wholes: list[Any] = []
+        if isinstance(units, Tensor):
+            wholes += self._jacobians().matrices(s)
+        else:
+            roots, doubtful = whitened(self._grams()[:, :, None], units)
+            for i, t in enumerate(self._ts):
+                b = t + s * (roots[i] @ t)
+                if doubtful is not None:
+                    where = doubtful[i, :, 0]
+                    b[where] += s * self._by_svd(i, where)
+                wholes.append(b)
+        for (index, shape), whole in zip(self._layers, wholes, strict=True):
+            b = self._basis.mT @ whole
             found.append((index, _shaped(b, shape).reshape(b.shape)))
         return found
+
+    def _jacobians(self) -> Jacobians:
+        ts: Any = self._ts
+        basis: Any = self._basis
+        return Jacobians(ts, self._ranges, basis, self._batch)
 
     def _grams(self) -> ArrayT:
         """G(i) = T(i) T(i)^T of every layer held: [layers, batch, A, A]."""
@@ -101,35 +118,26 @@ class Transforms(Generic[ArrayT]):
         return xp.concatenate(whole).reshape(-1, *shape)
 
     def _gram(self, i: int) -> ArrayT:
-        """G of the i-th layer held, made non-singular outside a known range: [batch or 1, A, A]."""
-        t: ArrayT = self._ts[i]
-        reach = self._ranges[i]
-        gram: ArrayT = self._chain.gram(t)
-        if reach is None:
-            return gram
-        # The root of a sum of two matrices on orthogonal subspaces acts on T like that of G alone.
-        size = namespace(gram).einsum("...ii->...i", gram).mean(1)
-        whole: ArrayT = gram + size[:, None, None] * (self._basis @ convert_like(reach.outside, t) @ self._basis.mT)
-        return whole
+        """G of the i-th layer held: [batch or 1, A, A]."""
+        gram: ArrayT = self._chain.gram(self._ts[i])
+        return gram
 
     def _by_svd(self, i: int, where: ArrayT) -> ArrayT:
         """Polar factors of those samples of the i-th T [batch or 1, A, n] for which `where` is true: [k, A, n]."""
         t: ArrayT = self._ts[i]
-        reach = self._ranges[i]
         chosen = namespace(t).broadcast_to(t, (self._batch, *t.shape[1:]))[where]
-        if reach is None:
-            return convert_like(polar_by_svd(torch.as_tensor(chosen)), t)
-        basis = self._basis @ convert_like(reach.basis, t)
-        factor: ArrayT = basis @ convert_like(polar_by_svd(torch.as_tensor(basis.mT @ chosen), reach.rank), t)
-        return factor
+        return convert_like(polar_by_svd(torch.as_tensor(chosen)), t)
 
 
 def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
     """An orthogonal Q [A, A] that makes the rows of Q W nearly orthogonal, for the output weight W [A, n].
 
-    For few actions, and without W, the first row of Q takes the mean of the actions' values.
+    For few actions, without W, and for tensors, the first row of Q takes the mean of the actions' values: hardly less
+    accurate, and the same for all weights.
     """
     actions = output.shape[1]
+    if isinstance(output, Tensor):
+        return _mean_first(actions, output.dtype, output.device)
     if actions == 2:
         return convert_like(_SUM_AND_DIFFERENCE, output)
     if actions == 3 or output_weight is None:
@@ -138,6 +146,12 @@ def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
     gram = w @ w.T
     _, vectors = xp.linalg.eigh(gram if xp.isfinite(gram).all() else xp.zeros_like(gram))
     return convert_like(vectors.T, output)
+
+
+@cache
+def _mean_first(actions: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Q [A, A] on its device, where it is copied once."""
+    return (_SUM_AND_DIFFERENCE if actions == 2 else _reflection(actions)).to(device, dtype)
 
 
 @cache

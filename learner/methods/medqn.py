@@ -12,7 +12,7 @@ from common.settings.config import RunConfig
 from common.settings.medqn import MedqnSettings
 from learner.edl.arrays import AnyArray
 from learner.methods.rule import Rule
-from learner.qnetwork import QNetwork, on_host
+from learner.qnetwork import QNetwork, as_float32, on_host
 
 Bounds = NDArray[np.float32]
 
@@ -42,8 +42,8 @@ class Consolidation(Rule):
         obs = inputs[: len(inputs) // 2]
         states = obs if self.settings.states == "real" else self._draw(inputs, len(obs))
         tape = online.forward(states)
-        gap = on_host(tape.output) - target.values(states)
-        online.add_gradient(tape, np.float32(2 * self.strength(update) / len(states)) * gap)
+        gap = as_float32(tape.output) - target.values(states)
+        online.add_gradient(tape, 2 * self.strength(update) / len(states) * gap)
 
     def _draw(self, inputs: AnyArray, count: int) -> Bounds:
         """Widen the bounds by inputs [n, *input], and draw `count` states between them."""

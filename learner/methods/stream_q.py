@@ -48,6 +48,7 @@ class StreamAgent:
     """
 
     acting = 0
+    lag = 0
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
         """Raise UsageError for a network that the method can't train."""

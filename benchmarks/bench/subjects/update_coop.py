@@ -1,4 +1,4 @@
-"""Our updates on one batch in memory: update_coop.py KIND METHOD BATCH DTYPE DEVICE [compiled]."""
+"""Our updates on one batch in memory: update_coop.py KIND METHOD BATCH DTYPE DEVICE."""
 
 import sys
 
@@ -10,10 +10,10 @@ from common.process.memory import keep_freed_memory
 from common.process.threads import use_threads
 from learner.agent import Agent
 
-kind, method, batch_size, dtype, device, *compiled = sys.argv[1:]
+kind, method, batch_size, dtype, device = sys.argv[1:]
 use_threads(1)
 keep_freed_memory()
 spec = KINDS[kind][1]
-agent = Agent(update_config(kind, method, int(batch_size), dtype, device, compiled=bool(compiled)), spec)
+agent = Agent(update_config(kind, method, int(batch_size), dtype, device), spec)
 batch = random_batch(spec, int(batch_size))
 attend(lambda seconds: {"updates/s": rate(lambda: agent.update(batch), seconds, on=device)})

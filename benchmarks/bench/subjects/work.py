@@ -47,8 +47,6 @@ def update_config(
     batch_size: int,
     dtype: str,
     device: str = "cpu",
-    *,
-    compiled: bool = False,
     **replay: float,
 ) -> RunConfig:
     """A preset's settings with single targets, whatever the method: Adam, Huber's loss, as all subjects have it.
@@ -59,7 +57,7 @@ def update_config(
     tables.pop("methods", None)
     tables["network"] |= {"dtype": dtype}
     adam = {"optimizer": "adam", "learning_rate": 1e-4, "eps": 1e-8, "loss": "huber", "double": False}
-    tables["learner"] |= adam | {"batch_size": batch_size, "swap_every": 10_000, "device": device, "compile": compiled}
+    tables["learner"] |= adam | {"batch_size": batch_size, "swap_every": 10_000, "device": device}
     tables["replay"] |= replay
     return resolve({**tables, "run": "bench", "total_steps": 10**12}, method)
 

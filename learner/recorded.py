@@ -1,0 +1,267 @@
+"""Updates recorded once and repeated as a whole: on a GPU as CUDA graphs, which the host starts with one call.
+
+The batch, s and the learning rate lie at fixed addresses, where `Feed` copies them from pinned memory on a stream of
+its own; TD errors are copied back without waiting, and read when they are wanted.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from common.settings.config import RunConfig
+from common.types import Batch, EnvSpec
+from learner.given import Given, indices
+from learner.losses import Columns, Values, columns
+
+Capture = Callable[[Callable[[], None], torch.device], Callable[[], None]]
+"""Makes a function without arguments, of a device, repeatable; it may run before, but does not while it is recorded."""
+
+_LANES = 3  # batches on their way to the device
+_WARM_UPS = 3  # runs in which libraries choose their algorithms and allocate what stays
+_LATE = 64  # TD errors of so many updates are on their way to the host
+_ALIGNMENT = 64  # bytes
+
+
+class Learner(Protocol):
+    """What `Recorded` asks of the agent: its state, and its optimizers' counts of steps."""
+
+    optimizers: list[Any]
+
+    def state(self) -> dict[str, Any]:
+        """The state for `load_state`."""
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore a state from `state`."""
+
+
+def cuda_graph(function: Callable[[], None], device: torch.device) -> Callable[[], None]:
+    """Record a function as a CUDA graph; returns what repeats it. Raises RuntimeError if it can't be recorded."""
+    torch.cuda.synchronize(device)
+    side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+    side.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(side):
+        for _ in range(_WARM_UPS):
+            function()
+    torch.cuda.current_stream(device).wait_stream(side)
+    torch.cuda.synchronize(device)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        function()
+    repeat: Callable[[], None] = graph.replay
+    return repeat
+
+
+def plain_call(function: Callable[[], None], device: torch.device) -> Callable[[], None]:
+    """The function itself, after the runs that recording needs: for tests of all else on a CPU."""
+    for _ in range(_WARM_UPS):
+        function()
+    return function
+
+
+class Late:
+    """TD errors on their way to the host: float32 [batch]."""
+
+    def __init__(self, slot: Tensor, copied: torch.cuda.Event | None) -> None:
+        self._slot: Tensor | None = slot
+        self._copied = copied
+        self._values: Values | None = None
+
+    def read(self) -> Values:
+        """Wait for them, and return them."""
+        if self._slot is not None:
+            if self._copied is not None:
+                self._copied.synchronize()
+            self._values, self._slot = self._slot.numpy().copy(), None
+        assert self._values is not None
+        return self._values
+
+
+class Recorded:
+    """The updates of an agent, one recording for each acting role."""
+
+    def __init__(
+        self,
+        learn: Callable[[int, Given], Tensor],
+        config: RunConfig,
+        spec: EnvSpec,
+        device: torch.device,
+        capture: Capture,
+        agent: Learner,
+    ) -> None:
+        """learn: the update of a role with a batch; it returns the TD errors."""
+        self._learn, self._device, self._capture, self._agent = learn, device, capture, agent
+        self._size, self._gamma, self._stack = config.learner.batch_size, config.learner.gamma, spec.stack
+        self._feed = Feed(spec, self._size, device)
+        self._errors = torch.zeros(self._size, device=device)
+        self._repeat: dict[int, Callable[[], None]] = {}
+        self._on_gpu = device.type == "cuda"
+        self._slots = _pinned(torch.empty(_LATE, self._size), self._on_gpu)
+        self._late: deque[Late] = deque(maxlen=_LATE)
+        self._count = 0
+        if self._on_gpu:
+            torch.backends.cudnn.benchmark = True  # shapes never change
+
+    def fits(self, batch: Batch) -> bool:
+        """Whether a batch has the recorded sizes."""
+        return len(batch) == self._size and batch.obs_index.shape[1] == self._stack
+
+    def run(self, acting: int, batch: Batch, s: float, rate: float) -> Late:
+        """Start the update of a role with a batch. Raises RuntimeError if it can't be recorded."""
+        self._feed.load(batch, columns(batch, self._gamma), s, rate)
+        if acting not in self._repeat:
+            self._record(acting)
+        self._repeat[acting]()
+        self._agent.optimizers[acting].steps += 1
+        if len(self._late) == _LATE:
+            self._late[0].read()  # its slot is the next one
+        slot = self._slots[self._count % _LATE]
+        slot.copy_(self._errors, non_blocking=True)
+        late = Late(slot, _event() if self._on_gpu else None)
+        self._late.append(late)
+        self._count += 1
+        return late
+
+    def _record(self, acting: int) -> None:
+        """Record the update of a role, and leave the agent as it was."""
+        state = self._agent.state()
+
+        def update() -> None:
+            self._errors.copy_(self._learn(acting, self._feed.given))
+
+        try:
+            repeat = self._capture(update, self._device)
+            if not self._on_gpu:
+                repeat = self._uncounted(repeat, acting)
+            self._repeat[acting] = repeat
+        finally:
+            self._agent.load_state(state)
+
+    def _uncounted(self, update: Callable[[], None], acting: int) -> Callable[[], None]:
+        """An update that, like a recorded one, leaves the optimizer's count on the host as it is."""
+
+        def run() -> None:
+            optimizer = self._agent.optimizers[acting]
+            steps = optimizer.steps
+            update()
+            optimizer.steps = steps
+
+        return run
+
+
+class Feed:
+    """Batches on their way to fixed addresses of a device.
+
+    given: the arrays there, which an update reads.
+    """
+
+    def __init__(self, spec: EnvSpec, size: int, device: torch.device) -> None:
+        self._layout = _Layout(spec, size)
+        self._on_gpu = device.type == "cuda"
+        self._place = torch.zeros(self._layout.bytes, dtype=torch.uint8, device=device)
+        self._lanes = deque(_Lane(self._layout, self._place, self._on_gpu) for _ in range(_LANES))
+        self._copies: torch.cuda.Stream | None = None
+        if self._on_gpu:
+            self._copies = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        views = self._layout.views(self._place)
+        held = Columns(*(views[name] for name in Columns._fields))
+        self.given = Given(views["frames"], views["index"], held, views["s"].view(()), views["rate"].view(()))
+
+    def load(self, batch: Batch, held: Columns[NDArray[Any]], s: float, rate: float) -> None:
+        """Begin to copy a batch; what the device does next sees it."""
+        lane = self._lanes[0]
+        self._lanes.rotate(-1)
+        lane.await_copied()
+        for name, values in zip(Columns._fields, held, strict=True):
+            lane.arrays[name][...] = values
+        lane.arrays["index"][...] = indices(batch)
+        lane.arrays["s"][...] = s
+        lane.arrays["rate"][...] = rate
+        frames = lane.arrays["frames"]
+        frames[: len(batch.frames)] = batch.frames
+        used = self._layout.offsets["frames"] + batch.frames.nbytes
+        lane.send(used, self._copies)
+
+
+class _Lane:
+    """Pinned memory on the host, and memory on the device behind it."""
+
+    def __init__(self, layout: _Layout, place: Tensor, on_gpu: bool) -> None:
+        self._host = _pinned(torch.zeros(layout.bytes, dtype=torch.uint8), on_gpu)
+        self._behind = torch.empty_like(place) if on_gpu else None
+        self._place = place
+        self._sent: torch.cuda.Event | None = None
+        self._taken: torch.cuda.Event | None = None
+        self.arrays: dict[str, NDArray[Any]] = {name: view.numpy() for name, view in layout.views(self._host).items()}
+
+    def await_copied(self) -> None:
+        """Wait until the host's memory may be written again."""
+        if self._sent is not None:
+            self._sent.synchronize()
+
+    def send(self, used: int, copies: torch.cuda.Stream | None) -> None:
+        """Copy the first bytes to their place, by way of the device's memory behind the lane."""
+        if copies is None or self._behind is None:
+            self._place[:used].copy_(self._host[:used])
+            return
+        main = torch.cuda.current_stream(self._place.device)
+        if self._taken is not None:
+            copies.wait_event(self._taken)
+        with torch.cuda.stream(copies):
+            self._behind[:used].copy_(self._host[:used], non_blocking=True)
+            self._sent = _event()
+        main.wait_event(self._sent)
+        self._place[:used].copy_(self._behind[:used], non_blocking=True)
+        self._taken = _event()
+
+
+class _Layout:
+    """Where a batch's arrays lie in one run of bytes; the frames, of which there may be fewer, come last.
+
+    offsets: of each array. bytes: of all.
+    """
+
+    def __init__(self, spec: EnvSpec, size: int) -> None:
+        rows = 2 * size * spec.stack
+        self._parts: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
+            "actions": (torch.int64, (size,)),
+            "rewards": (torch.float32, (size,)),
+            "discounts": (torch.float32, (size,)),
+            "weights": (torch.float32, (size,)),
+            "s": (torch.float32, (1,)),
+            "rate": (torch.float32, (1,)),
+            "index": (torch.int32, (rows,)),
+            "frames": (getattr(torch, spec.frame_dtype), (rows, *spec.frame_shape)),
+        }
+        self.offsets: dict[str, int] = {}
+        self.bytes = 0
+        for name, (dtype, shape) in self._parts.items():
+            self.offsets[name] = self.bytes
+            length = int(np.prod(shape)) * dtype.itemsize
+            self.bytes += -(-length // _ALIGNMENT) * _ALIGNMENT
+
+    def views(self, memory: Tensor) -> dict[str, Tensor]:
+        """The arrays in uint8 [bytes]."""
+        found = {}
+        for name, (dtype, shape) in self._parts.items():
+            start = self.offsets[name]
+            length = int(np.prod(shape)) * dtype.itemsize
+            found[name] = memory[start : start + length].view(dtype).view(shape)
+        return found
+
+
+def _pinned(memory: Tensor, on_gpu: bool) -> Tensor:
+    return memory.pin_memory() if on_gpu else memory
+
+
+def _event() -> torch.cuda.Event:
+    """What is reached once the present stream has done all that it has been given."""
+    event = torch.cuda.Event()  # type: ignore[no-untyped-call]
+    event.record()
+    return event
