@@ -130,7 +130,7 @@ def test_a_name_belongs_to_one(package: Path, monkeypatch: pytest.MonkeyPatch) -
     assert methods().get("dqn") is METHODS.get("dqn"), "no package takes the name of a method of ours"
 
 
-LOCKSTEP = "from deploy.commands import lockstep; lockstep()"
+LOCKSTEP = "import sys; sys.argv[0] = 'coop-lockstep'; from deploy.commands import main; main()"
 OPTIONS = "from common.settings.options import RunOptions, parse_run; parse_run(RunOptions, 'coop-local', '')"
 
 
