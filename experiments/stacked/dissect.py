@@ -3,7 +3,8 @@
     python -m experiments.stacked.dissect --out runs/dissect --device cuda --minutes 6
 
 Conditions x optimizers x depths, each cell with the learning rate that the tuning chose for it. It goes on where it
-stopped: every stack of runs is a file in --out. The rules are those of results/dissection/plan.md.
+stopped: every stack of runs is a file in --out. The rules are those of
+results/cartpole/edl/plan.md.
 """
 
 from __future__ import annotations
