@@ -15,7 +15,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -47,7 +47,10 @@ RATES = {
 }
 TUNING_SEEDS = 1000  # the first of them
 FINAL = 0.93  # the learning rate is multiplied by this every 1,000 steps, as in the preset cartpole-paper
+SLOW = "weight-gradient"  # its decompositions keep to the CPU: a seed a stack, at the rates of "none", not tuned
 POINTS = 20  # measurements of a run
+WAVE = 132  # runs that a GPU's processors play at once: one on each of an H100's
+MEASURED, SPARE, OVERHEAD = 300, 1.2, 2.0  # steps; and of a stack's time: a factor, and seconds besides
 AGREE = 1e-2  # of the way that parameters have come: a condition whose kernels are farther off runs without them
 RATE_FILE = "rates.json"
 
@@ -67,6 +70,8 @@ class Plan:
     width: int
     conditions: tuple[str, ...]
     precision: str
+    slow_seeds: int = 20
+    workers: int = 0
     without_kernels: tuple[str, ...] = ()
 
     def settings(self, condition: str, depth: int) -> StackSettings:
@@ -82,9 +87,8 @@ class Plan:
         cells = [(rate, seed) for name in OPTIMIZERS for rate, seed in product(RATES[name], seeds)]
         return _runs(cells, [(name, len(RATES[name]) * len(seeds)) for name in OPTIMIZERS])
 
-    def study(self, depth: int, rates: dict[str, float]) -> Runs:
-        """Every seed of the study with each optimizer at its rate."""
-        seeds = range(self.seeds[self.depths.index(depth)])
+    def study(self, seeds: Sequence[int], rates: dict[str, float]) -> Runs:
+        """The seeds with each optimizer at its rate."""
         cells = [(rates[name], seed) for name in OPTIMIZERS for seed in seeds]
         return _runs(cells, [(name, len(seeds)) for name in OPTIMIZERS])
 
@@ -189,37 +193,36 @@ def choose(plan: Plan, condition: str, depth: int, tuned: dict[str, Any]) -> Non
     part.replace(file)
 
 
-def stacks(plan: Plan) -> Iterator[tuple[str, int, str]]:
-    """(condition, depth, "tuning" or "study") of every stack in order: the tuning of a depth before its study."""
-    for depth, phase in product(plan.depths, ("tuning", "study")):
-        for condition in plan.conditions:
-            yield condition, depth, phase
+def known_rates(plan: Plan, condition: str, depth: int) -> dict[str, float]:
+    """The rate of each optimizer that the tuning chose; empty if it has not."""
+    file = plan.out / RATE_FILE
+    known = json.loads(file.read_text()) if file.exists() else {}
+    keys = {name: f"{depth} {condition} {name}" for name in OPTIMIZERS}
+    return {name: known[key]["rate"] for name, key in keys.items()} if set(keys.values()) <= set(known) else {}
 
 
-def run(plan: Plan, minutes: float) -> int:
-    """Play what is not there yet; return how many stacks are left."""
-    deadline = time.monotonic() + 60 * minutes
+def run(plan: Plan, deadline: float) -> int:
+    """Play what is not there yet, the tuning of a depth before its study; return how many stacks are left."""
     plan.out.mkdir(parents=True, exist_ok=True)
     left = 0
     longest: dict[tuple[int, str], float] = {}  # seconds of a stack by depth and phase
-    for condition, depth, phase in stacks(plan):
+    workers: list[subprocess.Popen[bytes]] = []
+    quick = [name for name in plan.conditions if name != SLOW]
+    for depth, phase, condition in product(plan.depths, ("tuning", "study"), quick):
+        if plan.workers and not workers and SLOW in plan.conditions and known_rates(plan, "none", plan.depths[0]):
+            workers = [_worker(plan, number, deadline) for number in range(plan.workers)]
         path = plan.out / f"{phase}-{depth}-{condition}.npz"
         if path.exists():
             continue
-        file = plan.out / RATE_FILE
-        known = json.loads(file.read_text()) if file.exists() else {}
-        needed = [f"{depth} {condition} {name}" for name in OPTIMIZERS] if phase == "study" else []
-        if phase == "tuning" and condition != "none":
-            needed = [f"{depth} none {name}" for name in OPTIMIZERS]
+        tuned = known_rates(plan, condition if phase == "study" else "none", depth)
         wait = longest.get((depth, phase), 0.0)
-        if any(key not in known for key in needed) or time.monotonic() + wait > deadline:
-            print(f"{path.stem}: left, for want of {'time' if wait else 'time or rates'}", flush=True)
+        if (not tuned and (phase, condition) != ("tuning", "none")) or time.monotonic() + wait > deadline:
+            print(f"{path.stem}: left, for want of {'time' if tuned else 'rates'}", flush=True)
             left += 1
             continue
         began = time.monotonic()
-        runs = plan.tuning()
-        if phase == "study":
-            runs = plan.study(depth, {name: known[f"{depth} {condition} {name}"]["rate"] for name in OPTIMIZERS})
+        seeds = range(plan.seeds[plan.depths.index(depth)])
+        runs = plan.study(seeds, tuned) if phase == "study" else plan.tuning()
         done = play(plan, condition, depth, runs, path, deadline)
         if done is None:
             print(f"{path.stem}: stopped, the time is up", flush=True)
@@ -231,7 +234,34 @@ def run(plan: Plan, minutes: float) -> int:
         gc.collect()
         if plan.device == "cuda":
             torch.cuda.empty_cache()
+    if SLOW in plan.conditions and not plan.workers and plan.device == "cpu":
+        left += run_slow(plan, 0, 1, deadline)
+    for process in workers:
+        process.wait()
     return left
+
+
+def run_slow(plan: Plan, first: int, every: int, deadline: float) -> int:
+    """Play the seeds first, first + every, ... of weight-gradient on the CPU; return how many stacks are left."""
+    left = 0
+    for depth, seed in product(plan.depths, range(first, plan.slow_seeds, every)):
+        path = plan.out / f"study-{depth}-{SLOW}-{seed}.npz"
+        rates = known_rates(plan, "none", depth)
+        if not path.exists():
+            done = rates and play(plan, SLOW, depth, plan.study([seed], rates), path, deadline)
+            left += not done
+    return left
+
+
+def _worker(plan: Plan, number: int, deadline: float) -> subprocess.Popen[bytes]:
+    """A process that plays its share of weight-gradient's seeds, and ends by itself at the deadline."""
+    command = [
+        sys.executable, "-m", "experiments.stacked.dissect", "--out", str(plan.out), "--conditions", SLOW,
+        "--depths", *map(str, plan.depths), "--steps", str(plan.steps), "--width", str(plan.width),
+        "--slow-seeds", str(plan.slow_seeds), "--share", str(number), str(plan.workers),
+        "--minutes", str((deadline - time.monotonic()) / 60),
+    ]  # fmt: skip
+    return subprocess.Popen(command)
 
 
 def agreement(condition: str, width: int, precision: str, updates: int = 32) -> float:
@@ -255,7 +285,7 @@ def warm(plan: Plan) -> list[str]:
     """
     began = time.monotonic()
     code = f"from experiments.stacked.dissect import *; print(agreement(sys.argv[1], {plan.width}, {plan.precision!r}))"
-    names = [name for name in plan.conditions if name not in ("weight-gradient", "transform-normal")]
+    names = [name for name in plan.conditions if name not in (SLOW, "transform-normal")]
     started = {
         name: subprocess.Popen(
             [sys.executable, "-c", code, name],
@@ -280,6 +310,37 @@ def warm(plan: Plan) -> list[str]:
         failed.append("transform-normal")
     print(f"kernels compiled and checked in {time.monotonic() - began:.1f} s; failed: {failed or 'none'}", flush=True)
     return failed
+
+
+def fitted(plan: Plan, seconds: float) -> Plan:
+    """The plan with the seeds that fit into the time: at most 100 of a depth, the shallow ones first, at least 44."""
+    waves = dict.fromkeys(plan.depths, 1)  # of WAVE runs, which take about the time of one
+    stacks, per_step = len([name for name in plan.conditions if name != SLOW]), {}
+    for depth in plan.depths:
+        runs = plan.study(range(WAVE // len(OPTIMIZERS)), dict.fromkeys(OPTIMIZERS, 1e-4))
+        stack = Stack(plan.settings("transform", depth), runs, plan.device, precision=plan.precision)
+        stack.advance(stack.settings.learning_starts + 2 * stack.settings.swap_every)
+        began = float(stack.theta.sum() * 0) + time.monotonic()  # waits for the device
+        stack.advance(MEASURED)
+        per_step[depth] = (float(stack.theta.sum() * 0) + time.monotonic() - began) / MEASURED
+        del stack
+        gc.collect()
+    tuning = -(-sum(map(len, RATES.values())) * plan.tuning_seeds // WAVE)
+
+    def needed() -> float:
+        every = {depth: per_step[depth] * plan.steps * (waves[depth] + tuning) for depth in plan.depths}
+        return sum(stacks * (SPARE * each + OVERHEAD) for each in every.values())
+
+    for depth in plan.depths:
+        while WAVE * waves[depth] < 3 * 100 and needed() < seconds:
+            waves[depth] += 1
+            if needed() > seconds:
+                waves[depth] -= 1
+                break
+    seeds = tuple(min(100, WAVE * waves[depth] // len(OPTIMIZERS)) for depth in plan.depths)
+    shown = {depth: round(1e6 * each) for depth, each in per_step.items()}
+    print(f"us/step of {WAVE} runs {shown}; seeds {seeds}, about {needed():.0f} s of {seconds:.0f} s", flush=True)
+    return replace(plan, seeds=seeds)
 
 
 def pack(out: Path, path: Path) -> int:
@@ -323,27 +384,42 @@ def main() -> None:
     parse.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parse.add_argument("--minutes", type=float, default=float("inf"), help="play no longer than this")
     parse.add_argument("--depths", type=int, nargs="+", default=[3, 8, 16], help="numbers of hidden layers")
-    parse.add_argument("--seeds", type=int, nargs="+", default=[100], help="seeds of the study, for all depths or each")
+    parse.add_argument(
+        "--seeds",
+        type=int,
+        nargs="+",
+        default=[100],
+        help="seeds of the study, for all depths or each; 0: as --minutes allow, by a measurement of the speed alone",
+    )
     parse.add_argument("--tuning-seeds", type=int, default=8)
     parse.add_argument("--steps", type=int, default=20_000)
     parse.add_argument("--width", type=int, default=128)
     parse.add_argument("--conditions", nargs="+", default=list(CONDITIONS), choices=list(CONDITIONS))
     parse.add_argument("--precision", default="tf32x3", choices=("tf32x3", "ieee", "tf32"), help="of products on a GPU")
+    parse.add_argument("--slow-seeds", type=int, default=20, help=f"seeds of {SLOW}")
+    parse.add_argument("--workers", type=int, default=0, help=f"processes that play {SLOW} on the CPU meanwhile")
+    parse.add_argument("--share", type=int, nargs=2, help=argparse.SUPPRESS)  # a worker's number, and their count
     parse.add_argument("--threads", type=int, default=1, help="of PyTorch on the CPU")
     parse.add_argument("--cold", action="store_true", help="compile kernels when they are needed, not all at the start")
     args = parse.parse_args()
-    began = time.monotonic()
+    deadline = time.monotonic() + 60 * args.minutes
     seeds = args.seeds * len(args.depths) if len(args.seeds) == 1 else args.seeds
     if len(seeds) != len(args.depths):
         parse.error("--seeds: give one number, or one for each of --depths")
     torch.set_num_threads(args.threads)
     plan = Plan(
         args.out, args.device, tuple(args.depths), tuple(seeds), args.tuning_seeds, args.steps, args.width,
-        tuple(args.conditions), args.precision,
+        tuple(args.conditions), args.precision, args.slow_seeds, args.workers,
     )  # fmt: skip
+    if args.share:
+        number, workers = args.share
+        run_slow(plan, number, workers, deadline)
+        return
     if args.device == "cuda" and not args.cold:
         plan = replace(plan, without_kernels=tuple(warm(plan)))
-    left = run(plan, args.minutes - (time.monotonic() - began) / 60)
+    if 0 in plan.seeds:
+        plan = fitted(plan, deadline - time.monotonic())
+    left = run(plan, deadline)
     packed = args.out / "dissection.parquet"
     print(f"{packed}: {pack(args.out, packed)} runs; {left} stacks left", flush=True)
 

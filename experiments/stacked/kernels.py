@@ -1,7 +1,7 @@
 """The step of `stack` as three Triton kernels: a program of the first plays and propagates for one whole run.
 
-They do what `Stack.act`, `Stack.update` and `networks` do, for widths and batches that are powers of 2. They run on a
-GPU, and on a CPU in Triton's interpreter (TRITON_INTERPRET=1), in which the tests compare both.
+They do what `Stack.act`, `Stack.update` and `networks` do, for widths and batches that are powers of 2, on a GPU or in
+Triton's interpreter; `dissect.agreement` compares both.
 """
 
 # Triton's functions take pointers and constants in capitals, and have no types that mypy knows.

@@ -8,6 +8,7 @@ difference, as `learner.edl.transforms` has it.
 from __future__ import annotations
 
 import math
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -30,6 +31,12 @@ class Layer(NamedTuple):
     outputs: int
     inputs: int
     stop: int
+
+
+@cache
+def shape_of(hidden: int, width: int) -> Shape:
+    """The shape, always the same object."""
+    return Shape(hidden, width)
 
 
 class Shape:
@@ -73,6 +80,7 @@ class Shape:
         """The sum of each layer's part of [K, size]: [K, layers]."""
         return torch.stack([values[:, at.start : at.stop].sum(1) for at in self.layers], 1)
 
+    @cache  # noqa: B019 (some megabytes, wanted until the end)
     def initial(self, seed: int, number: int) -> Tensor:
         """The parameters with which lockstep begins network `number` of a run, float32 [size]."""
         words = np.random.SeedSequence([seed, number]).generate_state(1)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from experiments.stacked import networks
 from experiments.stacked.cartpole import Chance, Draws, move
-from experiments.stacked.networks import Shape, Tape
+from experiments.stacked.networks import Tape, shape_of
 from experiments.stacked.settings import Runs, StackSettings
 
 COLUMNS = 10  # of the table: obs, next_obs, action, terminated
@@ -55,7 +55,7 @@ class Stack:
     ) -> None:
         """kernels: use Triton's on a GPU. precision: of their products, "tf32x3", "ieee" or "tf32"."""
         self.settings, self.runs, self.device = settings, runs, torch.device(device)
-        self.shape = Shape(settings.hidden, settings.width)
+        self.shape = shape_of(settings.hidden, settings.width)
         self.step = self.updates = 0
         count, size = len(runs.seeds), self.shape.size
         trained = 2 if settings.two_networks else 1
@@ -238,11 +238,11 @@ class Stack:
 
     def episodes(self) -> list[Episodes]:
         """The finished episodes of each run so far."""
-        lengths = self.ended[: self.step].cpu().numpy()
+        lengths = self.ended[: self.step].t().contiguous().cpu().numpy()
         found = []
-        for run in range(lengths.shape[1]):
-            ends = np.flatnonzero(lengths[:, run])
-            found.append(Episodes(ends + 1, lengths[ends, run].astype(np.int64)))
+        for run in lengths:
+            ends = np.flatnonzero(run)
+            found.append(Episodes(ends + 1, run[ends].astype(np.int64)))
         return found
 
     def finite(self) -> NDArray[np.bool_]:
