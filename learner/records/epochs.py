@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -77,7 +78,10 @@ def newest_epoch(run_dir: Path, *, replay: bool = False) -> Whole | None:
 
 def load_learner(path: Path) -> dict[str, Any]:
     """Read learner.pt from a checkpoint's folder, without executing any code in it."""
-    state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
+    try:
+        state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError) as error:  # whose advice is to execute it all the same
+        raise ValueError(f"PyTorch {torch.__version__} can't read it ({type(error).__name__})") from error
     if not isinstance(state, dict):
         raise TypeError("not a learner's state")
     return state
