@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -84,7 +85,10 @@ def load_learner(path: Path) -> dict[str, Any]:
         RunError: it is no whole checkpoint, or declares more than it holds.
     """
     check_torch_file(path / LEARNER)
-    state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
+    try:
+        state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError) as error:  # whose advice is to execute it all the same
+        raise ValueError(f"PyTorch {torch.__version__} can't read it ({type(error).__name__})") from error
     if not isinstance(state, dict):
         raise TypeError("not a learner's state")
     return state

@@ -286,7 +286,7 @@ def _is_damaged(file: BinaryIO, at: int) -> bool:
     """True if a header at byte `at` has been damaged; False for what a kill leaves, or remains of an older file."""
     file.seek(at)
     packed = file.read(HEADER_BYTES)
-    return packed.startswith(_MARK) and _unpacked(packed) is None
+    return len(packed) == HEADER_BYTES and packed.startswith(_MARK) and _unpacked(packed) is None
 
 
 def _find_header(file: BinaryIO, start: int, number: int, expected: int) -> tuple[int, Header] | None:
