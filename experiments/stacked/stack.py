@@ -10,6 +10,7 @@ Triton's kernels (`experiments.stacked.kernels`) where they fit and of PyTorch's
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -149,8 +150,13 @@ class Stack:
         torch.cuda.current_stream().wait_stream(stream)
         torch.cuda.synchronize()
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            self.play(self._draws, True, role)
+        gc.collect()
+        gc.disable()  # the end of an older graph would end the recording
+        try:
+            with torch.cuda.graph(graph):
+                self.play(self._draws, True, role)
+        finally:
+            gc.enable()
         self._replays[role] = graph.replay
 
     def play(self, draws: Draws, learning: bool, role: int) -> None:
