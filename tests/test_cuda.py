@@ -12,6 +12,7 @@ from samples import make_segment
 
 from common.settings.tables import resolve
 from common.types import Batch, EnvSpec
+from experiments.stacked.dissect import AGREE, agreement
 from learner.agent import Agent
 from learner.edl import kernels
 from learner.edl.completed import Jacobians
@@ -197,3 +198,9 @@ def test_a_run_is_resumed_and_evaluated(tmp_path: Path) -> None:
     summary = json.loads((run / "summary.json").read_text())
     assert (summary["env_steps"], summary["exit"]) == (2000, "complete")
     assert str(summary["updates"]) in run_command("coop-eval", run, "--episodes", "2", check=True).stdout
+
+
+@pytest.mark.parametrize("condition", ["none", "transform", "matched", "noise", "random"])
+def test_stacked_kernels_are_pytorchs_operations(condition: str) -> None:
+    pytest.importorskip("triton")
+    assert agreement(condition, width=32, precision="tf32x3") < AGREE
