@@ -156,7 +156,7 @@ def test_no_lock_goes_through_a_link(tmp_path: Path) -> None:
     run = tmp_path / "run"
     run.mkdir()
     (run / ".learner.lock").symlink_to(mine)
-    with pytest.raises(RunError, match="run directory"):
+    with pytest.raises(RunError, match="a link that leads out of the run"):
         RunLock(run, "coop-learner", ("learner",))
     assert mine.read_text() == "precious"
 
