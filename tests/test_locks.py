@@ -117,7 +117,8 @@ def test_each_write_looks_whether_the_lease_is_still_held(tmp_path: Path, monkey
     """The thread that touches the file may be the last one to wake."""
     monkeypatch.setattr(locks, "LOCAL", frozenset())
     monkeypatch.setattr(locks, "SETTLE", 0.0)
-    ended = []
+    monkeypatch.setattr(locks, "BEAT", 1000.0)
+    ended: list[int] = []
     monkeypatch.setattr(os, "_exit", ended.append)
     with RunLock(tmp_path, "coop-learner", ("learner",)):
         (tmp_path / ".learner.lock").write_text("coop-learner elsewhere\nanother token\nanother place\n")
@@ -155,7 +156,7 @@ def test_no_lock_goes_through_a_link(tmp_path: Path) -> None:
     run = tmp_path / "run"
     run.mkdir()
     (run / ".learner.lock").symlink_to(mine)
-    with pytest.raises(RunError, match="run directory"):
+    with pytest.raises(RunError, match="a link that leads out of the run"):
         RunLock(run, "coop-learner", ("learner",))
     assert mine.read_text() == "precious"
 
