@@ -100,7 +100,7 @@ def play_lockstep(
         RunError: there is no space for the closing epoch or the summary.
     """
     trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
-    evaluator = Evaluator(run.config, stop.is_set, say)
+    evaluator = Evaluator(run.config, stop.is_set)
     _evaluate(run, directory, evaluator)  # what a stop has abandoned
     while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
         for effects in run.play():

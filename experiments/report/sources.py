@@ -33,11 +33,14 @@ class Source(Protocol):
 
 
 class FolderSource:
-    """A folder of run directories."""
+    """A folder of run directories, or a single one."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.names = sorted(path.parent.name for path in folder.glob(f"*/{CONFIG}"))
+        single = (folder / CONFIG).is_file()
+        self._folder = folder.resolve().parent if single else folder
+        self.names = (
+            [folder.resolve().name] if single else sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
+        )
         self.sweep = (folder / SWEEP).read_text(encoding="utf-8") if (folder / SWEEP).exists() else None
 
     def text(self, run: str, file: str) -> str | None:
