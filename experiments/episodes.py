@@ -17,6 +17,7 @@ from common.errors import CoopError, UsageError
 from common.imports import describe
 from common.messaging.messages.evaluate import EvaluationRow
 from common.networks.acting import ActingNetwork
+from common.process.console import say
 from common.settings.config import RunConfig
 from common.types import Array, EnvSpec
 
@@ -90,10 +91,10 @@ class Evaluator:
         self,
         config: RunConfig,
         stopped: Callable[[], bool],
-        tell: Callable[[str], None],
         episodes: int | None = None,
         epsilon: float = 0.0,
         at_once: int = AT_ONCE,
+        tell: Callable[[str], None] = say,
     ) -> None:
         self._config = config
         self._stopped = stopped

@@ -130,7 +130,7 @@ class EvaluatorService:
         self._node, self._stop, self._console, self._incarnation = node, stop, console, incarnation
         self._weights = WeightsFollower(node, self._policy)
         self._evaluations, self._films = Schedule(plan.seconds, steps), Schedule(None, config.video_every)
-        self._evaluator = Evaluator(config, self._abandons, console.event, plan.episodes, plan.epsilon, plan.at_once)
+        self._evaluator = Evaluator(config, self._abandons, plan.episodes, plan.epsilon, plan.at_once, console.event)
         self._number = 0
         self._last = False
 

@@ -105,7 +105,7 @@ def play_lockstep(
         RunError: there is no space for the closing epoch or the summary.
     """
     trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
-    evaluator = Evaluator(run.config, stop.is_set, say)
+    evaluator = Evaluator(run.config, stop.is_set)
     _evaluate(run, directory, evaluator)  # what a stop has abandoned
     outcome = ""
     try:

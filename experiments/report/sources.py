@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from common.errors import RunError
 from common.process.untrusted import MAX_SETTINGS, check_links, read_text
-from experiments.report.packed import EPISODES, SWEEP, PackedStudy, run_names
+from experiments.report.packed import CONFIG, EPISODES, SWEEP, PackedStudy, run_names
 from learner.records.reading import check_records, column, read_csv, read_jsonl
 
 
@@ -34,16 +34,18 @@ class Source(Protocol):
 
 
 class FolderSource:
-    """A folder of run directories."""
+    """A folder of run directories, or a single one."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
         self._checked: set[str] = set()  # runs whose records are those that they seal
-        self.names = run_names(folder)
+        single = (folder / CONFIG).is_file()
+        self._folder = folder.resolve().parent if single else folder
+        self.names = [folder.resolve().name] if single else run_names(folder)
         check_links(folder)
         for run in self.names:
-            check_links(folder / run)
-        self.sweep = read_text(folder / SWEEP, MAX_SETTINGS) if (folder / SWEEP).exists() else None
+            check_links(self._folder / run)
+        sweep = self._folder / SWEEP
+        self.sweep = read_text(sweep, MAX_SETTINGS) if not single and sweep.exists() else None
 
     def text(self, run: str, file: str) -> str | None:
         """See `Source`."""

@@ -35,6 +35,7 @@ Q_SIZE, Q_BOUND, Q_SHARE = "q_abs_mean", "q_bound", "q_share"
 CHURN = "churn_per_100"
 NOT_AXES = {"run", "method", "seed"}
 PRESET = "cartpole"
+SHOWN = 3  # unfinished runs in an error
 
 
 @dataclass(frozen=True)
@@ -202,7 +203,9 @@ def load_study(path: Path) -> Study:
             runs.append(run)
     if not runs:
         also = f", {len(diverged)} diverged" if diverged else ""
-        raise RunError(f"{path}: none of its {len(names)} runs is finished{also}")
+        states = ", ".join(f"{name}: {state}" for name, state in list(missing.items())[:SHOWN])
+        more = f" (and {len(missing) - SHOWN} more)" if len(missing) > SHOWN else ""
+        raise RunError(f"{path}: none of its {len(names)} runs is finished{also}: {states}{more}")
     axes = _axes([*(run.config for run in runs), *diverged.values()])
     preset = resolve(load_tables(grid.file.preset if grid else PRESET, None))
     reference = tuple(_nearest(value_of(preset, axis), {value_of(run.config, axis) for run in runs}) for axis in axes)
@@ -229,6 +232,8 @@ def _read(source: Source, run: str, path: Path) -> Run:
         ends, returns, s, q1, q2 = (np.array(values, np.float64) for values in episodes.values())
         metrics = {name: np.array(values, np.float64) for name, values in rows.items()}  # None becomes nan
         evaluated = returns_by_step(source.text(run, EVALUATIONS) or "")
+    except FileNotFoundError as error:
+        raise RunError(f"{path / run}: a finished run without its {Path(error.filename).name}") from error
     except (OSError, ValueError, KeyError, UsageError) as error:
         raise RunError(f"{path / run}: a finished run with a file that can't be read: {error!r}") from error
     size, bound = metrics.pop(Q_SIZE), metrics.pop(Q_BOUND)

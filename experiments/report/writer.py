@@ -93,7 +93,13 @@ def write_report(runs: Path, out: Path, baseline: str | None = None) -> tuple[Pa
 def _draw_all(figures: Sequence[tuple[Figure, Path]]) -> None:
     """Draw every figure, on all cores: matplotlib takes half of a report's time. Raises OSError as `draw`."""
     workers = max(1, min(len(figures), cores()))
-    # Forked, since a new process would first spend a second on its imports.
-    with ProcessPoolExecutor(workers, get_context("fork")) as pool:
+    try:
+        # Forked, since a new process would first spend a second on its imports.
+        processes = ProcessPoolExecutor(workers, get_context("fork"))
+    except OSError:  # they need a /dev/shm that can be written
+        for figure, path in figures:
+            draw(figure, path)
+        return
+    with processes as pool:
         for _ in pool.map(draw, *zip(*figures, strict=True)):
             pass
