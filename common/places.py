@@ -29,9 +29,24 @@ def working_directory() -> Path:
         raise UsageError("the working directory has been deleted; give absolute paths") from error
 
 
-def absolute(path: Path) -> Path:
-    """A path as it was meant when this command was started; raises UsageError as `working_directory`."""
-    return path if path.is_absolute() else working_directory() / path
+def user_path(text: str | Path) -> Path:
+    """A path as users write it: ~ is their home; raises ValueError for an empty one, which would be this folder."""
+    if not str(text):
+        raise ValueError("an empty path; this folder is .")
+    return Path(text).expanduser()
+
+
+def absolute(path: str | Path, name: str = "path") -> Path:
+    """A user's path as it was meant when this command was started. name: of the argument, for the error.
+
+    Raises:
+        UsageError: it is empty, or as `working_directory`.
+    """
+    try:
+        given = user_path(path)
+    except (ValueError, RuntimeError) as error:  # the last for a home that nobody has
+        raise UsageError(f"{name} = {str(path)!r}: {error}") from None
+    return given if given.is_absolute() else working_directory() / given
 
 
 def shown(path: Path) -> Path:

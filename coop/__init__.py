@@ -52,7 +52,7 @@ def load(run_dir: str | Path, *, allow_import: Collection[str] = ()) -> SavedRun
         UsageError: there is no run.
         RunError: a link leads out of the folder.
     """
-    return SavedRun(absolute(Path(run_dir)), allow_import)
+    return SavedRun(absolute(run_dir, "run_dir"), allow_import)
 
 
 def register_method(method: Method) -> None:

@@ -200,11 +200,11 @@ def _options(
     """The options that the same flags give on a command line."""
     if preset is not None and file is not None:
         raise UsageError("preset and config: give one of them")
-    directory = None if run_dir is None else absolute(Path(run_dir))
+    directory = None if run_dir is None else absolute(run_dir, "run_dir")
     steps = settings.get("total_steps")
     base = chosen_config(
         preset,
-        None if file is None else absolute(Path(file)),
+        None if file is None else absolute(file, "config"),
         method,
         steps if isinstance(steps, int) else None,
         directory if start.goes_on else None,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from common.errors import UsageError
 from common.places import absolute
 from common.process.untrusted import check_links
@@ -20,7 +18,7 @@ def load_initial_networks(agent: Agent) -> None:
     folder = agent.config.learner.initial_networks
     if not folder:
         return
-    path = absolute(Path(folder))
+    path = absolute(folder, "learner.initial_networks")
     check_links(path)
     setting, epoch = f"learner.initial_networks = {folder!r}", newest_epoch(path)
     if epoch is None:

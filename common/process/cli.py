@@ -15,8 +15,7 @@ from tyro import _errors as tyro_errors  # private; pyproject.toml pins the vers
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from common.errors import UsageError
-from common.places import absolute
-from common.process.files import user_path
+from common.places import absolute, user_path
 from common.process.flags import SHELLS, completion, placeholder, sections
 from common.process.help import full_help, short_help
 from common.process.lifecycle import Leave

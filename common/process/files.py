@@ -201,13 +201,6 @@ def sync_file(path: Path) -> int:
         os.close(descriptor)
 
 
-def user_path(text: str | Path) -> Path:
-    """A path as users write it: ~ is their home; raises ValueError for an empty one, which would be this folder."""
-    if not str(text):
-        raise ValueError("an empty path; this folder is .")
-    return Path(text).expanduser()
-
-
 def sync_folder(path: Path) -> None:
     """Flush a folder's entries to the disk; raises OSError."""
     sync_file(path)

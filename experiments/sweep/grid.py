@@ -148,7 +148,7 @@ def _text(name: str) -> str:
     if not name.endswith(".toml"):
         hint = f"give a .toml file or one of {', '.join(shipped_grids())}"
         raise UsageError(refusal("unknown", closest(name, shipped_grids()), hint))
-    return Path(name).read_text(encoding="utf-8")
+    return Path(name).read_text(encoding="utf-8-sig")  # some editors begin files with a mark
 
 
 def _choices(file: GridFile) -> Iterator[Choice]:

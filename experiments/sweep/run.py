@@ -62,10 +62,10 @@ def sweep(
     if isinstance(grid, Mapping):
         if folder is None:
             raise UsageError("folder: a grid without a name needs one")
-        checked, path = parse_grid(tomli_w.dumps(grid), str(folder), quick), absolute(Path(folder))
+        checked, path = parse_grid(tomli_w.dumps(grid), str(folder), quick), absolute(folder, "folder")
     else:
         checked = load_grid(str(grid), quick)
-        path = absolute(Path(folder or default_folder(grid, quick)))
+        path = absolute(default_folder(grid, quick) if folder is None else folder, "folder")
     cells = [CellFolder(path, cell) for cell in checked.cells]
     claim_folder(checked, cells, path)
     runner = Runner(cells, LocalProcesses(checked.file, jobs))
