@@ -104,7 +104,7 @@ class LearnerSettings:
     """Run the passes through torch.compile, on a CPU by a C++ compiler; no gain was measured there or on an H100."""
     threads: Positive = 1
     """CPU threads that PyTorch uses in the learner."""
-    prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 4
+    prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 8
     """Batches that are asked for ahead."""
     mirror: Literal["auto", "off"] = "auto"
     """auto: keep copies of the table's frames, in at most a quarter of the memory, so that each is sent once."""
