@@ -321,7 +321,8 @@ def test_a_frame_is_read_only_by_its_number() -> None:
     mirror = FrameMirror(PICTURES, 10_000)
     none = _pictures()
     assert mirror.read(_named([0], [1], [], none)) is None, "it holds nothing yet"
-    _write(mirror, 7, [3, 5 * FIRST_SLOTS], [11, 12])
+    _write(mirror, 7, [3], [11])
+    _write(mirror, 7, [5 * FIRST_SLOTS], [12])
     read = mirror.read(_named([5 * FIRST_SLOTS, 3, 3], [12, 11, 11], [], none))
     assert read is not None
     assert (read.dtype, read.tolist()) == (np.uint8, _pictures(12, 11, 11).tolist())
