@@ -358,13 +358,17 @@ def test_another_table_empties_the_mirror() -> None:
 
 
 def test_a_mirror_that_cannot_grow_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    mirror = FrameMirror(PICTURES, 10**9)
+    mirror, grow = FrameMirror(PICTURES, 10**9), GrowingRows.grow
     _write(mirror, 7, [3], [11])
     with pytest.raises(OSError):  # noqa: PT011 (the system's own words)
         mirror._rows.grow(1 << 60)
-    read = mirror.read(_named([3], [11], [], _pictures()))
+    monkeypatch.setattr(GrowingRows, "grow", lambda rows, _: grow(rows, 1 << 60))
+    _write(mirror, 7, [2, 5 * FIRST_SLOTS], [12, 13])
+    read = mirror.read(_named([3, 2], [11, 12], [], _pictures()))
     assert read is not None
-    assert read.tolist() == _pictures(11).tolist()
+    assert read.tolist() == _pictures(11, 12).tolist()
+    assert mirror.read(_named([5 * FIRST_SLOTS], [13], [], _pictures())) is None
+    assert mirror.slots == FIRST_SLOTS, "which it says with its next request"
 
 
 # ----------------------------------------------------------------------------------------------------------------------
