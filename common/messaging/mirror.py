@@ -30,6 +30,7 @@ class FrameMirror:
         slots: at most so many; frames in higher slots are in each answer.
 
     Attributes:
+        slots: as given, or fewer where memory ran out.
         number: counts the times that the mirror began, empty: once, and again for each table that it met.
     """
 
@@ -55,12 +56,11 @@ class FrameMirror:
         if not len(slots):
             return
         highest = slots.item(slots.argmax())
+        if self.slots > len(self._numbers) <= highest:
+            self._grow(highest + 1)
         if highest >= self.slots:
             inside = slots < self.slots
-            self.write(table, slots[inside], numbers[inside], frames[inside])
-            return
-        if highest >= len(self._numbers):
-            self._grow(highest + 1)
+            slots, numbers, frames = slots[inside], numbers[inside], frames[inside]
         self._rows.view[slots] = self._items(frames)
         self._numbers[slots] = numbers
 
@@ -81,9 +81,13 @@ class FrameMirror:
         return np.ascontiguousarray(frames).reshape(-1).view(self._rows.dtype)
 
     def _grow(self, needed: int) -> None:
-        """Make room; raises OSError if there is none."""
+        """Make room up to slot number `needed`, or remain as large as it is for good if there is none."""
         slots = min(self.slots, max(needed, int(len(self._numbers) * GROWTH)))
-        self._rows.grow(slots)
+        try:
+            self._rows.grow(slots)
+        except OSError:
+            self.slots = len(self._numbers)
+            return
         numbers = np.zeros(slots, np.int64)
         numbers[: len(self._numbers)] = self._numbers
         self._numbers = numbers

@@ -34,6 +34,7 @@ from common.process.lifecycle import Stop
 from common.settings.capacity import frame_bytes
 from common.types import Batch, EnvSpec
 
+MANY = 4  # batches are asked for one by one if more than one of so many frames came with the last answer
 TOGETHER = 1 << 24  # bytes of batches that are asked for in one request, unless it is a single one
 
 
@@ -91,7 +92,7 @@ class SampleClient:
         self._key = replay_key(node, "sample")
         self._outstanding: deque[_Asked] = deque()
         self._arrived: deque[tuple[Batch | NamedBatch, Drawn]] = deque()
-        self._admitted = 0  # draws of lower numbers need not wait
+        self._admitted = 0  # draws of lower numbers need not wait, and may be asked for together
         self._next = first
         self._done = first
         self._pinned: int | None = None
@@ -195,7 +196,8 @@ class SampleClient:
         arrived: list[tuple[Batch | NamedBatch, Drawn]] = []
         if message.kind == NAMED:
             draws, batches = self._read_named(message)
-            self._admitted = draws.admitted
+            few = MANY * len(message.arrays["frames"]) <= len(message.arrays["slots"])
+            self._admitted = draws.admitted if few else 0  # two batches with all frames are slower than one by one
             arrived += zip(batches, draws.draws, strict=True)
             if not draws.memory:
                 self._mirrored(message, draws.table)

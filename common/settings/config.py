@@ -106,7 +106,7 @@ class LearnerSettings:
     """Let a GPU's matrix units read float32 numbers with 10 bits of mantissa; not where exactness needs more."""
     threads: Positive = 1
     """CPU threads that PyTorch uses in the learner."""
-    prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 4
+    prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 8
     """Batches that are asked for ahead."""
     mirror: Literal["auto", "off"] = "auto"
     """auto: keep copies of the table's frames, in at most a quarter of the memory, so that each is sent once."""

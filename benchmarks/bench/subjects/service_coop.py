@@ -31,7 +31,7 @@ from learner.roster import Roster
 from learner.shared_epochs import SharedEpochs
 
 RUN = "bench"
-PREFETCH = 4
+PREFETCH = 8
 WINDOW = 16  # segments of an inserting process in flight, as many as an actor with 8 emulators has
 # A run whose limiter admits everything.
 CONFIG = validated(
@@ -86,7 +86,7 @@ def main(way: str) -> None:
             node, Stop(), incarnation, ATARI, BATCH, PREFETCH, shared_memory=way == "shm", mirror=mirror
         )
         inserters.insert(1.0)
-        attend_service(inserters, sampler.next)
+        attend_service(inserters, sampler.next, settle=0 if way == "whole" else CAPACITY // BATCH)
 
 
 if __name__ == "__main__":

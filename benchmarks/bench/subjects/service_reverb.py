@@ -17,7 +17,7 @@ from service_work import BATCH, CAPACITY, STEPS, Inserters, attend_service, inse
 TABLE = "table"
 STACK = 4  # an item is this many frames and the next one
 FRAME = (84, 84)
-AHEAD = 128  # items drawn ahead, as our client asks for four batches ahead
+AHEAD = 256  # items drawn ahead, as our client asks for eight batches ahead
 
 
 def server(end: Connection) -> None:
@@ -70,7 +70,7 @@ def main() -> None:
         inserters = Inserters(stack, inserter, address)
         inserters.insert(2.0)
         items = reverb.TrajectoryDataset.from_table_signature(address, TABLE, max_in_flight_samples_per_worker=AHEAD)
-        batches = iter(items.batch(BATCH).prefetch(4).as_numpy_iterator())
+        batches = iter(items.batch(BATCH).prefetch(8).as_numpy_iterator())
         attend_service(inserters, lambda: next(batches))
 
 

@@ -77,8 +77,12 @@ class Inserters:
         return sum(rates), list(chain(*waits))
 
 
-def attend_service(inserters: Inserters, draw: Callable[[], object]) -> None:
-    """Take turns: inserts alone, draws alone, then draws beside inserts at `INSERT_RATE`, as they come and singly."""
+def attend_service(inserters: Inserters, draw: Callable[[], object], settle: int = 0) -> None:
+    """Take turns: inserts alone, draws alone, then draws beside inserts at `INSERT_RATE`, as they come and singly.
+
+    settle: draws that are not measured after the inserts alone, which replace the table, and with it what a learner
+        that keeps copies of its frames has of it.
+    """
 
     def draws(seconds: float, name: str) -> dict[str, float]:
         waits, begun = [], time.perf_counter()
@@ -90,6 +94,8 @@ def attend_service(inserters: Inserters, draw: Callable[[], object]) -> None:
 
     def turn(seconds: float) -> Mapping[str, float]:
         alone, _ = inserters.insert(seconds)
+        for _ in range(settle):
+            draw()
         found = {"inserted/s alone": alone} | draws(seconds, "alone")
         both: dict[str, float] = {}
         beside, _ = inserters.insert(seconds, INSERT_RATE, lambda: both.update(draws(seconds, "beside inserts")))
