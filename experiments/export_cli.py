@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from common.places import shown
 from common.process.cli import parse
 from common.process.lifecycle import raise_on_signals, run_main
 
@@ -35,6 +36,6 @@ def _run() -> None:
     from experiments.export import export  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
     done = export(options.run_dir, options.out)
-    print(f"checkpoint {done.epoch} in {options.run_dir}, network {done.acting} acts: {', '.join(done.names)}")
+    print(f"checkpoint {done.epoch} in {shown(options.run_dir)}, network {done.acting} acts: {', '.join(done.names)}")
     if done.without_onnx:
         print(f"no ONNX files: {done.without_onnx}")

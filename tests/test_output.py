@@ -65,7 +65,7 @@ def on_a_terminal(line: str, cwd: Path, *, nohup: bool = False) -> Iterator[tupl
     side, terminal = pty.openpty()
     with subprocess.Popen(
         line.split(), cwd=cwd, env=VARIABLES, stdin=terminal, stdout=terminal, stderr=terminal,
-        start_new_session=True, preexec_fn=begin,
+        start_new_session=True, preexec_fn=begin,  # noqa: PLW1509 (of the child alone)
     ) as process:  # fmt: skip
         os.close(terminal)
         try:
