@@ -9,6 +9,7 @@ from pathlib import Path
 from common.envs.make import check_filmed, env_spec
 from common.errors import RunError, UsageError
 from common.messaging.transport import new_incarnation
+from common.places import shown
 from common.process.console import say, stamped
 from common.process.files import make_folder, write_atomic
 from common.process.flags import HttpAddress
@@ -188,7 +189,7 @@ def _supervise(
     """Run the processes to the end of the run."""
     topology.start()
     status = RunStatus(config.run, topology.endpoint, new_incarnation(), options.zenoh_config)
-    title = f"{config.env.id}, {config.method}, seed {config.seed}: {directory}"
+    title = f"{config.env.id}, {config.method}, seed {config.seed}: {shown(directory)}"
     interrupted = False
     try:
         with Display(status, page) as display:
@@ -207,11 +208,11 @@ def _supervise(
         status.close()
     if topology.learner.was_interrupted():
         topology.abort()
-        say(f"{topology.learner.last_line()}; coop-local --resume --run-dir {directory} goes on")
+        say(f"{topology.learner.last_line()}; coop-local --resume --run-dir {shown(directory)} goes on")
         stop.leave()
         raise RunError(topology.learner.why())  # the learner alone was interrupted
     topology.finish()
     say(topology.learner.last_line())
     curve = directory / "learning_curve.png"
     if curve.exists():
-        say(f"learning curve: {curve}")
+        say(f"learning curve: {shown(curve)}")

@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from common.imports import permit
+from common.places import shown
 from common.process.cli import parse
 from common.process.lifecycle import raise_on_signals, run_main
 
@@ -39,6 +40,6 @@ def _run() -> None:
 
     permit(options.allow_import)
     done = export(options.run_dir, options.out)
-    print(f"checkpoint {done.epoch} in {options.run_dir}, network {done.acting} acts: {', '.join(done.names)}")
+    print(f"checkpoint {done.epoch} in {shown(options.run_dir)}, network {done.acting} acts: {', '.join(done.names)}")
     if done.without_onnx:
         print(f"no ONNX files: {done.without_onnx}")

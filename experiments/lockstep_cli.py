@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import closing
 
 from common.errors import RunError
+from common.places import shown
 from common.process.console import say
 from common.process.importing import importing
 from common.process.lifecycle import Stop, run_main
@@ -38,7 +39,8 @@ def _run() -> None:
             say(line)
         summary = run.play(stop, _progress)
     stopped = summary.exit == stop.reason  # otherwise the run was complete before the signal
-    say(f"{summary}; coop-lockstep --resume --run-dir {path} goes on" if stopped else f"{summary}; {path}")
+    there = shown(path)
+    say(f"{summary}; coop-lockstep --resume --run-dir {there} goes on" if stopped else f"{summary}; {there}")
     if run.diverged:
         raise RunError(run.diverged)
     if stopped:

@@ -192,7 +192,7 @@ def test_a_resumed_run_keeps_the_lines_up_to_its_epoch(tmp_path: Path) -> None:
         assert directory.evaluated == 200
         directory.evaluation(msgspec.structs.replace(RESULT, env_step=250, return_mean=1234567.25))
     assert [row["env_step"] for row in rows(tmp_path)] == ["100", "200", "250"]
-    assert rows(tmp_path)[-1]["return_mean"] == "1234567.2"
+    assert rows(tmp_path)[-1]["return_mean"] == "1234567.25"
     board = EventAccumulator(str(tmp_path / "tb")).Reload()
     assert [event.step for event in board.Scalars("eval/return_mean")][-1] == 250
     with RunDirectory(tmp_path, config):

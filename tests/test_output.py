@@ -65,7 +65,7 @@ def on_a_terminal(line: str, cwd: Path, *, nohup: bool = False) -> Iterator[tupl
     side, terminal = pty.openpty()
     with subprocess.Popen(
         line.split(), cwd=cwd, env=VARIABLES, stdin=terminal, stdout=terminal, stderr=terminal,
-        start_new_session=True, preexec_fn=begin,  # noqa: PLW1509 (this process has no other threads)
+        start_new_session=True, preexec_fn=begin,  # noqa: PLW1509 (of the child alone)
     ) as process:  # fmt: skip
         os.close(terminal)
         try:
@@ -177,3 +177,23 @@ def test_sighup_requests_a_stop_unless_it_is_ignored() -> None:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+def test_a_signal_ends_commands_that_hold_no_state_in_order(number: signal.Signals) -> None:
+    code = f"""
+import os, time
+from common.process.lifecycle import raise_on_signals, run_main
+def main():
+    try:
+        os.kill(os.getpid(), {int(number)})
+        time.sleep(20)
+    except Exception:
+        print("users' code has swallowed it")
+    finally:
+        print("tidied up")
+raise_on_signals()
+run_main("coop-x", main)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "tidied up\n", "coop-x: interrupted\n")

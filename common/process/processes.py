@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -22,6 +23,7 @@ from common.process.output import keep_standard_files
 SIGNAL_STATUSES = tuple(map(status_after, SIGNALS))
 LAST_WORDS = 400  # characters of a log's line
 SAYS_WHY = ": error: "  # in the line in which a command says why it fails
+_NUMBERS = re.compile(r"0x[0-9a-f]+|[0-9][0-9,.:]*")  # steps, times, ports: not the same at each start
 # Signals by which a process ends itself.
 FAULTS = tuple(-number for number in (signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV))
 
@@ -98,7 +100,7 @@ class ChildProcess:
         status = self.exit_status() or 0
         if self.was_interrupted() or (status < 0 and status not in FAULTS):
             return ""
-        return f"{status} {self._reason()}"
+        return f"{status} {_NUMBERS.sub('#', self._reason()) if status > 0 else ''}"
 
     def interrupt(self) -> None:
         """Ask it to stop cleanly."""

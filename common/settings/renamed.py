@@ -46,7 +46,7 @@ def current_flags(args: Sequence[str], optimizer: str) -> list[str]:
 
     optimizer: the one in use if the command line names none.
     """
-    for token, following in zip(args, [*args[1:], ""], strict=True):
+    for token, following in zip(args, [*args[1:], ""], strict=False):
         flag, equals, value = token.partition("=")
         if flag == "--learner.optimizer":
             optimizer = value if equals else following

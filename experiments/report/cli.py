@@ -11,6 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from common.errors import RunError, UsageError
+from common.places import shown
 from common.process.cli import parse
 from common.process.lifecycle import raise_on_signals, run_main
 from common.process.untrusted import refuse_links
@@ -64,7 +65,7 @@ def _run() -> None:
     elif options.curves is not None:
         from experiments.report.writer import draw_curves  # noqa: PLC0415
 
-        print(*draw_curves(runs, options.curves), sep="\n")
+        print(*map(shown, draw_curves(runs, options.curves)), sep="\n")
     else:
         from experiments.report.writer import write_report  # noqa: PLC0415
 
@@ -72,4 +73,4 @@ def _run() -> None:
         if options.out is None:
             refuse_links(beside / "report")
         index, told = write_report(runs, options.out or beside / "report", options.baseline)
-        print(*told, index, sep="\n")
+        print(*told, shown(index), sep="\n")

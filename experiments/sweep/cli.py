@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from common.errors import Interrupted, RunError, UsageError
-from common.places import absolute
+from common.places import absolute, shown
 from common.process.cli import parse
 from common.process.console import say
 from common.process.extras import check_extra
@@ -102,7 +102,7 @@ def _work(runner: Runner, folder: Path) -> None:
     stop = Stop()
     stop.on_signals()
     with SweepDisplay(runner) as display:
-        display.say(f"{len(runner.folders)} cells in {folder}, {runner.skipped} of them finished before")
+        display.say(f"{len(runner.folders)} cells in {shown(folder)}, {runner.skipped} of them finished before")
         for name, how in runner.diverged.items():
             display.say(f"{name}: {how}")
         try:
@@ -123,4 +123,4 @@ def _work(runner: Runner, folder: Path) -> None:
         count = len(runner.failed)
         raise RunError(f"{count} of {len(runner.folders)} cells failed; the same command tries them again")
     diverged = f", {len(runner.diverged)} of them diverged" if runner.diverged else ""
-    say(f"all {len(runner.folders)} cells are finished{diverged}; coop-report {folder}")
+    say(f"all {len(runner.folders)} cells are finished{diverged}; coop-report {shown(folder)}")
