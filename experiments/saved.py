@@ -19,6 +19,7 @@ from common.networks.network import FlatNetwork
 from common.process.summaries import read_summary
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
+from common.settings.resuming import settings_digest
 from common.settings.tables import read_run_config
 from common.types import EnvSpec
 from learner.qnetwork import make_network
@@ -129,7 +130,7 @@ class SavedRun:
 
         Raises UsageError if there is none.
         """
-        epoch = newest_epoch(self.path)
+        epoch = newest_epoch(self.path, settings_digest(self.config))
         if epoch is None:
             raise UsageError(f"{self.path}: has no complete checkpoint")
         state, spec = epoch.state, env_spec(self.config.env)

@@ -24,6 +24,7 @@ from common.settings.config import RunConfig, check_distributed
 from common.settings.effects import without_effect
 from common.settings.options import RunOptions
 from common.settings.overrides import leaves, merged
+from common.settings.resuming import settings_digest
 from common.settings.sources import chosen_config
 from common.settings.tables import to_tables, to_toml, validated
 from experiments.lockstep_run import LockstepRun
@@ -231,7 +232,7 @@ class _Topology:
 
 def _topology(config: RunConfig, directory: Path, actors: int, start: Start) -> _Topology:
     with RunLock(directory, "coop.train", ("learner", "replay")):  # the process takes it after this one
-        start.prepare(directory, replay=True)
+        start.prepare(directory, replay=True, settings=settings_digest(config))
     logs = directory / "logs"
     try:
         make_folder(logs)

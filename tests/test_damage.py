@@ -114,7 +114,7 @@ def test_python_refuses_as_the_commands_do(run: Path) -> None:
     for distributed in (False, True):
         with pytest.raises(UsageError, match="no checkpoint can be gone on from"):
             coop.train(run_dir=run, resume=True, distributed=distributed)
-    with pytest.raises(UsageError, match=r"no checkpoint is whole: checkpoint 200: learner\.pt: wrong checksum"):
+    with pytest.raises(UsageError, match=r"has no complete checkpoint: checkpoint 200: learner\.pt: wrong checksum"):
         coop.load(run).policy()
     assert contents(run) == before
 

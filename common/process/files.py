@@ -129,7 +129,8 @@ def make_folder(path: Path) -> None:
     """Create a folder with its parents, durably, if it does not exist; raises OSError."""
     if path.is_dir():
         return
-    make_folder(path.parent)
+    if not path.parent.exists():
+        make_folder(path.parent)
     path.mkdir(exist_ok=True)
     sync_folder(path.parent)
 

@@ -13,8 +13,8 @@ from typing import Any
 import pydantic
 import tomli_w
 
-from common.errors import RunError, UsageError
-from common.process.run_ids import has_run_id, read_run_id
+from common.errors import UsageError
+from common.process.run_ids import has_run_id
 from common.settings.config import OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from common.settings.methods import METHODS
 from common.settings.overrides import merged, of_method
@@ -126,14 +126,10 @@ def to_toml(config: RunConfig) -> str:
     return tomli_w.dumps(to_tables(config))
 
 
-def run_config_text(config: RunConfig, run_id: int | None) -> str:
-    """The text of a run's config.toml: the resolved config, and its checksum with the run's id as a comment."""
+def run_config_text(config: RunConfig) -> str:
+    """The text of a run's config.toml: the resolved config, and its checksum as a comment."""
     text = to_toml(config)
-    return text + _seal(text, run_id)
-
-
-def _seal(text: str, run_id: int | None) -> str:
-    return f"{_SEAL}{zlib.crc32(text.encode()):08x}{'' if run_id is None else f' of run {run_id}'}\n"
+    return f"{text}{_SEAL}{zlib.crc32(text.encode()):08x}\n"
 
 
 def read_run_config(run_dir: Path) -> RunConfig:
@@ -143,24 +139,18 @@ def read_run_config(run_dir: Path) -> RunConfig:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
-    try:
-        # Runs of a packed study have no id, and may come from versions that wrote no checksum.
-        return parse_run_config(text, path, read_run_id(run_dir) if has_run_id(run_dir) else None)
-    except RunError as error:
-        raise UsageError(str(error)) from error
+    # Runs of a packed study have no id, and may come from versions that wrote no checksum.
+    return parse_run_config(text, path, needed=has_run_id(run_dir))
 
 
-def parse_run_config(text: str, place: object, run_id: int | None = None) -> RunConfig:
-    """Read the text of a run's config.toml; place: for the error. run_id: of the run, which then must have sealed it.
+def parse_run_config(text: str, place: object, *, needed: bool = False) -> RunConfig:
+    """Read the text of a run's config.toml; place: for the error. needed: it must have a checksum.
 
     Raises UsageError.
     """
-    content, seal, rest = text.rpartition(_SEAL)
-    _, _, owner = rest.strip().partition(" of run ")
-    if (seal or run_id is not None) and seal + rest != _seal(content, int(owner) if owner.isdecimal() else None):
+    content, seal, checksum = text.rpartition(_SEAL)
+    if (seal or needed) and checksum != f"{zlib.crc32(content.encode()):08x}\n":
         raise UsageError(f"{place}: not what the run wrote (wrong checksum); flags change the settings of a run")
-    if owner and run_id is not None and owner != str(run_id):
-        raise UsageError(f"{place}: belongs to another run")
     try:
         return resolve(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:

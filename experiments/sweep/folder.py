@@ -15,7 +15,6 @@ from common.errors import RunError, UsageError
 from common.process.checkpoints import checked_summary
 from common.process.files import make_folder, write_atomic
 from common.process.locks import FileLock
-from common.process.run_ids import has_run_id, read_run_id
 from common.returns import RETURN_WINDOW
 from common.settings.tables import identity, read_run_config, run_config_text
 from experiments.sweep.grid import Cell, Grid
@@ -83,10 +82,7 @@ class CellFolder:
 
     def prepare(self) -> None:
         """Write the config from which the run starts or continues."""
-        write_atomic(self.path / "config.toml", run_config_text(self.cell.config, self._run_id()).encode())
-
-    def _run_id(self) -> int | None:
-        return read_run_id(self.path) if has_run_id(self.path) else None
+        write_atomic(self.path / "config.toml", run_config_text(self.cell.config).encode())
 
     def progress(self) -> Progress:
         """Read the progress from the end of episodes.csv; zeros before the first episode's end, or if it is damaged."""
