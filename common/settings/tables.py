@@ -127,9 +127,20 @@ def to_toml(config: RunConfig) -> str:
 
 
 def run_config_text(config: RunConfig) -> str:
-    """The text of a run's config.toml: the resolved config, and its checksum as a comment."""
-    text = to_toml(config)
+    """The text of a run's config.toml: the resolved config, and its checksum."""
+    return sealed_toml(to_toml(config))
+
+
+def sealed_toml(text: str) -> str:
+    """The text of a TOML file, with its checksum as a comment."""
     return f"{text}{_SEAL}{zlib.crc32(text.encode()):08x}\n"
+
+
+def check_toml(text: str, place: object, *, needed: bool = False) -> None:
+    """Check a text of `sealed_toml`; needed: it must have a checksum. Raises UsageError."""
+    content, seal, _ = text.rpartition(_SEAL)
+    if (seal or needed) and text != sealed_toml(content):
+        raise UsageError(f"{place}: not what was written (wrong checksum)")
 
 
 def read_run_config(run_dir: Path) -> RunConfig:
@@ -148,9 +159,7 @@ def parse_run_config(text: str, place: object, *, needed: bool = False) -> RunCo
 
     Raises UsageError.
     """
-    content, seal, checksum = text.rpartition(_SEAL)
-    if (seal or needed) and checksum != f"{zlib.crc32(content.encode()):08x}\n":
-        raise UsageError(f"{place}: not what the run wrote (wrong checksum); flags change the settings of a run")
+    check_toml(text, place, needed=needed)
     try:
         return resolve(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:

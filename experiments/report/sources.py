@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from common.errors import RunError
+from common.process.notices import warn
+from common.process.run_ids import RUN_ID
+from common.settings.tables import check_toml
 from experiments.report.packed import CONFIG, EPISODES, SWEEP, PackedStudy
 from learner.records.reading import check_records, column, read_csv, read_jsonl
 
@@ -38,8 +41,23 @@ class FolderSource:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._checked: set[str] = set()  # runs whose records are those that they seal
-        self.names = sorted(path.parent.name for path in folder.glob(f"*/{CONFIG}"))
-        self.sweep = (folder / SWEEP).read_text(encoding="utf-8") if (folder / SWEEP).exists() else None
+        self.sweep = self._sweep()
+        self.names = self._distinct(sorted(path.parent.name for path in folder.glob(f"[!.]*/{CONFIG}")))
+
+    def _distinct(self, names: list[str]) -> list[str]:
+        """The runs without a user's copies of them, which are no further runs; a warning names these."""
+        first: dict[str, str] = {}
+        for name in names:
+            run_id = self.text(name, RUN_ID) or name  # a packed run has none
+            if first.setdefault(run_id, name) != name and self.sweep is None:
+                warn(f"{self._folder / name}: a copy of {first[run_id]}, left out")
+        return [name for name in names if name in first.values()]
+
+    def _sweep(self) -> str | None:
+        text = self.text("", SWEEP)
+        if text is not None:  # one that the user wrote has no checksum
+            check_toml(text, self._folder / SWEEP, needed=any(self._folder.glob(f"*/{RUN_ID}")))
+        return text
 
     def text(self, run: str, file: str) -> str | None:
         """See `Source`."""

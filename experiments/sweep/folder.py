@@ -16,7 +16,7 @@ from common.process.checkpoints import checked_summary
 from common.process.files import make_folder, write_atomic
 from common.process.locks import FileLock
 from common.returns import RETURN_WINDOW
-from common.settings.tables import identity, read_run_config, run_config_text
+from common.settings.tables import identity, read_run_config, run_config_text, sealed_toml
 from experiments.sweep.grid import Cell, Grid
 
 TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
@@ -115,6 +115,6 @@ def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
         make_folder(folder)
         for cell in cells:
             cell.check()
-        write_atomic(folder / "sweep.toml", grid.to_toml().encode())
+        write_atomic(folder / "sweep.toml", sealed_toml(grid.to_toml()).encode())
     except OSError as error:
         raise UsageError(f"--dir {folder}: {error.strerror}") from error
