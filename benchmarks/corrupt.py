@@ -59,7 +59,7 @@ class Hang(Exception):
 
 @dataclass(frozen=True)
 class Reader:
-    """A command that reads a copy of a subject. arguments: {} is the copy, {out} a new folder.
+    """A command that reads a copy of a subject. arguments: {} is the copy, {out} a new folder, {base} the original.
 
     result: files whose bytes are its result, beside what it prints: patterns below the copy and {out}.
     """
@@ -85,7 +85,7 @@ DISTRIBUTED = (
 STUDY = (
     Reader("coop-report", ("{}", "--out", "{out}"), REPORTED),
     Reader("coop-report --curves", ("{}", "--curves", "{out}"), ("out/*/*.png",)),
-    Reader("coop-sweep", ("{}/sweep.toml", "--dir", "{}", "--jobs", "1"), ("*/episodes.csv",)),
+    Reader("coop-sweep", ("{base}.toml", "--dir", "{}", "--jobs", "1"), ("*/episodes.csv",)),
 )
 PACKED = (
     Reader("coop-report", ("{}/study.parquet", "--out", "{out}"), REPORTED),
@@ -230,7 +230,7 @@ def read(base: Path, reader: Reader, change: Callable[[Path], None] = lambda cop
     shutil.copytree(base, work / "copy")
     change(work / "copy")
     before = contents(work / "copy")
-    arguments = [each.format(work / "copy", out=work / "out") for each in reader.arguments]
+    arguments = [each.format(work / "copy", out=work / "out", base=base) for each in reader.arguments]
     out = io.StringIO()
     status: int | None = 0
     try:

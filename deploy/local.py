@@ -20,6 +20,7 @@ from common.process.processes import ChildProcess, command, free_endpoint
 from common.settings.capacity import check_memory, check_messages
 from common.settings.config import RunConfig, check_distributed
 from common.settings.options import LearnerRunOptions, parse_run
+from common.settings.resuming import settings_digest
 from common.settings.tables import to_toml
 from deploy.status import Display, Page, RunStatus, live_page
 from deploy.supervisor import RestartPolicy
@@ -176,7 +177,7 @@ def _run() -> None:
             check_can_listen("--prometheus", options.prometheus)
         with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
             # Before anything is written; what the roles find, they find by the same code.
-            _, told = options.start.prepare(directory, replay=not options.restart)
+            _, told = options.start.prepare(directory, replay=not options.restart, settings=settings_digest(config))
             for line in told:
                 say(line)
             lock.sign()

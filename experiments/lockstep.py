@@ -101,9 +101,17 @@ class Lockstep:
         def snapshot(folder: str) -> None:
             self.memory.save(directory.path / folder / REPLAY, mark)
 
-        records, fallbacks = directory.records(), directory.fallbacks
         try:
-            save_epoch(directory.path, run_id, number, state, snapshot, records=records, fallbacks=fallbacks)
+            save_epoch(
+                directory.path,
+                run_id,
+                number,
+                state,
+                snapshot,
+                records=directory.records(),
+                fallbacks=directory.fallbacks,
+                settings=directory.settings,
+            )
         except OSError as error:
             text = f"epoch {self.agent.updates} in {directory.path}: {error.strerror or error}"
             raise RunError(text) from error

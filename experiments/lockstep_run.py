@@ -14,6 +14,7 @@ from common.process.lifecycle import Stop, first_line
 from common.process.locks import RunLock
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
+from common.settings.resuming import settings_digest
 from experiments.episodes import Evaluator
 from experiments.lockstep import Lockstep, Replaying
 from learner.initial_networks import load_initial_networks
@@ -53,15 +54,18 @@ class LockstepRun:
         self._wandb = wandb
         if config.video_every:
             check_filmed(config.env)
-        self._lock = RunLock(path, program, ("learner", "replay"))
+        self._run = Lockstep(config)
         try:
-            self._found, self.told = start.prepare(path, replay=not config.streaming, load=load_learner)
-            self._lock.sign()
-            self._run = Lockstep(config)
-        except BaseException:
-            self._lock.release()
+            self._lock = RunLock(path, program, ("learner", "replay"))
+        except RunError:
+            self._run.env.close()
             raise
         try:
+            settings = settings_digest(config)
+            self._found, self.told = start.prepare(
+                path, replay=not config.streaming, settings=settings, load=load_learner
+            )
+            self._lock.sign()
             if self._found.newest is None:
                 load_initial_networks(self._run.agent)
             else:

@@ -18,6 +18,7 @@ from common.process.summaries import read_summary
 from common.process.threads import use_threads
 from common.process.untrusted import check_links
 from common.settings.config import RunConfig
+from common.settings.resuming import settings_digest
 from common.settings.tables import read_run_config
 from learner.agent import Agent
 from learner.initial_networks import load_initial_networks
@@ -66,7 +67,7 @@ def reexecute(run_dir: Path) -> Outcome:
     if not journal_files(folder):
         raise UsageError(f"{run_dir}: no journal with a finished epoch; was the run started with --replay.journal?")
     run_id = read_run_id(run_dir)
-    found = survey(run_dir, replay=True, load=load_learner, every=True)
+    found = survey(run_dir, replay=True, settings=settings_digest(config), load=load_learner, every=True)
     final = found.newest
     if final is None:
         raise UsageError(f"{run_dir}: no whole checkpoint to compare with; {found.passed_over or 'there is none'}")

@@ -22,6 +22,7 @@ from common.process.summaries import read_summary
 from common.process.untrusted import check_links
 from common.settings.config import RunConfig
 from common.settings.environment import EnvSettings
+from common.settings.resuming import settings_digest
 from common.settings.tables import read_run_config
 from common.types import Array, EnvSpec
 from learner.qnetwork import make_network
@@ -153,7 +154,7 @@ class SavedRun:
 
         Raises UsageError if there is none.
         """
-        epoch = newest_epoch(self.path)
+        epoch = newest_epoch(self.path, settings_digest(self.config))
         if epoch is None:
             raise UsageError(f"{self.path}: has no complete checkpoint")
         state, spec = epoch.state, env_spec(self.config.env)

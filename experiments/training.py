@@ -27,6 +27,7 @@ from common.settings.config import RunConfig, check_distributed
 from common.settings.effects import without_effect
 from common.settings.options import RunOptions
 from common.settings.overrides import leaves, merged
+from common.settings.resuming import settings_digest
 from common.settings.sources import chosen_config
 from common.settings.tables import to_tables, to_toml, validated
 from experiments.lockstep_run import LockstepRun
@@ -252,7 +253,7 @@ def _named(settings: Mapping[str, Any]) -> list[str]:
 def _topology(config: RunConfig, directory: Path, actors: int, start: Start, named: list[str]) -> _Topology:
     check_links(directory)
     with RunLock(directory, "coop.train", ("learner", "replay")):  # the process takes it after this one
-        start.prepare(directory, replay=True)
+        start.prepare(directory, replay=True, settings=settings_digest(config))
     logs = directory / "logs"
     try:
         make_folder(logs)

@@ -98,6 +98,7 @@ class Checkpoints:
                 lambda _: self._wait_for(written),
                 records=records,
                 fallbacks=self._directory.fallbacks,
+                settings=self._directory.settings,
             )
         except OSError as error:
             raise RunError(f"epoch {number} in {self._run_dir}: {error.strerror or error}") from error

@@ -19,6 +19,7 @@ from common.process.locks import RunLock
 from common.process.threads import use_threads
 from common.settings.capacity import mirror_slots
 from common.settings.config import RunConfig
+from common.settings.resuming import settings_digest
 from common.types import EnvSpec
 from learner.agent import Agent
 from learner.checkpoints import Checkpoints
@@ -42,7 +43,9 @@ def learn(options: LearnerOptions, config: RunConfig, spec: EnvSpec) -> None:
     path = options.directory()
     with RunLock(path, "coop-learner", ("learner",)) as lock:
         console = Console()
-        found, told = options.start.prepare(path, replay=False, load=load_learner, every=True)
+        found, told = options.start.prepare(
+            path, replay=False, settings=settings_digest(config), load=load_learner, every=True
+        )
         _check_origin(found)
         for line in told:
             console.event(line)

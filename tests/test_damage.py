@@ -114,7 +114,7 @@ def test_python_refuses_as_the_commands_do(run: Path) -> None:
     for distributed in (False, True):
         with pytest.raises(UsageError, match="no checkpoint can be gone on from"):
             coop.train(run_dir=run, resume=True, distributed=distributed)
-    with pytest.raises(UsageError, match=r"no checkpoint is whole: checkpoint 200: learner\.pt: wrong checksum"):
+    with pytest.raises(UsageError, match=r"has no complete checkpoint: checkpoint 200: learner\.pt: wrong checksum"):
         coop.load(run).policy()
     assert contents(run) == before
 
@@ -285,7 +285,7 @@ def test_a_config_or_an_id_that_was_not_written_by_the_run(file: str, run: Path)
     for command, flags in (("coop-lockstep", ("--resume", "--run-dir", run)), ("coop-eval", (run, "--episodes", "1"))):
         done = run_command(command, *flags)
         assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-        assert "not what the run wrote" in done.stderr or "belongs to another run" in done.stderr
+        assert "not what was written" in done.stderr or "belongs to another run" in done.stderr
     assert contents(run) == before
     (run / "config.toml").unlink()
     done = resume(run)
@@ -507,3 +507,9 @@ def test_damage_on_purpose() -> None:
     command = [sys.executable, str(ROOT / "benchmarks" / "corrupt.py"), "--mutations", "200", "--seed", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=880)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_copy_of_a_run_is_no_further_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(run, run.with_name("run-best"))
+    assert [each.name for each in load_study(run.parent).runs] == ["run"]
+    assert capsys.readouterr().err == f"warning: {run.with_name('run-best')}: a copy of run, left out\n"

@@ -68,8 +68,9 @@ class Damaged(Exception):
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What `DONE` seals.
 
-    run, number: of the checkpoint. files, records: by name. fallbacks: where the run went on from an older checkpoint
-    than its newest. journal: the first file of the journal that continues a replay service's part; 0 for others.
+    run, number: of the checkpoint. settings: checksum of those that a resumed run keeps. files, records: by name.
+    fallbacks: where the run went on from an older checkpoint than its newest. journal: the first file of the journal
+    that continues a replay service's part; 0 for others.
     """
 
     run: int
@@ -78,6 +79,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     records: dict[str, Measured] = msgspec.field(default_factory=dict)
     fallbacks: list[str] = msgspec.field(default_factory=list)
     journal: int = 0
+    settings: str = ""
 
 
 def checkpoint_path(run_dir: Path, number: int) -> Path:
@@ -251,6 +253,7 @@ def survey(
     *,
     replay: bool = False,
     records: bool = False,
+    settings: str = "",
     load: Callable[[Path], dict[str, Any]] | None = None,
     every: bool = False,
 ) -> Survey:
@@ -259,6 +262,7 @@ def survey(
     Args:
         replay: the replay service's part must be whole too.
         records: the run's records must hold what the checkpoint seals, as they must to be continued.
+        settings: checksum of the run's settings, as config.toml has them; not compared if it is empty.
         load: reads the learner's state of a checkpoint; one for which that fails is not whole.
         every: look at every checkpoint, not only as far as the newest whole one.
     """
@@ -274,6 +278,8 @@ def survey(
             manifest = check_part(path, number, run_id)
             if LEARNER not in manifest.files:
                 raise Damaged(f"{DONE}: does not seal {LEARNER}")
+            if settings and manifest.settings not in ("", settings):
+                raise Damaged("it was saved with other settings than those in config.toml")
             if replay:
                 _check_replay(path, number, manifest.run)
             state = {} if load is None else _loaded(path, load)
@@ -298,7 +304,7 @@ def checked_summary(run_dir: Path) -> dict[str, Any]:
     summary = read_summary(run_dir)
     for name, (size, checksum) in summary.get("records", {}).items():
         try:
-            if name not in (*RECORDS, EVALUATIONS):
+            if name not in (*RECORDS, EVALUATIONS, "config.toml"):
                 raise Damaged(f"{SUMMARY}: names {name!r}, which is no record of a run")
             check_record(run_dir / name, Measured(size, checksum))
         except Damaged as damaged:
@@ -328,6 +334,7 @@ class Start:
         run_dir: Path,
         *,
         replay: bool,
+        settings: str = "",
         load: Callable[[Path], dict[str, Any]] | None = None,
         every: bool = False,
     ) -> tuple[Survey, list[str]]:
@@ -349,7 +356,7 @@ class Start:
             raise RunError(f"run directory {run_dir}: {_reason(error)}") from error
         found = Survey(run_dir)
         if self.goes_on:
-            found = survey(run_dir, replay=replay, records=True, load=load, every=every)
+            found = survey(run_dir, replay=replay, records=True, settings=settings, load=load, every=every)
             found.check()
             told.append(found.describe())
         return found, [line for line in told if line]

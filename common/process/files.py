@@ -35,7 +35,8 @@ def guard_writes(check: Callable[[], None]) -> None:
     _guards.append(check)
 
 
-def _check_guards() -> None:
+def check_guards() -> None:
+    """Ask everything that guards this process's writes; called before each."""
     for check in _guards:
         check()
 
@@ -47,7 +48,7 @@ class SyncedFile:
     """
 
     def __init__(self, path: Path) -> None:
-        _check_guards()
+        check_guards()
         keep_standard_files()
         self._file = open(path, "wb", buffering=0, opener=no_links)  # noqa: SIM115 (Path.open takes no opener)
         self.size = 0
@@ -103,7 +104,7 @@ class LineFile:
 
     def append(self, data: bytes) -> None:
         """Append the bytes of one line or record."""
-        _check_guards()
+        check_guards()
         self._late += data
         size, checksum = self.measured
         self.measured = Measured(size + len(data), zlib.crc32(data, checksum))
@@ -147,7 +148,8 @@ def make_folder(path: Path) -> None:
     """Create a folder with its parents, durably, if it does not exist; raises OSError."""
     if path.is_dir():
         return
-    make_folder(path.parent)
+    if not path.parent.exists():
+        make_folder(path.parent)
     path.mkdir(exist_ok=True)
     sync_folder(path.parent)
 

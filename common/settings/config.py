@@ -164,7 +164,8 @@ class ReplaySettings:
     importance_exponent: Share = 0.4
     """beta of the importance-sampling weights; 0 corrects nothing, 1 corrects fully."""
     journal: bool = False
-    """Write each accepted segment and each draw to disk before answering, so that a kill loses nothing."""
+    """Write each accepted segment and each draw to a file before answering, so that the kill of a process loses none;
+    the death of the machine may lose those since the newest checkpoint."""
     journal_keep: bool = False
     """Keep journal files that an epoch has made redundant, so that the run can be re-executed from its beginning."""
 

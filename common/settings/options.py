@@ -80,7 +80,8 @@ class RunOptions(RunConfig):
     run_dir: Path | None = None
     """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
     resume: bool = False
-    """Continue the run in --run-dir, with its config, from its newest whole checkpoint; start it if none has begun."""
+    """Continue the run in --run-dir, with its config, from its newest whole checkpoint, which survives
+    the death of process and machine; start it if none has begun."""
     resume_from: int | None = None
     """As --resume, but go back to the checkpoint with this number (folder checkpoints/NUMBER), even if records are
     damaged; what is younger is moved to aside/."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,16 @@ from common.settings.tables import to_tables
 _FREE = (*OUTSIDE, "target_return")
 _TELLS_APART = (("run",), ("method",), ("seed",), ("env", "id"))
 _LIMITS = ("total_updates", "total_episodes")  # 0: none
+
+
+def settings_digest(config: RunConfig) -> str:
+    """A checksum of the settings that stay the same in a resumed run, for its checkpoints."""
+    kept = [(path, value) for path, value in leaves(to_tables(config)) if path[0] != "methods" and not _is_free(path)]
+    return f"{zlib.crc32(repr(sorted(kept, key=str)).encode()):08x}"
+
+
+def _is_free(path: tuple[str, ...]) -> bool:
+    return path[0] in (*_FREE, "total_steps", *_LIMITS)
 
 
 def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:

@@ -14,7 +14,7 @@ import pydantic
 import tomli_w
 
 from common.errors import RunError, UsageError
-from common.process.run_ids import has_run_id, read_run_id
+from common.process.run_ids import has_run_id
 from common.process.untrusted import MAX_SETTINGS, read_text
 from common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from common.settings.methods import METHODS
@@ -129,14 +129,21 @@ def to_toml(config: RunConfig) -> str:
     return tomli_w.dumps(to_tables(config))
 
 
-def run_config_text(config: RunConfig, run_id: int | None) -> str:
-    """The text of a run's config.toml: the resolved config, and its checksum with the run's id as a comment."""
-    text = to_toml(config)
-    return text + _seal(text, run_id)
+def run_config_text(config: RunConfig) -> str:
+    """The text of a run's config.toml: the resolved config, and its checksum."""
+    return sealed_toml(to_toml(config))
 
 
-def _seal(text: str, run_id: int | None) -> str:
-    return f"{_SEAL}{zlib.crc32(text.encode()):08x}{'' if run_id is None else f' of run {run_id}'}\n"
+def sealed_toml(text: str) -> str:
+    """The text of a TOML file, with its checksum as a comment."""
+    return f"{text}{_SEAL}{zlib.crc32(text.encode()):08x}\n"
+
+
+def check_toml(text: str, place: object, *, needed: bool = False) -> None:
+    """Check a text of `sealed_toml`; needed: it must have a checksum. Raises UsageError."""
+    content, seal, _ = text.rpartition(_SEAL)
+    if (seal or needed) and text != sealed_toml(content):
+        raise UsageError(f"{place}: not what was written (wrong checksum)")
 
 
 def read_run_config(run_dir: Path) -> RunConfig:
@@ -146,24 +153,16 @@ def read_run_config(run_dir: Path) -> RunConfig:
         text = read_text(path, MAX_SETTINGS)
     except (OSError, UnicodeDecodeError, RunError) as error:
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
-    try:
-        # Runs of a packed study have no id, and may come from versions that wrote no checksum.
-        return parse_run_config(text, path, read_run_id(run_dir) if has_run_id(run_dir) else None)
-    except RunError as error:
-        raise UsageError(str(error)) from error
+    # Runs of a packed study have no id, and may come from versions that wrote no checksum.
+    return parse_run_config(text, path, needed=has_run_id(run_dir))
 
 
-def parse_run_config(text: str, place: object, run_id: int | None = None) -> RunConfig:
-    """Read the text of a run's config.toml; place: for the error. run_id: of the run, which then must have sealed it.
+def parse_run_config(text: str, place: object, *, needed: bool = False) -> RunConfig:
+    """Read the text of a run's config.toml; place: for the error. needed: it must have a checksum.
 
     Raises UsageError.
     """
-    content, seal, rest = text.rpartition(_SEAL)
-    _, _, owner = rest.strip().partition(" of run ")
-    if (seal or run_id is not None) and seal + rest != _seal(content, int(owner) if owner.isdecimal() else None):
-        raise UsageError(f"{place}: not what the run wrote (wrong checksum); flags change the settings of a run")
-    if owner and run_id is not None and owner != str(run_id):
-        raise UsageError(f"{place}: belongs to another run")
+    check_toml(text, place, needed=needed)
     try:
         return resolve(tomllib.loads(text))
     except (tomllib.TOMLDecodeError, RecursionError) as error:

@@ -7,7 +7,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from common.errors import RunError
-from common.process.untrusted import MAX_SETTINGS, check_links, read_text
+from common.process.notices import warn
+from common.process.run_ids import RUN_ID
+from common.process.untrusted import check_links, read_text
+from common.settings.tables import check_toml
 from experiments.report.packed import CONFIG, EPISODES, SWEEP, PackedStudy, run_names
 from learner.records.reading import check_records, column, read_csv, read_jsonl
 
@@ -40,12 +43,26 @@ class FolderSource:
         self._checked: set[str] = set()  # runs whose records are those that they seal
         single = (folder / CONFIG).is_file()
         self._folder = folder.resolve().parent if single else folder
-        self.names = [folder.resolve().name] if single else run_names(folder)
         check_links(folder)
+        self.sweep = None if single else self._sweep()
+        self.names = [folder.resolve().name] if single else self._distinct(run_names(folder))
         for run in self.names:
             check_links(self._folder / run)
-        sweep = self._folder / SWEEP
-        self.sweep = read_text(sweep, MAX_SETTINGS) if not single and sweep.exists() else None
+
+    def _distinct(self, names: list[str]) -> list[str]:
+        """The runs without a user's copies of them, which are no further runs; a warning names these."""
+        first: dict[str, str] = {}
+        for name in names:
+            run_id = self.text(name, RUN_ID) or name  # a packed run has none
+            if first.setdefault(run_id, name) != name and self.sweep is None:
+                warn(f"{self._folder / name}: a copy of {first[run_id]}, left out")
+        return [name for name in names if name in first.values()]
+
+    def _sweep(self) -> str | None:
+        text = self.text("", SWEEP)
+        if text is not None:  # one that the user wrote has no checksum
+            check_toml(text, self._folder / SWEEP, needed=any(self._folder.glob(f"*/{RUN_ID}")))
+        return text
 
     def text(self, run: str, file: str) -> str | None:
         """See `Source`."""

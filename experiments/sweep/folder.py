@@ -14,10 +14,9 @@ from common.errors import RunError, UsageError
 from common.process.checkpoints import checked_summary
 from common.process.files import make_folder, write_atomic
 from common.process.locks import Held, RunLock
-from common.process.run_ids import has_run_id, read_run_id
 from common.process.untrusted import check_links
 from common.returns import RETURN_WINDOW
-from common.settings.tables import identity, read_run_config, run_config_text
+from common.settings.tables import identity, read_run_config, run_config_text, sealed_toml
 from experiments.sweep.grid import Cell, Grid
 
 TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
@@ -79,10 +78,7 @@ class CellFolder:
 
     def prepare(self) -> None:
         """Write the config from which the run starts or continues."""
-        write_atomic(self.path / "config.toml", run_config_text(self.cell.config, self._run_id()).encode())
-
-    def _run_id(self) -> int | None:
-        return read_run_id(self.path) if has_run_id(self.path) else None
+        write_atomic(self.path / "config.toml", run_config_text(self.cell.config).encode())
 
     def progress(self) -> Progress:
         """Read the progress from the end of episodes.csv; zeros before the first episode's end, or if it is damaged."""
@@ -115,6 +111,6 @@ def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
         make_folder(folder)
         for cell in cells:
             cell.check()
-        write_atomic(folder / "sweep.toml", grid.to_toml().encode())
+        write_atomic(folder / "sweep.toml", sealed_toml(grid.to_toml()).encode())
     except OSError as error:
         raise UsageError(f"--dir {folder}: {error.strerror}") from error

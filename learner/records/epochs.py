@@ -37,11 +37,12 @@ def save_epoch(
     *,
     records: Mapping[str, Measured],
     fallbacks: Sequence[str] = (),
+    settings: str = "",
 ) -> Path:
     """Save one checkpoint, and delete those that are too old.
 
     snapshot: makes the replay service save its state under the given folder, relative to the run directory.
-    records, fallbacks: see `Manifest`.
+    records, fallbacks, settings: see `Manifest`.
 
     Raises:
         OSError: the run directory cannot be written; nothing is left of this checkpoint.
@@ -53,7 +54,8 @@ def save_epoch(
         torch.save(learner_state, content)
         files = {LEARNER: write_atomic(path / LEARNER, content.getvalue())}
         snapshot(str(path.relative_to(run_dir)))
-        finish(run_dir, path, Manifest(run_id, number, files, dict(records), list(fallbacks)))
+        manifest = Manifest(run_id, number, files, dict(records), list(fallbacks), settings=settings)
+        finish(run_dir, path, manifest)
     except BaseException:
         remove(path)
         raise
@@ -61,17 +63,17 @@ def save_epoch(
     return path
 
 
-def newest_epoch(run_dir: Path, *, replay: bool = False) -> Whole | None:
+def newest_epoch(run_dir: Path, settings: str = "") -> Whole | None:
     """The newest whole checkpoint of a run, with the learner's state, for readers; None if there is none.
 
-    A warning names those that were passed over. replay: the replay service's part must be whole too.
+    A warning names those that were passed over. settings: see `survey`.
 
     Raises:
         UsageError: there are checkpoints, but none is whole.
     """
-    found = survey(run_dir, replay=replay, load=load_learner)
+    found = survey(run_dir, settings=settings, load=load_learner)
     if found.newest is None and found.problems:
-        raise UsageError(f"{run_dir}: no checkpoint is whole: {found.passed_over}")
+        raise UsageError(f"{run_dir}: has no complete checkpoint: {found.passed_over}")
     if found.fallback:
         warn(f"{run_dir}: takes checkpoint {found.whole[0].number}; passes over {found.fallback}")
     return found.newest

@@ -16,12 +16,13 @@ from common.imports import describe, remember
 from common.messaging.messages.evaluate import EvaluationRow
 from common.process.checkpoints import RECORDS, Survey, go_back
 from common.process.console import say
-from common.process.files import LineFile, Measured, make_folder, truncate, write_atomic
+from common.process.files import LineFile, Measured, make_folder, measure, truncate, write_atomic
 from common.process.run_ids import claim, has_run_id, read_run_id
 from common.process.summaries import SUMMARY, strict_json, summary_text
 from common.returns import exact
 from common.settings.config import RunConfig
 from common.settings.overrides import leaves
+from common.settings.resuming import settings_digest
 from common.settings.tables import CONFIG, run_config_text, to_tables
 from learner.records.curve import draw_learning_curve
 from learner.records.evaluations import EVALUATIONS, EvaluationsFile
@@ -59,10 +60,12 @@ class RunDirectory:
             UsageError: Weights & Biases refuses.
         """
         self.path = path
+        self.settings = settings_digest(config)
         self.fallbacks: list[str] = []
         self.aside = ""
         sealed: Mapping[str, Measured] = {}
         try:
+            (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
             newest = None if found is None or number is None else found.of(number)
             run_id = claim_run_directory(path, config, None if newest is None else newest.manifest.run)
             mirror = WandbMirror(path, run_id) if wandb else None
@@ -73,7 +76,6 @@ class RunDirectory:
                     sealed = newest.manifest.records
             for name, (size, _) in sealed.items():
                 truncate(path / name, size)
-            (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
             goes_on = number is not None
             self._episodes, self._metrics = (LineFile(path / name, go_on=goes_on) for name in RECORDS)
             self._evaluations = EvaluationsFile(path, env_step if goes_on else None)
@@ -147,6 +149,7 @@ class RunDirectory:
             for file in files:
                 file.sync()
             sealed = {name: file.measured for name, file in zip((*RECORDS, EVALUATIONS), files, strict=True)}
+            sealed[CONFIG] = measure(self.path / CONFIG)
             fields = {**asdict(summary), "fallbacks": self.fallbacks, "records": sealed}
             write_atomic(self.path / SUMMARY, summary_text(fields).encode())
         except OSError as error:
@@ -209,7 +212,7 @@ def claim_run_directory(path: Path, config: RunConfig, known: int | None = None)
         drawn = secrets.randbits(63) if known is None else known
         run_id = read_run_id(path) if has_run_id(path) else drawn
         # First, as an id alone makes it a replay service's folder.
-        write_atomic(path / CONFIG, run_config_text(config, run_id).encode())
+        write_atomic(path / CONFIG, run_config_text(config).encode())
     except OSError as error:
         raise RunError(f"run directory {path}: {error.strerror or error}") from error
     claim(path, run_id)

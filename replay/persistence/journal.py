@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from common.errors import RunError, UsageError
 from common.messaging.messages.sample import DrawRequest
-from common.process.files import make_folder, sync_file, sync_folder
+from common.process.files import check_guards, make_folder, sync_file, sync_folder
 from common.process.run_ids import check_owner
 from replay.limiter import RateLimiter
 
@@ -174,6 +174,7 @@ class Journal:
             del self._late[0]
 
     def _write(self, kind: int, payload: bytes, transitions: int = 0) -> None:
+        check_guards()
         accepted = self._accepted + transitions
         header = Header(_checksum(payload), kind, self._number, self._records, accepted, len(payload))
         try:
