@@ -40,7 +40,7 @@ class Refused(CartPoleEnv):
     def reset(self, **keywords): return np.zeros(7, np.float32), {}
 class NotEvaluated(Ending):
     def end(self):
-        if "eval" in sys.argv[0]: sys.exit("not here")
+        if "eval" in sys.argv[0]: os.abort()
 
 for kind in (Raising, Exiting, Vanishing, Crashing, Refused, NotEvaluated):
     gymnasium.register(kind.__name__ + "-v0", entry_point=kind)
