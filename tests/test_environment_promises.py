@@ -23,7 +23,7 @@ from common.envs.gymnasium_env import GymnasiumEnv
 from common.envs.make import env_spec, make_filmed_env, make_vector_env
 from common.envs.protocol import VectorEnv
 from common.errors import BadMessage, CoopError, RunError, UsageError
-from common.messaging.messages.insert import check_transitions
+from common.messaging.messages.insert import check_values
 from common.process import notices
 from common.settings.environment import EnvSettings
 from common.settings.resuming import check_resumed
@@ -262,9 +262,9 @@ def test_rewards_have_one_bound_in_every_kind_of_run() -> None:
         "span": np.array([3], np.uint8),
     }
     spec = EnvSpec("x", (3,), "float32", 1, 2)
-    check_transitions(spec, arrays)
+    check_values(spec, arrays)
     with pytest.raises(BadMessage, match=r"arrays\.rewards"):
-        check_transitions(spec, {**arrays, "span": np.array([2], np.uint8)})
+        check_values(spec, {**arrays, "span": np.array([2], np.uint8)})
 
 
 def test_a_run_in_python_fails_as_documented_and_says_so_in_its_summary(tmp_path: Path) -> None:

@@ -107,5 +107,5 @@ def test_a_thread_that_ends_of_an_error_ends_the_process(
     thread.start()
     thread.join()
     assert stop.failed
-    assert stop.reason == "error of this program in the thread 'epoch 7': ZeroDivisionError('gone')"
+    assert stop.reason == "error of this program in the thread 'epoch 7': ZeroDivisionError: gone"
     assert "Traceback" in capfd.readouterr().err

@@ -514,7 +514,7 @@ def test_priorities_arrive_with_requests_for_several_batches(nodes: tuple[Node, 
     chosen = int(_batch(client).ids[0])
     for number in range(20):
         batch = _batch(client)
-        client.prioritise(batch, np.where(batch.ids == chosen, 1e6, 1e-3).astype(np.float32))
+        client.prioritise(batch.ids, np.where(batch.ids == chosen, 1e6, 1e-3).astype(np.float32))
         if number > 8:
             assert (batch.ids == chosen).all()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from common.process.checkpoints import Start
 from common.process.lifecycle import Stop
 from common.process.summaries import SUMMARY, read_summary, strict_json
 from common.returns import exact
@@ -89,7 +90,7 @@ def test_tensorboard_is_cut_back_with_the_records(tmp_path: Path) -> None:
     theirs = path / "tb" / "events.out.tfevents.0000000001.elsewhere.1"
     theirs.write_bytes(b"not a run's")
     before = [each.step for each in EventAccumulator(str(mine)).Reload().Scalars("charts/episodic_return")]
-    resumed = LockstepRun(config, path, "test", resume=True)
+    resumed = LockstepRun(config, path, "test", Start(resume=True))
     resumed.play(Stop())
     resumed.close()
     with (path / "episodes.csv").open() as file:

@@ -15,7 +15,7 @@ from commands import run_command
         ("--env.id CartPole-v0", ["network.kind = 'nature': needs pictures; CartPole-v0 has frames [4]"]),
         (
             "--replay.capacity 1000000000 --total-steps 1000000000",
-            ["replay.capacity = 1,000,000,000: needs up to 6640.3 GiB, this machine has"],
+            ["replay.capacity = 1,000,000,000: needs up to 6647.8 GiB, this machine has"],
         ),
         ("--actors 0", ["--actors 0: must be at least 1, or 0 with --listen"]),
         ("--actors=-1 --listen tcp/127.0.0.1:0", ["--actors -1: must be at least 1, or 0 with --listen"]),

@@ -31,5 +31,5 @@ def test_a_run_that_goes_on_has_none(tmp_path: Path) -> None:
             Summary("dqn", "CartPole-v0", 0, 1000, 900, 10, 22.6, 20.8, 3.4, 1000, 0, 0, "complete"), "a run"
         )
     assert (tmp_path / "run" / "summary.json").exists()
-    with RunDirectory(tmp_path / "run", config, sizes={}):
+    with RunDirectory(tmp_path / "run", config):
         assert not (tmp_path / "run" / "summary.json").exists()
