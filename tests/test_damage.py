@@ -16,7 +16,7 @@ import pytest
 from commands import run_command
 from samples import make_segment
 from test_epochs import CONFIG, save
-from test_journal import _insert
+from test_journal import _insert, _use
 
 import coop
 from common.errors import RunError, UsageError
@@ -397,6 +397,20 @@ def test_a_page_of_zeros_costs_what_it_covers(spec: EnvSpec, tmp_path: Path) -> 
     _, told = recover(twin, tmp_path, 1, 5)
     assert (twin.table.inserted, twin.lost) == (12, 12)
     assert "records 2 to 4 before byte" in told[1]
+
+
+def test_draws_of_what_is_lost_are_passed_over(spec: EnvSpec, tmp_path: Path) -> None:
+    core = ReplayCore(CONFIG, spec, Journal(tmp_path, 5, 1, keep=False))
+    _use(core, spec, range(9))
+    content = (tmp_path / "00000001.log").read_bytes()
+    for part in (3, 1):  # a third, and all but the last record
+        end = len(content) // part - (HEADER_BYTES + 200 if part == 1 else 0)
+        (tmp_path / "00000001.log").write_bytes(content[:100] + bytes(end - 100) + content[end:])
+        twin = ReplayCore(CONFIG, spec)
+        recover(twin, tmp_path, 1, 5)
+        assert twin.table.inserted + twin.lost == core.table.inserted
+        assert twin.lost > 0
+        assert twin.drawn == core.drawn
 
 
 def test_a_missing_file_and_the_end_of_a_file_are_counted(spec: EnvSpec, tmp_path: Path) -> None:

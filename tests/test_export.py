@@ -1,5 +1,6 @@
 """`coop-export`: a run's networks as safetensors and ONNX, which play without this package."""
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -89,6 +90,8 @@ def test_the_card_and_the_parameters(tmp_path: Path) -> None:
         assert all(torch.equal(tensors[name], expected[name]) for name in tensors)
     card = json.loads((tmp_path / "a" / "b" / "card.json").read_text())
     returns = [float(line.split(",")[5]) for line in (tmp_path / "run" / "episodes.csv").read_text().splitlines()[1:]]
+    files = {name: (tmp_path / "a" / "b" / name).read_bytes() for name in names[:-1]}
+    assert card.pop("sha256") == {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     assert card == {
         "environment": card["environment"],
         "preprocessing": {

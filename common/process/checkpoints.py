@@ -308,7 +308,7 @@ def checked_summary(run_dir: Path) -> dict[str, Any]:
                 raise Damaged(f"{SUMMARY}: names {name!r}, which is no record of a run")
             check_record(run_dir / name, Measured(size, checksum))
         except Damaged as damaged:
-            raise RunError(f"{run_dir}: {damaged}") from damaged
+            raise RunError(f"{run_dir}: can't be read as it was written: {damaged}") from damaged
     return summary
 
 

@@ -83,7 +83,7 @@ def load_learner(path: Path) -> dict[str, Any]:
     try:
         state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
     except (pickle.UnpicklingError, RuntimeError) as error:  # whose advice is to execute it all the same
-        raise ValueError(f"PyTorch {torch.__version__} can't read it ({type(error).__name__})") from error
+        raise pickle.UnpicklingError(f"PyTorch {torch.__version__} can't read it") from error
     if not isinstance(state, dict):
         raise TypeError("not a learner's state")
     return state
