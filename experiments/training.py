@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from common.errors import RunError, UsageError
-from common.process.checkpoints import Start
 from common.process.console import say
 from common.process.files import make_folder
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
 from common.process.processes import ChildProcess, command
+from common.process.resumption import Start
 from common.process.summaries import read_summary
 from common.settings.config import RunConfig, check_distributed
 from common.settings.effects import without_effect

@@ -20,9 +20,10 @@ from test_journal import _insert, _use
 
 import coop
 from common.errors import RunError, UsageError
-from common.process import checkpoints
-from common.process.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, survey, write_manifest
+from common.process import checkpoints, resumption
+from common.process.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, write_manifest
 from common.process.files import Measured, measure, sealed, unsealed
+from common.process.resumption import survey
 from common.types import EnvSpec
 from experiments.evaluation import evaluate_checkpoint
 from experiments.export import export
@@ -127,7 +128,7 @@ def test_a_run_of_another_account_is_refused(run: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(checkpoints, "measure", fails)
     with pytest.raises(UsageError, match=r"checkpoint 220: learner.pt: Input/output error"):
-        checkpoints.Start(resume=True).prepare(run, replay=True)
+        resumption.Start(resume=True).prepare(run, replay=True)
 
 
 def test_a_fallback_is_said_everywhere_and_younger_ones_are_kept_aside(run: Path) -> None:

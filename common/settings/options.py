@@ -14,10 +14,11 @@ import tyro
 
 from common.errors import RunError, UsageError
 from common.process import cli
-from common.process.checkpoints import LEARNER, RECORDS, Start, checkpoint_numbers, holds_run
+from common.process.checkpoints import LEARNER, RECORDS, checkpoint_numbers
 from common.process.extras import check_extra
 from common.process.flags import HttpAddress
 from common.process.notices import note_renamed, warn
+from common.process.resumption import Start, holds_run
 from common.process.run_ids import has_run_id, read_run_id
 from common.settings.config import RunConfig
 from common.settings.effects import without_effect

@@ -12,19 +12,10 @@ from typing import Any
 import torch
 
 from common.errors import CoopError, UsageError
-from common.process.checkpoints import (
-    LEARNER,
-    Manifest,
-    Whole,
-    begin,
-    checkpoint_path,
-    finish,
-    remove,
-    remove_old,
-    survey,
-)
+from common.process.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
 from common.process.files import Measured, write_atomic
 from common.process.notices import warn
+from common.process.resumption import Whole, survey
 
 
 def save_epoch(
