@@ -326,6 +326,24 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
         save_epoch(tmp_path, 5, 200, {}, lambda _: None, records=records)
 
 
+def test_a_run_over_processes_goes_on_from_the_checkpoint_that_both_hold(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    flags = ("--actors", "1", "--run-dir", path)
+    run_command("coop-local", *flags, *SHORT, "--checkpoint-every", "100", "--replay.journal", check=True)
+    older, newest = checkpoint_numbers(path)
+    flip(path / "checkpoints" / str(newest) / "replay" / "actions.npy")
+    damaged = contents(path / "checkpoints" / str(newest))
+    done = run_command("coop-local", *flags, "--resume", "--total-steps", "300")
+    assert done.returncode == 0, done.stderr
+    why = f"passes over checkpoint {newest}: replay/actions.npy: wrong checksum\n"
+    assert done.stdout.startswith(f"goes on from checkpoint {older}; {why}")
+    summary = json.loads((path / "summary.json").read_text())
+    assert (summary["exit"], summary["transitions_lost"]) == ("complete", 0)
+    assert summary["fallbacks"] == [f"checkpoint {newest}: the replay service has no whole part of it"]
+    (aside,) = (path / "aside").iterdir()
+    assert contents(aside / "checkpoints" / str(newest)) == damaged
+
+
 CELL = 'preset = "cartpole"\nmethods = ["dqn"]\nseeds = [0]\n[fixed]\ntotal_steps = 260\n'
 
 

@@ -264,7 +264,7 @@ def go_back(found: Survey, number: int | None) -> str:
     else:
         move_aside(run_dir, started, to)
     move_aside(run_dir, [f"{FOLDER}/{each}" for each in younger], to)
-    return f"what is younger is in {to}"
+    return f"what {'was there' if number is None else 'is younger'} is in {to}"
 
 
 def keep_from(run_dir: Path, number: int) -> str:
