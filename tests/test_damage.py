@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from commands import run_command
 from samples import make_segment
-from test_epochs import CONFIG, save
+from test_epochs import CONFIG, save, save_learner
 from test_journal import _insert, _use
 
 import coop
@@ -173,6 +173,15 @@ def test_folders_of_the_user_among_the_checkpoints_are_the_users(other: str, run
     assert done.returncode == 0, done.stderr
     assert contents(mine) == before
     assert next(evaluate_checkpoint(run, 1, 0)).epoch == 460
+
+
+def test_a_file_of_the_user_in_an_old_checkpoint_outlives_it(tmp_path: Path) -> None:
+    for number in (100, 200, 300, 400):
+        save_learner(tmp_path, number, {})
+        (tmp_path / "checkpoints" / str(number) / "notes.txt").write_text("mine")
+    assert checkpoint_numbers(tmp_path) == [100, 200, 300, 400]
+    assert checkpoint_numbers(tmp_path, "learner.pt") == checkpoint_numbers(tmp_path, DONE) == [300, 400]
+    assert contents(tmp_path / "checkpoints" / "100") == {"notes.txt": b"mine"}
 
 
 def test_a_replay_service_lists_only_its_own_parts(spec: EnvSpec, tmp_path: Path) -> None:
