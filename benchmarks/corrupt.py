@@ -291,7 +291,7 @@ def load(path: Path) -> None:
 def restore(path: Path) -> None:
     """What `coop-local --resume` reads: its own check, the learner's state, the table and the journal."""
     from common.envs.make import env_spec  # noqa: PLC0415
-    from common.process.checkpoints import Start, go_back  # noqa: PLC0415
+    from common.process.resumption import Start, go_back  # noqa: PLC0415
     from common.process.run_ids import read_run_id  # noqa: PLC0415
     from common.settings.tables import read_run_config  # noqa: PLC0415
     from learner.records.epochs import load_learner  # noqa: PLC0415

@@ -15,8 +15,9 @@ from actors.policy import Policy
 from common.envs.make import make_vector_env
 from common.errors import RunError, UsageError
 from common.messaging.messages.sample import EpisodeRecord
-from common.process.checkpoints import REPLAY, Whole
+from common.process.checkpoints import REPLAY
 from common.process.randomness import generator_state, set_generator_state
+from common.process.resumption import Whole
 from common.settings.config import RunConfig
 from experiments.memory import make_memory
 from learner.records.epochs import fitting, save_epoch

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from common.envs.make import check_filmed
 from common.errors import CoopError, RunError
-from common.process.checkpoints import Start
 from common.process.console import say
 from common.process.lifecycle import Stop, first_line
 from common.process.locks import RunLock
+from common.process.resumption import Start
 from common.process.threads import use_threads
 from common.settings.config import RunConfig
 from common.settings.resuming import settings_digest

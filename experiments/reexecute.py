@@ -12,7 +12,7 @@ import torch
 from common.envs.make import env_spec
 from common.errors import RunError, UsageError
 from common.imports import hand_over
-from common.process.checkpoints import Survey, survey
+from common.process.resumption import Survey, survey
 from common.process.run_ids import read_run_id
 from common.process.summaries import read_summary
 from common.process.threads import use_threads

@@ -15,12 +15,12 @@ from typing import Any
 from common.errors import CoopError, RunError, UsageError
 from common.imports import describe, permit
 from common.places import absolute
-from common.process.checkpoints import Start
 from common.process.console import say
 from common.process.files import make_folder
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
 from common.process.processes import ChildProcess, command
+from common.process.resumption import Start
 from common.process.summaries import read_summary
 from common.process.untrusted import check_links
 from common.settings.config import RunConfig, check_distributed

@@ -11,11 +11,11 @@ from common.messaging.mirror import FrameMirror
 from common.messaging.sample_client import SampleClient
 from common.messaging.session import SHORT_QUEUE, open_session
 from common.messaging.transport import Node, new_incarnation
-from common.process.checkpoints import Survey
 from common.process.console import Console, say
 from common.process.health import answering
 from common.process.lifecycle import Stop
 from common.process.locks import RunLock
+from common.process.resumption import Survey
 from common.process.threads import use_threads
 from common.settings.capacity import mirror_slots
 from common.settings.config import RunConfig

@@ -15,14 +15,15 @@ from pathlib import Path
 import pytest
 from commands import run_command
 from samples import make_segment
-from test_epochs import CONFIG, save
-from test_journal import _insert
+from test_epochs import CONFIG, save, save_learner
+from test_journal import _insert, _use
 
 import coop
 from common.errors import RunError, UsageError
-from common.process import checkpoints
-from common.process.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, survey, write_manifest
+from common.process import checkpoints, resumption
+from common.process.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, write_manifest
 from common.process.files import Measured, measure, sealed, unsealed
+from common.process.resumption import survey
 from common.types import EnvSpec
 from experiments.evaluation import evaluate_checkpoint
 from experiments.export import export
@@ -127,7 +128,7 @@ def test_a_run_of_another_account_is_refused(run: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(checkpoints, "measure", fails)
     with pytest.raises(UsageError, match=r"checkpoint 220: learner.pt: Input/output error"):
-        checkpoints.Start(resume=True).prepare(run, replay=True)
+        resumption.Start(resume=True).prepare(run, replay=True)
 
 
 def test_a_fallback_is_said_everywhere_and_younger_ones_are_kept_aside(run: Path) -> None:
@@ -172,6 +173,15 @@ def test_folders_of_the_user_among_the_checkpoints_are_the_users(other: str, run
     assert done.returncode == 0, done.stderr
     assert contents(mine) == before
     assert next(evaluate_checkpoint(run, 1, 0)).epoch == 460
+
+
+def test_a_file_of_the_user_in_an_old_checkpoint_outlives_it(tmp_path: Path) -> None:
+    for number in (100, 200, 300, 400):
+        save_learner(tmp_path, number, {})
+        (tmp_path / "checkpoints" / str(number) / "notes.txt").write_text("mine")
+    assert checkpoint_numbers(tmp_path) == [100, 200, 300, 400]
+    assert checkpoint_numbers(tmp_path, "learner.pt") == checkpoint_numbers(tmp_path, DONE) == [300, 400]
+    assert contents(tmp_path / "checkpoints" / "100") == {"notes.txt": b"mine"}
 
 
 def test_a_replay_service_lists_only_its_own_parts(spec: EnvSpec, tmp_path: Path) -> None:
@@ -325,6 +335,24 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
         save_epoch(tmp_path, 5, 200, {}, lambda _: None, records=records)
 
 
+def test_a_run_over_processes_goes_on_from_the_checkpoint_that_both_hold(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    flags = ("--actors", "1", "--run-dir", path)
+    run_command("coop-local", *flags, *SHORT, "--checkpoint-every", "100", "--replay.journal", check=True)
+    older, newest = checkpoint_numbers(path)
+    flip(path / "checkpoints" / str(newest) / "replay" / "actions.npy")
+    damaged = contents(path / "checkpoints" / str(newest))
+    done = run_command("coop-local", *flags, "--resume", "--total-steps", "300")
+    assert done.returncode == 0, done.stderr
+    why = f"passes over checkpoint {newest}: replay/actions.npy: wrong checksum\n"
+    assert done.stdout.startswith(f"goes on from checkpoint {older}; {why}")
+    summary = json.loads((path / "summary.json").read_text())
+    assert (summary["exit"], summary["transitions_lost"]) == ("complete", 0)
+    assert summary["fallbacks"] == [f"checkpoint {newest}: the replay service has no whole part of it"]
+    (aside,) = (path / "aside").iterdir()
+    assert contents(aside / "checkpoints" / str(newest)) == damaged
+
+
 CELL = 'preset = "cartpole"\nmethods = ["dqn"]\nseeds = [0]\n[fixed]\ntotal_steps = 260\n'
 
 
@@ -397,6 +425,20 @@ def test_a_page_of_zeros_costs_what_it_covers(spec: EnvSpec, tmp_path: Path) -> 
     _, told = recover(twin, tmp_path, 1, 5)
     assert (twin.table.inserted, twin.lost) == (12, 12)
     assert "records 2 to 4 before byte" in told[1]
+
+
+def test_draws_of_what_is_lost_are_passed_over(spec: EnvSpec, tmp_path: Path) -> None:
+    core = ReplayCore(CONFIG, spec, Journal(tmp_path, 5, 1, keep=False))
+    _use(core, spec, range(9))
+    content = (tmp_path / "00000001.log").read_bytes()
+    for part in (3, 1):  # a third, and all but the last record
+        end = len(content) // part - (HEADER_BYTES + 200 if part == 1 else 0)
+        (tmp_path / "00000001.log").write_bytes(content[:100] + bytes(end - 100) + content[end:])
+        twin = ReplayCore(CONFIG, spec)
+        recover(twin, tmp_path, 1, 5)
+        assert twin.table.inserted + twin.lost == core.table.inserted
+        assert twin.lost > 0
+        assert twin.drawn == core.drawn
 
 
 def test_a_missing_file_and_the_end_of_a_file_are_counted(spec: EnvSpec, tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from table_reference import check_references
 
 from common.errors import RunError
 from common.messaging.messages.sample import DrawRequest, EpisodeRecord
-from common.process.checkpoints import DONE, checkpoint_numbers, go_back, survey
+from common.process.checkpoints import DONE, checkpoint_numbers
+from common.process.resumption import go_back, survey
 from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from common.types import EnvSpec
 from learner.records.epochs import load_learner, newest_epoch, save_epoch

@@ -25,10 +25,11 @@ from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow
 from common.messaging.messages.join import Joined
 from common.messaging.messages.stop import EndOfRun
 from common.messaging.transport import Node, Refused
-from common.process.checkpoints import Manifest, Start, Survey, Whole
+from common.process.checkpoints import Manifest
 from common.process.console import Console
 from common.process.lifecycle import Stop
 from common.process.processes import free_endpoint
+from common.process.resumption import Start, Survey, Whole
 from common.settings.config import NetworkSettings, RunConfig
 from common.settings.environment import EnvSettings
 from common.settings.sources import base_config

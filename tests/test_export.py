@@ -90,9 +90,9 @@ def test_the_card_and_the_parameters(tmp_path: Path) -> None:
         assert all(torch.equal(tensors[name], expected[name]) for name in tensors)
     card = json.loads((tmp_path / "a" / "b" / "card.json").read_text())
     returns = [float(line.split(",")[5]) for line in (tmp_path / "run" / "episodes.csv").read_text().splitlines()[1:]]
-    sums = {name: hashlib.sha256((tmp_path / "a" / "b" / name).read_bytes()).hexdigest() for name in names[:-1]}
+    files = {name: (tmp_path / "a" / "b" / name).read_bytes() for name in names[:-1]}
+    assert card.pop("sha256") == {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     assert card == {
-        "sha256": sums,
         "environment": card["environment"],
         "preprocessing": {
             "stack": 1, "resize": None, "grayscale": False, "axes": [0, 1], "input_shape": [4], "scale": 1.0,

@@ -13,7 +13,7 @@ from commands import run_command
 from actors.policy import Policy
 from common.errors import UsageError
 from common.networks.network import FlatNetwork, build_network
-from common.process.checkpoints import survey
+from common.process.resumption import survey
 from common.settings.config import NETWORK_KINDS, NetworkSettings, RunConfig
 from common.settings.sources import base_config
 from common.settings.tables import validated

@@ -21,10 +21,11 @@ from common.messaging.joining import join
 from common.messaging.messages.join import Join
 from common.messaging.session import open_session
 from common.messaging.transport import Node, new_incarnation
-from common.process.checkpoints import Manifest, Survey, Whole, go_back, survey
+from common.process.checkpoints import Manifest
 from common.process.files import Measured, truncate
 from common.process.lifecycle import Stop
 from common.process.locks import INHERITED, RunLock
+from common.process.resumption import Survey, Whole, go_back, survey
 from common.process.run_ids import RUN_ID, claim, read_run_id
 from common.settings.options import RunOptions
 from common.types import EnvSpec

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from common.process.checkpoints import Start
 from common.process.lifecycle import Stop
+from common.process.resumption import Start
 from common.process.summaries import SUMMARY, read_summary, strict_json
 from common.returns import exact
 from common.settings.sources import base_config

@@ -16,10 +16,11 @@ from common.errors import RunError, UsageError
 from common.imports import permit
 from common.places import absolute
 from common.process import cli
-from common.process.checkpoints import LEARNER, RECORDS, Start, checkpoint_numbers, holds_run
+from common.process.checkpoints import LEARNER, RECORDS, checkpoint_numbers
 from common.process.extras import check_extra
 from common.process.flags import HttpAddress
 from common.process.notices import note_renamed, warn
+from common.process.resumption import Start, holds_run
 from common.process.run_ids import has_run_id, read_run_id
 from common.process.untrusted import check_run
 from common.settings.config import RunConfig

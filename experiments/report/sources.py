@@ -11,7 +11,7 @@ from common.process.notices import warn
 from common.process.run_ids import RUN_ID
 from common.process.untrusted import check_links, read_text
 from common.settings.tables import check_toml
-from experiments.report.packed import CONFIG, EPISODES, SWEEP, PackedStudy, run_names
+from experiments.report.packed import CONFIG, EPISODES, SUMMARY, SWEEP, PackedStudy, run_names
 from learner.records.reading import check_records, column, read_csv, read_jsonl
 
 
@@ -51,11 +51,12 @@ class FolderSource:
 
     def _distinct(self, names: list[str]) -> list[str]:
         """The runs without a user's copies of them, which are no further runs; a warning names these."""
-        first: dict[str, str] = {}
+        first: dict[tuple[str, str | None], str] = {}
         for name in names:
-            run_id = self.text(name, RUN_ID) or name  # a packed run has none
-            if first.setdefault(run_id, name) != name and self.sweep is None:
-                warn(f"{self._folder / name}: a copy of {first[run_id]}, left out")
+            # A packed run has no id; one that went on by itself has another summary.
+            run = self.text(name, RUN_ID) or name, self.text(name, SUMMARY)
+            if first.setdefault(run, name) != name and self.sweep is None:
+                warn(f"{self._folder / name}: a copy of {first[run]}, left out")
         return [name for name in names if name in first.values()]
 
     def _sweep(self) -> str | None:

@@ -12,19 +12,10 @@ from typing import Any
 import torch
 
 from common.errors import CoopError, UsageError
-from common.process.checkpoints import (
-    LEARNER,
-    Manifest,
-    Whole,
-    begin,
-    checkpoint_path,
-    finish,
-    remove,
-    remove_old,
-    survey,
-)
+from common.process.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
 from common.process.files import Measured, write_atomic
 from common.process.notices import warn
+from common.process.resumption import Whole, survey
 from common.process.untrusted import check_torch_file
 
 
@@ -90,7 +81,7 @@ def load_learner(path: Path) -> dict[str, Any]:
     try:
         state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
     except (pickle.UnpicklingError, RuntimeError) as error:  # whose advice is to execute it all the same
-        raise ValueError(f"PyTorch {torch.__version__} can't read it ({type(error).__name__})") from error
+        raise pickle.UnpicklingError(f"PyTorch {torch.__version__} can't read it") from error
     if not isinstance(state, dict):
         raise TypeError("not a learner's state")
     return state

@@ -41,7 +41,7 @@ def check_records(run_dir: Path) -> None:
             for name, written in manifest.records.items():
                 check_record(run_dir / name, written)
         except Damaged as damaged:
-            raise RunError(f"{run_dir}: {damaged}") from damaged
+            raise RunError(f"{run_dir}: can't be read as it was written: {damaged}") from damaged
         return
 
 

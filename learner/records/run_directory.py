@@ -14,9 +14,10 @@ from typing import Any, Self
 from common.errors import RunError
 from common.imports import describe, remember
 from common.messaging.messages.evaluate import EvaluationRow
-from common.process.checkpoints import RECORDS, Survey, go_back
+from common.process.checkpoints import RECORDS
 from common.process.console import say
 from common.process.files import LineFile, Measured, make_folder, measure, truncate, write_atomic
+from common.process.resumption import Survey, go_back
 from common.process.run_ids import claim, has_run_id, read_run_id
 from common.process.summaries import SUMMARY, strict_json, summary_text
 from common.returns import exact

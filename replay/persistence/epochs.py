@@ -143,7 +143,7 @@ class ReplayEpochs:
         for each in younger:
             with contextlib.suppress(OSError):  # something else is there
                 checkpoint_path(self._folder, each).rmdir()
-        return f"what is younger is in {to}"
+        return f"what {'was there' if anew else 'is younger'} is in {to}"
 
     def _is_shared(self, number: int) -> bool:
         return any((checkpoint_path(self._folder, number) / name).exists() for name in (LEARNER, DONE))

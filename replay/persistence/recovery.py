@@ -16,7 +16,6 @@ from common.messaging.messages.insert import SegmentReader
 from common.messaging.messages.sample import DrawRequest
 from replay.core import ReplayCore
 from replay.persistence.journal import (
-    BEGIN,
     DRAW,
     END,
     LIMITER,
@@ -92,10 +91,14 @@ class Replaying:
                 segment = read(wire.decode(payload, wire.ON_DISK))
                 self._count(accepted - segment.steps)
                 core.apply_insert(segment)
-            elif kind == BEGIN:
-                self._count(accepted)
-            elif kind == DRAW:
+                self._accepted = accepted
+                continue
+            self._count(accepted)
+            if kind == DRAW:
                 request, ids = read_draw(payload)
+                if self.lost and len(core.table) < request.batch_size:
+                    core.drawn = max(core.drawn, request.sequence + 1)  # of transitions that are lost
+                    continue
                 batch, _ = core.apply_draw(request)
                 if not self.lost and not np.array_equal(batch.columns["ids"], ids):
                     text = f"{self._folder}: file {number}, batch {request.sequence}: other transitions than recorded"
@@ -104,7 +107,6 @@ class Replaying:
             elif kind == LIMITER:
                 core.restore_limiter(read_limiter(payload))
             self.ended = kind == END
-            self._accepted = accepted
 
     def _count(self, accepted: int) -> None:
         """Count what is lost before a record at which the run had accepted so many transitions."""
