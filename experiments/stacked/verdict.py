@@ -10,6 +10,7 @@ import argparse
 import hashlib
 import math
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +32,7 @@ DEPTHS = (3, 8, 16)
 FEEDBACKS = ("transform-constant", "transform-normal", "weight-gradient", "noise", "rates", "random")
 JUDGED = ("transform-constant", "transform-normal")  # by the verdict on EDL under RMSProp and Adam
 VANISHED, PLAIN, TIMES = 0.01, 0.1, 10.0  # family D: ratios of the first layer's norm to the last's, and of two ratios
+MEASURES = ("gradient_ratio", "gradient_cosine", "step_ratio", "step_cosine", "least", "largest", "dead")
 PHASES = ("study", "tuning", "layers")
 AT = ("first", "fifth", "tenth", "last")  # of the 20 moments, those that are packed
 
@@ -70,7 +72,8 @@ def differences(runs: pd.DataFrame, area: str = "area") -> pd.DataFrame:
     runs: those of the study. The mean of none is that over the seeds that the cell has.
     """
     keys = ["depth", "optimizer", "seed"]
-    plain = runs[runs["condition"] == "none"][[*keys, area]].rename(columns={area: "none"})
+    plain = runs[runs["condition"] == "none"][[*keys, area, "rate"]]
+    plain = plain.rename(columns={area: "none", "rate": "none_rate"})
     both = runs[runs["condition"] != "none"].merge(plain, on=keys)
     base = both.groupby(["condition", "depth", "optimizer"])["none"].transform("mean")
     return both.assign(area=both[area], percent=100 * (both[area] - both["none"]) / base, base=base)
@@ -83,7 +86,8 @@ def compared(found: pd.DataFrame) -> pd.DataFrame:
         values = part["percent"].to_numpy(np.float64)
         rows.append(
             {
-                "feedback": condition, "depth": depth, "optimizer": optimizer, "none": part["base"].iloc[0],
+                "feedback": condition, "depth": depth, "optimizer": optimizer, "rate": part["rate"].iloc[0],
+                "none_rate": part["none_rate"].iloc[0], "none": part["base"].iloc[0],
                 "area": float(part["area"].mean()), "percent": values.mean(),
                 **dict(zip(("low", "high"), over_seeds(values)[1:], strict=True)), "seeds": len(values),
                 **tests_of(values)._asdict(),
@@ -255,7 +259,7 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
     recorded = differences(data.study, "recorded")
     return {
         "a": family_a(found), "step_rates": step_rates(found), "b": b, "c": family_c(data.study, b),
-        "d": family_d(data.study),
+        "d": family_d(data.study), "layers": layers_table(data),
         "rates": chosen_rates(data.rates), "equal_rates": equal_rates(data.tuning), "secondary": secondary(data.study),
         "a_recorded": family_a(recorded), "b_recorded": family_b(recorded),
         "c_recorded": family_c(data.study, family_b(recorded), "recorded"),
@@ -295,7 +299,8 @@ def by_layer(data: Data, depth: int, moment: int = 2) -> Figure:
                 medians = medians[np.isfinite(medians)]
                 nothing = np.full(len(medians), np.nan)
                 layers = np.arange(1.0, len(medians) + 1)
-                lines.append(Line(f"{condition}, {optimizer}", layers, Interval(medians, nothing, nothing)))
+                name = "EDL" if condition != "none" else condition
+                lines.append(Line(f"{name} {optimizer}", layers, Interval(medians, nothing, nothing)))
         log = measure in ("gradient_ratio", "least", "largest")
         panels.append(Panel(label, "layer", "", lines, log_y=log, share=measure == "dead"))
     text = f"The {AT[moment]} of 20 moments; medians over seeds."
@@ -307,6 +312,25 @@ def layers_of(data: Data, condition: str, depth: int, optimizer: str, measure: s
     where = {"condition": condition, "depth": depth, "optimizer": optimizer, "measure": measure, "moment": moment}
     (row,) = data.layers[(data.layers[list(where)] == pd.Series(where)).all(axis=1)].to_dict("records")
     return np.asarray(row["median"], np.float64)
+
+
+def layers_table(data: Data) -> pd.DataFrame:
+    """The extremes over layers of their medians over seeds, at the tenth of 20 moments."""
+    rows = []
+    for condition, depth, optimizer in product(("none", "transform-constant", "weight-gradient"), DEPTHS, OPTIMIZERS):
+        if condition == "weight-gradient" and depth > min(DEPTHS):
+            continue
+        found = {name: layers_of(data, condition, depth, optimizer, name) for name in MEASURES}
+        rows.append(
+            {
+                "feedback": condition, "depth": depth, "optimizer": optimizer,
+                "longest": found["gradient_ratio"].max(), "cosine": found["gradient_cosine"].min(),
+                "longest_step": found["step_ratio"].max(), "step_cosine": found["step_cosine"].min(),
+                "least": np.nanmin(found["least"]), "largest": np.nanmin(found["largest"]),
+                "dead": 100 * np.nanmax(found["dead"]),
+            }
+        )  # fmt: skip
+    return pd.DataFrame(rows)
 
 
 def _small(path: Path) -> None:
