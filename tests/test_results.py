@@ -33,6 +33,7 @@ PAGES = {
         "minatar/plan.md",
         "../README.md",
         "../docs/cartpole.md",
+        "../docs/algorithm.md",
     )
 }
 TABLES = {
