@@ -123,3 +123,20 @@ def test_polar_factors_by_svd(rank: int | None, dtype: torch.dtype) -> None:
     broken = polar_by_svd(matrices, rank)
     assert broken[1].isnan().all()
     torch.testing.assert_close(broken[[0, 2]], expected[[0, 2]])
+
+
+def test_a_matrix_on_which_lapack_fails_is_decomposed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    matrices = torch.randn(3, 6, 5, dtype=torch.float64)
+    true_svd = torch.linalg.svd
+
+    def failing(matrix: torch.Tensor, full_matrices: bool) -> tuple[torch.Tensor, ...]:
+        """Fails on the second matrix, as LAPACK does on a few that it does not share with other versions of it."""
+        if any(torch.equal(each, matrices[1]) for each in matrix.view(-1, 6, 5)):
+            raise torch.linalg.LinAlgError("failed to converge")
+        return tuple(true_svd(matrix, full_matrices=full_matrices))
+
+    plain = polar_by_svd(matrices)
+    monkeypatch.setattr(torch.linalg, "svd", failing)
+    factors = polar_by_svd(matrices)
+    torch.testing.assert_close(factors[[0, 2]], plain[[0, 2]], rtol=0, atol=1e-14)
+    torch.testing.assert_close(factors[1], plain[1], rtol=0, atol=1e-11)

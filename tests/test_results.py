@@ -19,6 +19,7 @@ from experiments.report.measures import shorter_runs
 from experiments.report.sources import open_source
 from experiments.report.study import Study, load_study
 from experiments.saved import SavedRun
+from experiments.stacked import verdict
 
 RESULTS = Path(__file__).parent.parent / "results"
 CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]
@@ -27,10 +28,12 @@ PAGES = {
     for page in (
         "README.md",
         "cartpole/README.md",
+        "cartpole/edl/README.md",
         "minatar/README.md",
         "minatar/plan.md",
         "../README.md",
         "../docs/cartpole.md",
+        "../docs/algorithm.md",
     )
 }
 TABLES = {
@@ -54,7 +57,14 @@ def study_of(name: str) -> Study:
 
 
 @cache
+def dissection() -> dict[str, pd.DataFrame]:
+    return verdict.tables(verdict.load(RESULTS / "cartpole" / "edl" / "dissection.parquet"))
+
+
+@cache
 def table_of(study: str, name: str) -> pd.DataFrame:
+    if study == "edl":
+        return dissection()[name]
     if name in controls.TABLES:
         return controls.TABLES[name](study_of(study))
     if name in registered.RULES:
@@ -234,10 +244,10 @@ INTERVAL = re.compile(r"\[[+-]?\d[\d.,]*, [+-]?\d[\d.,]*\]")
 
 
 def test_the_page_counts_its_intervals() -> None:
-    here, cartpole, minatar = (len(INTERVAL.findall(PAGES[f"{at}README.md"])) for at in ("", "cartpole/", "minatar/"))
-    assert (
-        f"This page has {here} intervals, that of CartPole {cartpole}, that of MinAtar {minatar};" in PAGES["README.md"]
-    )
+    pages = ("", "cartpole/", "cartpole/edl/", "minatar/")
+    here, cartpole, edl, minatar = (len(INTERVAL.findall(PAGES[f"{at}README.md"])) for at in pages)
+    text = f"This page has {here} intervals, that of CartPole {cartpole}, that of EDL {edl}, that of MinAtar {minatar};"
+    assert text in PAGES["README.md"]
 
 
 def test_what_the_pages_say_of_short_runs() -> None:

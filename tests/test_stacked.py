@@ -269,6 +269,31 @@ def test_the_polar_factor_of_a_gradient(rows: int, m: int, n: int) -> None:
         torch.testing.assert_close(factor[run].double() @ right, u[run, :, :rank], rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("m", [4, 16])
+@pytest.mark.parametrize("bad", [np.inf, np.nan, 1e30])
+def test_a_gradient_that_is_not_finite_is_that_of_its_run_alone(m: int, bad: float) -> None:
+    torch.manual_seed(0)
+    delta, h, noise = torch.randn(3, 8, m), torch.randn(3, 8, 16), torch.randn(3, 32)
+    whole = networks.polar_of_gradient(delta, h, noise)
+    delta[1, 2, 3], h[1, 2, 3] = bad, bad  # 1e30: their product is what overflows, in float32
+    factor = networks.polar_of_gradient(delta, h, noise)
+    torch.testing.assert_close(factor[[0, 2]], whole[[0, 2]], rtol=0, atol=0)
+    assert factor[1].isnan().all() or (bad == 1e30 and m == 16 and factor[1].isfinite().all())
+
+
+def test_a_run_that_diverges_under_weight_gradient_leaves_those_beside_it_alone() -> None:
+    settings = StackSettings("edql", "weight-gradient", hidden=1, width=8, total_steps=60, learning_starts=20)
+
+    def played(rate: float) -> Stack:
+        stack = Stack(settings, Runs(np.array([0, 1]), np.array([rate, 1e-3]), np.full(2, 0.1), (("sgd", 2),)))
+        stack.advance(60)
+        return stack
+
+    one, other = played(1e30), played(1e-3)
+    assert one.finite().tolist() == [False, True]
+    torch.testing.assert_close(one.theta[:, 1], other.theta[:, 1], rtol=0, atol=0)
+
+
 def test_random_numbers_are_uniform_and_apart() -> None:
     runs = Runs.of(list(range(50)), "adam", 1.0, 1.0)
     words = bits(keys_of(runs, CPU), torch.arange(4000)).double() / 2**32

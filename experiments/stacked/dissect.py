@@ -53,6 +53,7 @@ WAVE = 132  # runs that a GPU's processors play at once: one on each of an H100'
 MEASURED, SPARE, OVERHEAD = 300, 1.2, 2.0  # steps; and of a stack's time: a factor, and seconds besides
 AGREE = 1e-2  # of the way that parameters have come: a condition whose kernels are farther off runs without them
 RATE_FILE = "rates.json"
+PLAN = Path("results/cartpole/edl/plan.md")
 
 Floats = NDArray[np.float64]
 
@@ -343,40 +344,6 @@ def fitted(plan: Plan, seconds: float) -> Plan:
     return replace(plan, seeds=seeds)
 
 
-def pack(out: Path, path: Path) -> int:
-    """Write all runs into one Parquet file, a row for each run; return their number."""
-    import pandas as pd  # noqa: PLC0415 (only here)
-
-    rows: list[dict[str, Any]] = []
-    for file in sorted(out.glob("*-*.npz")):
-        if file.name.endswith(".part.npz"):
-            continue
-        with np.load(file) as held:
-            data = {name: held[name] for name in held.files}
-        about = json.loads(str(data["about"]))
-        ends = np.cumsum(data["counts"])
-        measures = data["measures"]  # [points, names, K, layers]
-        for row, (start, end) in enumerate(zip(ends - data["counts"], ends, strict=True)):
-            found = {
-                name: measures[:, number, row].ravel() for number, name in enumerate(about["names"]) if measures.size
-            }
-            rows.append(
-                {
-                    "phase": file.name.split("-")[0], "condition": about["condition"], "depth": about["depth"],
-                    "optimizer": str(data["optimizer"][row]), "seed": int(data["seed"][row]),
-                    "rate": float(data["rate"][row]), "area": float(data["area"][row]),
-                    "finite": bool(data["finite"][row]), "device": about["device"], "path": about["path"],
-                    "env_step": data["env_step"][start:end], "returns": data["returns"][start:end],
-                    "points": data["points"].astype(np.int32), **found,
-                }
-            )  # fmt: skip
-    rates = (out / RATE_FILE).read_text() if (out / RATE_FILE).exists() else "{}"
-    frame = pd.DataFrame(rows)
-    frame.attrs["rates"] = json.loads(rates)
-    frame.to_parquet(path, compression="zstd", compression_level=19, index=False)
-    return len(rows)
-
-
 def main() -> None:
     """Read the arguments, play, and pack what there is."""
     parse = argparse.ArgumentParser(prog="dissect", description=(__doc__ or "").split("\n", maxsplit=1)[0])
@@ -420,8 +387,10 @@ def main() -> None:
     if 0 in plan.seeds:
         plan = fitted(plan, deadline - time.monotonic())
     left = run(plan, deadline)
+    from experiments.stacked.packed import pack  # noqa: PLC0415 (needs the extra "report")
+
     packed = args.out / "dissection.parquet"
-    print(f"{packed}: {pack(args.out, packed)} runs; {left} stacks left", flush=True)
+    print(f"{packed}: {pack(args.out, packed, PLAN)} runs; {left} stacks left", flush=True)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from experiments.stacked.settings import StackSettings
+from learner.edl.polar import polar_by_svd, svd
 
 ACTIONS, INPUTS = 2, 4
 _HALF = 0.5**0.5
@@ -271,16 +272,18 @@ def step_of(
 def polar_of_gradient(delta: Tensor, h: Tensor, noise: Tensor) -> Tensor:
     """U V^T, float32 [K, m, n], of each weight gradient delta^T h, by the product's `learner.edl.polar`.
 
+    It is nan where a run's gradient is not finite: that run has diverged, those beside it go on.
+
     delta: [K, batch, m]. h: [K, batch, n]. noise: N(0, 1), [K, 2 max(m, n)], which pairs the null directions.
     """
     rows, m, n = delta.shape[1], delta.shape[2], h.shape[2]
     if rows >= min(m, n):
-        u, _, vh = torch.linalg.svd(torch.bmm(delta.mT, h).double(), full_matrices=False)
-        factor: Tensor = u @ vh
-        return factor.float()
+        return polar_by_svd(torch.bmm(delta.mT, h))
+    diverged = ~(delta.isfinite().all(2).all(1) & h.isfinite().all(2).all(1))[:, None, None]
+    delta, h = delta.masked_fill(diverged, 0), h.masked_fill(diverged, 0)
     q, upper = torch.linalg.qr(delta.mT.double(), mode="complete")
     p, lower = torch.linalg.qr(h.mT.double(), mode="complete")
-    u, values, vh = torch.linalg.svd(upper[:, :rows] @ lower[:, :rows].mT)
+    u, values, vh = svd(upper[:, :rows] @ lower[:, :rows].mT)
     rank = (values > torch.finfo(torch.float32).eps * values[:, :1]).sum(1, keepdim=True)
     short, long = min(m, n), max(m, n)
     place = torch.arange(long, device=delta.device)
@@ -292,4 +295,4 @@ def polar_of_gradient(delta: Tensor, h: Tensor, noise: Tensor) -> Tensor:
     core[:, :rows] = u @ core[:, :rows]
     core[:, :, :rows] = core[:, :, :rows] @ vh
     whole: Tensor = q @ core @ p.mT
-    return whole.float()
+    return whole.float().masked_fill_(diverged, torch.nan)

@@ -11,6 +11,7 @@ from torch import Tensor
 from learner.edl.arrays import ArrayT, convert_like, namespace, widened
 
 _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # the two other indices of three
+_NUDGE = 1e-13  # of the largest entry of a matrix whose SVD fails
 _SMALL = 8  # the shorter side up to which an SVD is faster than the algebra with a Gram matrix
 
 
@@ -172,7 +173,7 @@ def polar(matrix: Tensor, rng: np.random.Generator) -> Tensor:
             return quick
     if not wide.isfinite().all():
         return torch.full_like(matrix, torch.nan)
-    u, values, vh = torch.linalg.svd(wide, full_matrices=False)
+    u, values, vh = svd(wide)
     if missing := len(wide) - (rank := _rank(values, matrix.dtype)):
         # Normal draws, projected off the row space, are uniform over the directions of its complement.
         draw = torch.from_numpy(rng.standard_normal((wide.shape[1], missing))).to(wide.device)
@@ -199,7 +200,7 @@ def polar_of_product(left: Tensor, right: Tensor, rng: np.random.Generator) -> T
     corner = q[:r].triu() @ p[:r].triu().t()
     if not corner.sum().isfinite():
         return torch.full((m, n), torch.nan, dtype=left.dtype, device=left.device)
-    u, values, vh = torch.linalg.svd(corner)
+    u, values, vh = svd(corner)
     factor = _paired(m, n, _rank(values, left.dtype), rng).to(corner.device)
     factor[:r] = u @ factor[:r]
     factor[:, :r] = factor[:, :r] @ vh
@@ -224,6 +225,25 @@ def _paired(m: int, n: int, rank: int, rng: np.random.Generator) -> Tensor:
     return torch.from_numpy(paired)
 
 
+def svd(matrices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """U, S and V^T, without null spaces, of finite matrices, float64 [..., m, n].
+
+    LAPACK's divide and conquer fails to converge on rare matrices. Such a one is decomposed with its last digits
+    changed, far below the rounding of float32.
+    """
+    try:
+        u, values, vh = torch.linalg.svd(matrices, full_matrices=False)
+    except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
+        if matrices.ndim > 2 and len(matrices) > 1:  # one failure fails the batch
+            parts = zip(*(svd(matrix) for matrix in matrices), strict=True)
+            u, values, vh = (torch.stack(part) for part in parts)
+        else:
+            noise = torch.randn(matrices.shape, generator=torch.Generator().manual_seed(0), dtype=matrices.dtype)
+            nudged = matrices + _NUDGE * matrices.abs().amax() * noise.to(matrices.device)
+            u, values, vh = torch.linalg.svd(nudged, full_matrices=False)
+    return u, values, vh
+
+
 def polar_by_svd(matrices: Tensor, rank: int | None = None) -> Tensor:
     """U V^T of each matrix [batch, m, n], computed in float64; nan if a matrix is not finite.
 
@@ -232,6 +252,6 @@ def polar_by_svd(matrices: Tensor, rank: int | None = None) -> Tensor:
     """
     m = matrices.double()
     broken = None if m.sum().isfinite() else ~m.isfinite().flatten(1).all(1)[:, None, None]
-    u, _, vh = torch.linalg.svd(m if broken is None else m.masked_fill(broken, 0), full_matrices=False)
+    u, _, vh = svd(m if broken is None else m.masked_fill(broken, 0))
     factor: Tensor = (u[..., :rank] @ vh[..., :rank, :]).to(matrices.dtype)
     return factor if broken is None else factor.masked_fill_(broken, torch.nan)
