@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import run_command
@@ -466,6 +467,25 @@ def test_a_kill_is_no_damage(spec: EnvSpec, tmp_path: Path) -> None:
         _, told = recover(twin, tmp_path, 1, 5)
         assert (twin.table.inserted, twin.lost, len(told)) == (20, 0, 1)
         assert told[0].endswith("which ends as a kill leaves it")
+
+
+def test_a_kill_within_a_record_leaves_none(spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    core, _ = _journal(spec, tmp_path)
+    write, written = os.pwrite, 0
+
+    def killed(*arguments: Any) -> int:
+        nonlocal written
+        written += 1
+        if written == 2:
+            raise KeyboardInterrupt
+        return write(*arguments)
+
+    monkeypatch.setattr(os, "pwrite", killed)
+    with pytest.raises(KeyboardInterrupt):
+        _insert(core, spec, 6)
+    twin = ReplayCore(AHEAD, spec)
+    recover(twin, tmp_path, 1, 5)
+    assert (twin.table.inserted, twin.lost) == (24, 0), "its actor sends the segment again"
 
 
 @pytest.mark.parametrize(
