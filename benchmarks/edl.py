@@ -37,7 +37,7 @@ Update = Callable[[], object]
 
 def settings(kind: str, method: str, double: bool) -> RunConfig:
     """The config of a run whose learner uses the feedback `method`."""
-    gradient = method != "transform" and method != "weight-gradient"
+    gradient = method not in {"transform", "weight-gradient"}
     edl = {"rate": RATE}
     return validated(
         {
