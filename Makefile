@@ -11,7 +11,7 @@ STAMP = $(shell date +%Y%m%d-%H%M%S)
 # The tests start hundreds of processes: they share what Python has compiled, also where it is told not to keep it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants bench gpu docs dist
+.PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants bench gpu gpu-atari docs dist
 
 run: $(READY)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -72,6 +72,11 @@ bench:
 # has put what is missing into .whl/ before.
 gpu:
 	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) benchmarks/gpu.py --out $(or $(OUT),runs/gpu)
+
+# The four methods learn a game on a GPU for MINUTES, or MINUTES more if OUT has what they had learned before.
+gpu-atari:
+	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) benchmarks/gpu_atari.py --out $(or $(OUT),runs/gpu-atari) \
+		--minutes $(or $(MINUTES),8) --game $(or $(GAME),pong)
 
 # The documentation as a site, build/site/index.html; a broken link is an error. Says how many code blocks the tests run.
 docs: $(READY)

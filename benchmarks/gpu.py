@@ -1,10 +1,11 @@
 """What a GPU makes of updates, acting and a whole run, in a few minutes: `make gpu`.
 
-Each part is a process of its own with a time limit; it writes its figures as lines of JSON while it goes, so that a
-part that fails, or is cut off, costs its own figures only. On a CPU, for a rehearsal: --device cpu --quick.
+Each part, and the updates of each method and batch size, is a process of its own with a time limit; it writes its
+figures as lines of JSON while it goes, so that a part that fails, or is cut off, costs its own figures only. On a CPU,
+for a rehearsal: --device cpu --quick.
 
     gpu.py [--out FOLDER] [--device cuda] [--seconds 235] [--parts updates profile ...] [--quick]
-    gpu.py --part NAME ...      (one part, in this process)
+    gpu.py --part NAME [--case METHOD BATCH] ...      (one part, in this process)
 """
 
 from __future__ import annotations
@@ -29,17 +30,19 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 PARTS = {  # with its limit in seconds
     "facts": 15,
+    "updates": 80,
+    "jax": 45,
+    "run": 85,
+    "acting": 15,
+    "sb3": 25,
+    "tests": 150,
     "accuracy": 40,
-    "updates": 75,
     "pieces": 40,
-    "jax": 50,
     "profile": 40,
-    "tests": 90,
-    "run": 95,
-    "acting": 25,
-    "sb3": 30,
 }
+USUAL = ("facts", "updates", "jax", "run", "acting", "sb3", "tests")  # the tests take what time is left
 METHODS = ("dqn", "edql", "g-coop", "coop")
+CASES = [(method, batch) for batch in (32, 512) for method in ("dqn", "coop", "edql", "g-coop")]
 
 
 def main() -> None:
@@ -49,8 +52,9 @@ def main() -> None:
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--seconds", type=float, default=235.0)
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(USUAL))
     parser.add_argument("--part", choices=PARTS)
+    parser.add_argument("--case", nargs=2, metavar=("METHOD", "BATCH"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     if options.part:
@@ -66,7 +70,17 @@ def main() -> None:
         if limit < 5:
             say(figures, {"part": part, "skipped": "no time left"})
             continue
-        run_part(part, [sys.executable, __file__, *flags, "--part", part], environment, limit, figures)
+        command = [sys.executable, __file__, *flags, "--part", part]
+        if part != "updates":
+            run_part(part, command, environment, limit, figures)
+            continue
+        # A process each: nothing that one leaves behind counts for the next.
+        until = time.monotonic() + limit
+        for method, batch in [(method, 4) for method in METHODS] if options.quick else CASES:
+            if (left := until - time.monotonic()) < 5:
+                say(figures, {"part": part, "method": method, "batch": batch, "skipped": "no time left"})
+                continue
+            run_part(part, [*command, "--case", method, str(batch)], environment, left, figures)
     print(table(figures))
     print(f"{time.monotonic() - began:.0f} s; figures in {figures}")
 
@@ -244,12 +258,12 @@ def _rate(update: Callable[[], object], seconds: float, device: str, each: int =
     return round(count / (time.perf_counter() - began), 1)
 
 
-def drawn_updates(agent: Any, spec: Any, count: int, recorded: bool) -> Callable[[], object]:
+def drawn_updates(agent: Any, spec: Any, count: int, recorded: bool, branches: bool = True) -> Callable[[], object]:
     """Updates with batches drawn on the device: `count` of them with each call."""
     import torch
 
     from learner.device_table import DeviceTable
-    from learner.recorded import cuda_graph
+    from learner.recorded import captured, cuda_graph
 
     table = DeviceTable(spec, 10_000, 16, 3, 0.99, agent.device)
     table._obs.random_(0, 256)
@@ -265,7 +279,10 @@ def drawn_updates(agent: Any, spec: Any, count: int, recorded: bool) -> Callable
     if recorded and agent.device.type == "cuda":
         with torch.inference_mode():
             torch.backends.cudnn.benchmark = True
-            return cuda_graph(update, agent.device)
+            if branches:
+                return cuda_graph(update, agent.device)
+            update()
+            return captured(update, agent.device)
 
     def led() -> None:
         with torch.inference_mode():
@@ -275,8 +292,7 @@ def drawn_updates(agent: Any, spec: Any, count: int, recorded: bool) -> Callable
 
 
 def part_updates(options: argparse.Namespace) -> None:
-    """Updates/s of the nature network with six actions."""
-    import torch
+    """Updates/s of the nature network with six actions, of one method and batch size."""
     from made_up import random_batch
     from work import ATARI
 
@@ -284,44 +300,28 @@ def part_updates(options: argparse.Namespace) -> None:
     from learner.agent import Agent
 
     use_threads(1)
-    device, seconds = options.device, 0.1 if options.quick else 0.8
-    sizes = (4,) if options.quick else (32, 512)
-    cases = [(m, b, "float32", True) for b in sizes for m in METHODS]
-    cases += [(m, b, "bfloat16", True) for b in sizes for m in ("dqn", "coop")]
-    cases += [(m, b, "float32", False) for b in sizes for m in ("dqn", "coop")]
-    for method, batch, dtype, tf32 in cases:
-        row = {
-            "what": "updates/s",
-            "method": method,
-            "batch": batch,
-            "precision": dtype if not tf32 or dtype != "float32" else "TF32",
-        }
+    device, seconds = options.device, 0.1 if options.quick else 0.6
+    method, batch = options.case[0], int(options.case[1])
+    many, given = 8 if batch == 32 else 2, random_batch(ATARI, batch)
+    main = method in ("dqn", "coop")
+    for dtype, tf32 in (("float32", True), *([("bfloat16", True), ("float32", False)] if main else [])):
+        precision = dtype if not tf32 or dtype != "float32" else "TF32"
+        row = {"what": "updates/s", "method": method, "batch": batch, "precision": precision}
         with _kept(row):
             agent = Agent(_config(method, batch, device, dtype, tf32=tf32), ATARI)
-            figure(
-                **row,
-                way="drawn on the device, 8 a replay",
-                value=_rate(
-                    drawn_updates(agent, ATARI, 8 if batch == 32 else 2, True), seconds, device, 8 if batch == 32 else 2
-                ),
-            )
-            if not tf32:
+            drawn = drawn_updates(agent, ATARI, many, True)
+            figure(**row, way=f"drawn on the device, {many} a replay", value=_rate(drawn, seconds, device, many))
+            if precision != "TF32":
                 continue
-            given = random_batch(ATARI, batch)
-            figure(
-                **row,
-                way="batches of the host",
-                value=_rate(lambda: agent.update(given), seconds, device),
-                eager=agent.eager,
-            )
-            if dtype == "float32" and method in ("dqn", "coop"):
-                figure(
-                    **row,
-                    way="eager, drawn on the device",
-                    value=_rate(drawn_updates(agent, ATARI, 1, False), seconds / 2, device),
-                )
-        if device != "cpu":
-            torch.cuda.empty_cache()
+            if main:
+                drawn = drawn_updates(agent, ATARI, many, True, branches=False)
+                way = f"drawn on the device, {many} a replay, no branches"
+                figure(**row, way=way, value=_rate(drawn, seconds / 2, device, many))
+            value = _rate(lambda: agent.update(given), seconds, device)
+            figure(**row, way="batches of the host", value=value, eager=agent.eager)
+            if method == "coop":
+                drawn = drawn_updates(agent, ATARI, 1, False)
+                figure(**row, way="eager, drawn on the device", value=_rate(drawn, seconds / 2, device))
 
 
 @contextmanager
@@ -470,7 +470,7 @@ def part_jax(options: argparse.Namespace) -> None:
         many = jax.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, count))[0])
         state = jax.block_until_ready(many((online, optimizer.init(online)), keys[0]))
         done, began = 0, time.perf_counter()
-        while time.perf_counter() - began < (0.1 if options.quick else 2.5):
+        while time.perf_counter() - began < (0.1 if options.quick else 1.5):
             state = jax.block_until_ready(many(state, keys[done % 3]))
             done += 1
         taken = time.perf_counter() - began

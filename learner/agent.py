@@ -34,6 +34,7 @@ from common.settings.config import RunConfig
 from common.settings.methods import METHODS
 from common.types import Array, Batch, EnvSpec
 from learner.edl.arrays import convert_like
+from learner.edl.beside import Branches
 from learner.given import Given
 from learner.losses import LOSSES, Values, output_error, td_errors
 from learner.methods.rule import Rule
@@ -133,9 +134,12 @@ class Agent:
         inputs, size = online.inputs(given.frames, given.index), len(given.columns.actions)
         first = None
         for _ in range(self.rule.passes):
+            branches = Branches(inputs)
+            next_values = branches.run(lambda: target.values(inputs[size:]), inputs)
             # With `double` the acting network chooses the next actions, so one pass covers obs and next_obs.
             tape = online.forward(inputs if settings.double else inputs[:size])
-            values, next_values = as_float32(tape.output), target.values(inputs[size:])
+            values = as_float32(tape.output)
+            branches.join()
             bootstrap = self._bootstrap(next_values, values[size:] if settings.double else next_values)
             errors = td_errors(given.columns, values[:size], bootstrap, settings.value_bound)
             error = output_error(given.columns, self.loss.slope(errors), next_values)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from common.types import EnvSpec
+from learner.edl import kernels
 from learner.given import Given
 from learner.losses import Columns
 
@@ -58,13 +59,20 @@ class DeviceTable:
 
     def sample(self, size: int, s: Any, rate: Any) -> Given:  # noqa: ANN401
         """Draw transitions uniformly, with replacement; s and rate: see `Given`."""
-        device, rows = self._obs.device, self._rows
-        held = self.steps.clamp(max=rows)
+        chance = torch.rand(2, size, device=self._obs.device)
+        told = (self._ended, self._terminated, self._rewards, self._actions)
+        drawn = kernels.draws(chance, self.steps, told, self._powers, len(self._stack))
+        *columns, index = self._drawn(chance) if drawn is None else drawn
+        return Given(self._frames, index, Columns(*columns), s, rate)
+
+    def _drawn(self, chance: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """See `kernels.draws`."""
+        rows, held = self._rows, self.steps.clamp(max=self._rows) - self._n
         # Ages from n + 1: the row after a transition's last reward must be there, and the oldest row still whole.
-        age = (torch.rand(size, device=device) * (held - self._n)).long() + self._n + 1
-        stream = (torch.rand(size, device=device) * self._streams).long()
+        age = (chance[0] * held).long() + self._n + 1
+        stream = (chance[1] * self._streams).long()
         first = self.steps - age
-        window = (first[:, None] + torch.arange(1, self._n + 1, device=device)) % rows
+        window = (first[:, None] + torch.arange(1, self._n + 1, device=chance.device)) % rows
         ended = self._ended[window, stream[:, None]]
         alive = torch.cumprod(1 - ended, 1)
         before = torch.cat((torch.ones_like(alive[:, :1]), alive[:, :-1]), 1)  # no end before this step
@@ -76,4 +84,4 @@ class DeviceTable:
         valid = 1 - self._ended[row, stream]
         places = torch.cat((row * self._streams + stream, last * self._streams + stream)).int()
         index = (places[:, None] * len(self._stack) + self._stack).view(-1)
-        return Given(self._frames, index, Columns(self._actions[row, stream], rewards, discounts, valid), s, rate)
+        return self._actions[row, stream], rewards, discounts, valid, index

@@ -6,8 +6,10 @@ its own; TD errors are copied back without waiting, and read when they are wante
 
 from __future__ import annotations
 
+import gc
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,8 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from common.process.notices import warn
 from common.settings.config import RunConfig
 from common.types import Batch, EnvSpec
+from learner.edl.beside import branching
 from learner.given import Given, indices
 from learner.losses import Columns, Values, columns
 
@@ -42,7 +46,11 @@ class Learner(Protocol):
 
 
 def cuda_graph(function: Callable[[], None], device: torch.device) -> Callable[[], None]:
-    """Record a function as a CUDA graph; returns what repeats it. Raises RuntimeError if it can't be recorded."""
+    """Record a function as a CUDA graph; returns what repeats it. Raises RuntimeError if it can't be recorded.
+
+    What may run side by side becomes parallel branches of the graph; if that can't be recorded, one line says so, and
+    the graph has one branch.
+    """
     torch.cuda.synchronize(device)
     side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
     side.wait_stream(torch.cuda.current_stream(device))
@@ -51,9 +59,39 @@ def cuda_graph(function: Callable[[], None], device: torch.device) -> Callable[[
             function()
     torch.cuda.current_stream(device).wait_stream(side)
     torch.cuda.synchronize(device)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        function()
+    try:
+        with branching():
+            return captured(function, device)
+    except RuntimeError as error:
+        warn(f"updates are recorded without parallel branches, and take longer: {str(error).splitlines()[0]}")
+        return captured(function, device)
+
+
+def captured(function: Callable[[], None], device: torch.device) -> Callable[[], None]:
+    """Record a function that has run before as a CUDA graph. If that fails, the device stays usable: RuntimeError."""
+    torch.cuda.synchronize(device)
+    number = torch.cuda.current_device() if device.index is None else device.index
+    generator = torch.cuda.default_generators[number]
+    kept, stream = generator.clone_state(), torch.cuda.current_stream(device)
+    graph, pool = torch.cuda.CUDAGraph(), torch.cuda.graph_pool_handle()
+    collected = gc.isenabled()
+    gc.collect()
+    gc.disable()  # the end of an older graph would end the recording
+    try:
+        # "thread_local": other threads may use the GPU meanwhile.
+        with torch.cuda.graph(graph, pool, capture_error_mode="thread_local"):
+            function()
+    except BaseException:
+        # PyTorch leaves its recording stream in use, the generator and the allocator in the midst of a recording.
+        torch.cuda.set_stream(stream)
+        generator.graphsafe_set_state(kept)
+        with suppress(RuntimeError, AttributeError):
+            torch._C._cuda_endAllocateToPool(number, pool)
+            torch._C._cuda_releasePool(number, pool)
+        raise
+    finally:
+        if collected:
+            gc.enable()
     repeat: Callable[[], None] = graph.replay
     return repeat
 

@@ -4,13 +4,16 @@ import copy
 import importlib
 import json
 import os
+import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from samples import until
 
@@ -318,3 +321,32 @@ def test_every_area_has_a_name_that_can_be_asked_for(bench: Any) -> None:
     for target in areas.TARGETS:
         subjects = next(c.subjects for c in areas.COMPARISONS if c.title == target.comparison)
         assert {target.over, *target.under} <= set(subjects)
+
+
+def test_the_methods_learn_a_game_in_turn_and_go_on_elsewhere(tmp_path: Path) -> None:
+    """`make gpu-atari`, with tiny settings on the processor."""
+    out = tmp_path / "out"
+    tiny = ["--device", "cpu", "--emulators", "4", "--kind", "nips2013", "--starts", "40", "--least", "80"]
+    command = [sys.executable, str(BENCHMARKS / "gpu_atari.py"), *tiny, "--minutes", "0.001"]
+    command += ["--methods", "dqn", "coop", "--out"]
+    found = []
+    for place in (out, tmp_path / "elsewhere"):
+        if place != out:
+            shutil.copytree(out, place)
+        done = subprocess.run([*command, place], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "coop" in done.stdout.splitlines()[-2]
+        found.append([json.loads((place / f"{method}.json").read_text()) for method in ("dqn", "coop")])
+        assert (place / "curves.png").stat().st_size > 0
+    for first, then in zip(*found, strict=True):
+        assert (first["resumed"], then["resumed"]) == (0, 1)
+        assert 0 < first["updates"] < then["updates"]
+        assert then["updates"] == then["agent_updates"] == sum(then["optimizer_steps"])
+        assert first["steps"] < then["steps"]
+        assert first["updates"] == (first["steps"] - 40) // 4 + 1
+    with np.load(out / "coop-1.npz") as before, np.load(tmp_path / "elsewhere" / "coop-1.npz") as after:
+        moved = np.abs(before["theta"] - after["theta"])
+        assert 0 < moved.max() < 0.1  # trained on, not begun anew
+    other = subprocess.run([*command, out, "--game", "breakout"], capture_output=True, text=True, check=False)
+    assert other.returncode == 2
+    assert "is of pong" in other.stderr

@@ -1,5 +1,6 @@
 """The learner on a GPU: the updates, states and runs of a CPU. Skipped where PyTorch finds no GPU."""
 
+import gc
 import json
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ from common.settings.tables import resolve
 from common.types import Batch, EnvSpec
 from experiments.stacked.dissect import AGREE, agreement
 from learner.agent import Agent
+from learner.device_table import DeviceTable
 from learner.edl import kernels
 from learner.edl.completed import Jacobians
+from learner.recorded import captured
 from replay.table.table import Table
 
 pytestmark = [
@@ -146,6 +149,60 @@ def test_adam_is_recorded_with_its_steps_and_its_rate() -> None:
         assert float(optimizer._count) == optimizer.steps
     _assert_same(recorded, eager)
     _assert_same(recorded, host)
+
+
+def test_older_graphs_do_not_end_a_recording() -> None:
+    """Agents are cycles: what collects them must not run while another one is recorded."""
+    threshold = gc.get_threshold()
+    gc.set_threshold(1)
+    try:
+        for method in ("coop", "dqn", "coop", "edql"):
+            agent = _agent("cuda", "nips2013", PICTURES, method)
+            for batch in _batches(PICTURES, 4):  # two recordings with two networks
+                agent.update(batch)
+            assert agent.eager == ""
+    finally:
+        gc.set_threshold(*threshold)
+
+
+def test_after_a_failed_recording_the_gpu_is_usable() -> None:
+    """What can't be recorded ends with an error, and random numbers, streams and other recordings go on as before."""
+    device, stream = torch.device("cuda"), torch.cuda.current_stream()
+    x = torch.ones(4, device=device)
+    for fail in (lambda: x.sum().item(), torch.cuda.synchronize):
+        with pytest.raises(RuntimeError):
+            captured(lambda fail=fail: (torch.rand(4, device=device), fail()), device)
+        assert torch.cuda.current_stream() == stream
+        assert gc.isenabled()
+        assert float(torch.rand(4, device=device).sum()) > 0
+        again = captured(lambda: x.mul_(2), device)
+        before = x.clone()
+        again()
+        assert torch.equal(x, 2 * before)
+
+
+def test_branches_change_no_update() -> None:
+    branched, plain = (_agent("cuda", "nature", PICTURES, "coop", learner=SGD) for _ in range(2))
+    plain._recorded._capture = lambda f, device: (f(), captured(f, device))[1]
+    for batch in _batches(PICTURES, 12):
+        for agent in (branched, plain):
+            agent.update(batch)
+    _assert_same(branched, plain)
+
+
+def test_the_table_draws_the_same_with_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = DeviceTable(PICTURES, 300, 3, 3, 0.9, torch.device("cuda"))
+    for column in (table._rewards, table._ended, table._terminated):
+        column.random_(0, 2)
+    table._actions.random_(0, 6)
+    table.steps.fill_(150)
+    torch.manual_seed(0)
+    found = table.sample(500, 0.0, 0.0)
+    monkeypatch.setattr(kernels, "draws", lambda *_: None)
+    torch.manual_seed(0)
+    expected = table.sample(500, 0.0, 0.0)
+    torch.testing.assert_close(found.columns, expected.columns)
+    assert torch.equal(found.index, expected.index)
 
 
 def test_the_kernels_are_compiled_and_are_the_plain_ways() -> None:

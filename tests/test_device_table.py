@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from common.types import EnvSpec
 from learner.device_table import DeviceTable
+from learner.edl import kernels
 
 SPEC = EnvSpec("pictures", (2, 3), "uint8", 4, 3)
 CPU = torch.device("cpu")
@@ -61,6 +69,40 @@ def test_transitions_are_the_emulators(rows: int, n_step: int) -> None:
     assert set(steps) == set(range(rows - held, rows - n_step))
     assert set(streams) == {0, 1, 2}
     assert (given.s, given.rate) == (0.1, 0.2)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+def test_the_kernel_draws_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel of a GPU, compiled for the processor, where a loop takes the place of its threads."""
+    kernel = re.search(r'extern "C" __global__ void \S+\ndraw\(.*?\n}\n', kernels.source(2), re.DOTALL)
+    assert kernel is not None
+    loop = 'extern "C" void block(int b) { blockIdx.x = b; }\nextern "C" void thread(int t) { threadIdx.x = t; }\n'
+    text = "struct Place { int x; } blockIdx, threadIdx;\n#define __global__\n#define __launch_bounds__(n)\n"
+    (tmp_path / "draw.cpp").write_text(f"{text}#define THREADS {kernels._THREADS}\n{kernel[0]}{loop}")
+    library = tmp_path / "draw.so"
+    subprocess.run(["g++", "-O1", "-shared", "-fPIC", "-o", library, tmp_path / "draw.cpp"], check=True)
+    host = ctypes.CDLL(str(library))
+
+    def launch(function: Any, grid: tuple[int, int, int], *arguments: Any) -> None:
+        held = [ctypes.c_void_p(one.data_ptr()) if isinstance(one, torch.Tensor) else one for one in arguments]
+        for block in range(grid[0]):
+            host.block(block)
+            for thread in range(kernels._THREADS):
+                host.thread(thread)
+                host.draw(*held)
+
+    for rows, n_step in ((8, 1), (20, 3), (25, 3), (25, 5)):
+        table, _ = _filled(rows, n_step)
+        torch.manual_seed(1)
+        expected = table.sample(500, 0.1, 0.2)
+        with monkeypatch.context() as patched:
+            patched.setattr(kernels, "usable", lambda _: True)
+            patched.setattr(kernels, "_module", lambda *_: {"draw": None})
+            patched.setattr(kernels, "_launch", launch)
+            torch.manual_seed(1)
+            found = table.sample(500, 0.1, 0.2)
+        torch.testing.assert_close(found.columns, expected.columns)
+        assert torch.equal(found.index, expected.index)
 
 
 def test_a_table_smaller_than_a_transition_is_refused() -> None:

@@ -64,6 +64,22 @@ def test_recorded_updates_are_the_eager_ones(method: str, tables: dict[str, Any]
     assert_equal(recorded, eager, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("method", ["dqn", "coop"])
+def test_a_thousand_recorded_updates_are_the_eager_ones(method: str) -> None:
+    tables = {"learner": {"optimizer": "adam", "eps": 1e-3, "learning_rate": 1e-5, "swap_every": 100, "batch_size": 4}}
+    eager, recorded = make_agent(method, **tables), make_agent(method, capture=plain_call, **tables)
+    begun = [network.snapshot() for network in eager.networks]
+    batches = make_batches(20, size=4)
+    for number in range(1000):
+        expected, found = (agent.update(batches[number % 20]) for agent in (eager, recorded))
+        assert (found.s, found.swapped) == (expected.s, expected.swapped)
+    np.testing.assert_allclose(found.td_errors, expected.td_errors, rtol=1e-3, atol=1e-4)
+    for one, other, start in zip(recorded.networks, eager.networks, begun, strict=True):
+        went, apart = other.snapshot() - start, one.snapshot() - other.snapshot()
+        assert np.linalg.norm(apart) < 1e-3 * np.linalg.norm(went)
+    assert [each.steps for each in recorded.optimizers] == [each.steps for each in eager.optimizers]
+
+
 def test_a_recorded_agent_is_saved_and_restored() -> None:
     one, other = make_agent("coop", capture=plain_call), make_agent("coop", capture=plain_call)
     *first, last = make_batches(10)

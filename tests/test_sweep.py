@@ -17,10 +17,13 @@ from common.errors import UsageError
 from common.settings.medqn import MedqnSettings
 from common.settings.tables import resolve
 from experiments.sweep.cli import SweepOptions, chosen, main
+from experiments.sweep.folder import CellFolder
 from experiments.sweep.grid import load_grid, shipped_grids
+from experiments.sweep.local import LocalProcesses
 
 pytestmark = pytest.mark.timeout(300)  # a dozen processes, one after the other, also on a machine that is busy
 SCRIPTS = Path(sysconfig.get_path("scripts"))
+NAMED = "CUDA_VISIBLE_DEVICES="
 TINY = 'methods = ["dqn", "coop"]\n[fixed]\ntotal_steps = 900\nreplay.capacity = 300\nlearner.swap_every = 10\n'
 
 
@@ -64,6 +67,24 @@ def test_one_cell_by_name_or_number() -> None:
         assert one.cell.name == names[number]
     with pytest.raises(UsageError, match="--cell 24: not in the grid"):
         chosen(SweepOptions("paper-buffers", cell="24"), grid, Path("runs"))
+
+
+def test_cells_share_the_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each cell on a GPU sees one; the environment of the processes says which."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,GPU-5")
+    path = tmp_path / "grid.toml"
+    path.write_text('methods = ["dqn"]\nseeds = [0, 1, 2, 3]\n[fixed]\nlearner.device = "cuda"\n')
+    grid = load_grid(str(path))
+    executor = LocalProcesses(grid.file, 4)
+    seen = []
+    try:
+        for cell in grid.cells:
+            assert executor.start(CellFolder(tmp_path, cell))
+            pid = executor._processes[cell.name].pid
+            seen += [one[21:] for one in Path(f"/proc/{pid}/environ").read_text().split("\0") if one[:21] == NAMED]
+    finally:
+        executor.stop(0)
+    assert sorted(seen) == ["3", "3", "GPU-5", "GPU-5"]
 
 
 @pytest.mark.parametrize(

@@ -126,13 +126,19 @@ class FilmedAtari(AtariEnv):
         self._picture = screens.reshape(*SCREEN, 3)
 
 
-def _emulators(settings: EnvSettings, game: str, count: int, **screen: Any) -> AtariVectorEnv:  # noqa: ANN401
+def _emulators(
+    settings: EnvSettings,
+    game: str,
+    count: int,
+    autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
+    **screen: Any,  # noqa: ANN401
+) -> AtariVectorEnv:
     """ALE's emulators of a game; screen: how they show it."""
     limit = settings.max_episode_steps * settings.frame_skip
     return AtariVectorEnv(
         game,
         count,
-        autoreset_mode=AutoresetMode.SAME_STEP,
+        autoreset_mode=autoreset,
         max_num_frames_per_episode=limit or FRAME_LIMIT,
         repeat_action_probability=settings.repeat_action_probability,
         full_action_space=settings.full_action_space,

@@ -10,7 +10,6 @@ Triton's kernels (`experiments.stacked.kernels`) where they fit and of PyTorch's
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -24,6 +23,7 @@ from experiments.stacked import networks
 from experiments.stacked.cartpole import Chance, Draws, move
 from experiments.stacked.networks import Tape, shape_of
 from experiments.stacked.settings import Runs, StackSettings
+from learner.recorded import captured
 
 COLUMNS = 10  # of the table: obs, next_obs, action, terminated
 BLOCK = 32  # steps, at most, of a captured block
@@ -148,16 +148,8 @@ class Stack:
         with torch.cuda.stream(stream):
             self.play(self._draws, True, role)
         torch.cuda.current_stream().wait_stream(stream)
-        torch.cuda.synchronize()
-        graph = torch.cuda.CUDAGraph()
-        gc.collect()
-        gc.disable()  # the end of an older graph would end the recording
-        try:
-            with torch.cuda.graph(graph):
-                self.play(self._draws, True, role)
-        finally:
-            gc.enable()
-        self._replays[role] = graph.replay
+        held = self._draws
+        self._replays[role] = captured(lambda: self.play(held, True, role), self.device)
 
     def play(self, draws: Draws, learning: bool, role: int) -> None:
         """Play the steps of a block; network `role` acts, and is trained if `learning`."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import time
+from collections import Counter
 from pathlib import Path
 
 from common.process.limits import cores
@@ -15,8 +17,18 @@ from experiments.sweep.grid import GridFile
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
+def cards() -> list[str]:
+    """The GPUs of this job, as CUDA_VISIBLE_DEVICES names them: those of the variable, or else of this machine."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None:
+        return [name for name in named.split(",") if name]
+    return sorted((path.name.removeprefix("nvidia") for path in Path("/dev").glob("nvidia[0-9]*")), key=int)
+
+
 class LocalProcesses:
     """An executor. A cell's process shares the run's locks with the sweep, and keeps them if the sweep is killed.
+
+    Of several GPUs each cell with `learner.device = "cuda"` sees one, that with the fewest cells.
 
     Args:
         jobs: number of cells to run concurrently; the number of cores of this job if None.
@@ -29,6 +41,7 @@ class LocalProcesses:
         self._directory = directory
         self._processes: dict[str, ChildProcess] = {}
         self._locks: dict[str, RunLock] = {}
+        self._cards: dict[str, str] = {}
 
     def slots(self) -> int:
         """See `Executor`."""
@@ -46,7 +59,7 @@ class LocalProcesses:
                 return False
             folder.prepare()
             log, command = folder.path / "run.log", self._command(folder)
-            process = ChildProcess(name, command, log, lock.descriptors, ONE_THREAD, self._directory)
+            process = ChildProcess(name, command, log, lock.descriptors, self._environment(folder), self._directory)
             process.start()
         except BaseException:
             lock.release()
@@ -80,6 +93,14 @@ class LocalProcesses:
     def news(self) -> list[str]:
         """See `Executor`; nothing happens to this machine."""
         return []
+
+    def _environment(self, folder: CellFolder) -> dict[str, str]:
+        """What a cell's process gets besides this one's environment."""
+        if folder.cell.config.learner.device != "cuda" or not (found := cards()):
+            return ONE_THREAD
+        load = Counter(card for name, card in self._cards.items() if name in self._processes)
+        self._cards[folder.cell.name] = card = min(found, key=load.__getitem__)
+        return {**ONE_THREAD, "CUDA_VISIBLE_DEVICES": card}
 
     def _ended(self, name: str) -> None:
         """Release a cell's locks; those of a run that was killed are its own children's, if some outlive it."""

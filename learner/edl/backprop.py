@@ -117,7 +117,7 @@ class Chain(Passes[Tensor]):
 
 def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:
     """Propagate cotangents [b, k, *shape] through a ReLU whose output is `activation` [batch, *shape]."""
-    if rows.shape[1] == 1:
+    if rows.shape[1] == 1 or rows.is_cuda:
         masked: Tensor = torch.ops.aten.threshold_backward(rows, activation.unsqueeze(1), 0)
         return masked
     mask = activation.sign().to(rows.dtype).unsqueeze(1)  # a ReLU's output is never negative

@@ -30,16 +30,17 @@ class Jacobians:
 
     def __init__(self, ts: Sequence[Tensor], ranges: Sequence[Range | None], basis: Tensor, batch: int) -> None:
         self._ts, self._basis, self._batch = ts, basis, batch
-        self._layers = [_Layer(t, reach, basis) for t, reach in zip(ts, ranges, strict=True)]
-        self._fused = kernels.fits(ts, batch) and all(layer.plain for layer in self._layers)
+        # The kernels compute Gram matrices of their own.
+        self._fused = kernels.fits(ts, batch) and all(reach is None for reach in ranges)
+        self._ranges = ranges
 
     def apply(self, e: Tensor, s: Tensor | float) -> list[Tensor]:
         """(T + s P)^T e of each layer: e [batch, A] -> [batch, n]."""
         if self._fused:
             return kernels.feedback(self._ts, e, s)
-        roots, completions = self._solve(e[None, :, :, None].double())
+        layers, roots, completions = self._solve(e[None, :, :, None].double())
         sigmas = []
-        for i, (t, layer) in enumerate(zip(self._ts, self._layers, strict=True)):
+        for i, (t, layer) in enumerate(zip(self._ts, layers, strict=True)):
             white, rest = (part[i, :, :, 0].to(e.dtype) for part in (roots, completions))
             weights = e + s * white
             sigma = weights @ t[0] if len(t) < len(e) else torch.bmm(weights.unsqueeze(1), t).squeeze(1)
@@ -51,28 +52,29 @@ class Jacobians:
     def matrices(self, s: float) -> list[Tensor]:
         """T + s P of each layer: [batch, A, n]."""
         units = torch.eye(self._basis.shape[0], dtype=torch.float64, device=self._basis.device)
-        roots, completions = self._solve(units[None, None])
+        layers, roots, completions = self._solve(units[None, None])
         found = []
-        for i, (t, layer) in enumerate(zip(self._ts, self._layers, strict=True)):
+        for i, (t, layer) in enumerate(zip(self._ts, layers, strict=True)):
             b = t + s * (roots[i].mT.to(t.dtype) @ t)
             if layer.completable:
                 b[:, :, : completions.shape[2]] += s * completions[i].mT.to(t.dtype)
             found.append(b)
         return found
 
-    def _solve(self, e: Tensor) -> tuple[Tensor, Tensor]:
+    def _solve(self, e: Tensor) -> tuple[list[_Layer], Tensor, Tensor]:
         """G'^(-1/2) e, and (delta D)^T times that: e float64 [1, batch or 1, A, k] -> [layers, batch, A, k] each."""
         shape = (self._batch, *self._basis.shape)
-        completed = [layer.completed() for layer in self._layers]
+        layers = [_Layer(t, reach, self._basis) for t, reach in zip(self._ts, self._ranges, strict=True)]
+        completed = [layer.completed() for layer in layers]
         grams, mixing = ([parts[i].expand(shape) for parts in completed] for i in (0, 1))
         white = inverse_root(torch.stack(grams)) @ e
-        return white, torch.stack(mixing).mT @ white
+        return layers, white, torch.stack(mixing).mT @ white
 
 
 class _Layer:
     """T of one layer.
 
-    plain: T may have full rank, and is no wider than it is long. completable: T can be completed to more rank.
+    completable: T can be completed to more rank.
     """
 
     def __init__(self, t: Tensor, reach: Range | None, basis: Tensor) -> None:
@@ -84,8 +86,7 @@ class _Layer:
         wide = t.double() if exact else t
         self._gram = torch.bmm(wide, wide.mT).double()
         self._inside: Tensor | None = None
-        self.plain = reach is None and width >= actions
-        self.completable = self.plain
+        self.completable = reach is None and width >= actions
         if reach is not None:
             self.completable = reach.rank == reach.basis.shape[1] and width >= actions
             inside = basis @ reach.basis.to(basis)

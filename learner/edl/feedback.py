@@ -19,7 +19,8 @@ With s = 0, or feedback "none", backward is plain backpropagation and costs one 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any, Generic
 
 import numpy as np
@@ -28,6 +29,7 @@ from torch import Tensor, nn
 
 from common.process.memory import keep_freed_memory
 from learner.edl.arrays import ArrayT, at_least_float32, convert_like
+from learner.edl.beside import Branches
 from learner.edl.layers import make_passes
 from learner.edl.passes import Passes, Tape
 from learner.edl.polar import polar, polar_of_product
@@ -71,23 +73,23 @@ class FeedbackRule(Generic[ArrayT]):
         size. s: the exploration rate, a number, or a tensor of one on the network's device, whose value then decides
         nothing. The caller disables autograd and numpy's warnings of non-finite values.
         """
-        if self.feedback == "random":
-            for index in self.chain.parametrised:
-                self.chain.write(tape, index, self._aligned(tape, index, error), out)
-        elif self.feedback == "transform" and _given(s):
-            self._transform(tape, error, s, out)
-        else:
-            for index, delta in self.chain.walk(tape, error[:, None]):
-                self.chain.write(tape, index, delta[:, 0], out)
-                if self.feedback == "weight-gradient" and _given(s):
-                    gradient = out[self.chain.names[index] + "weight"]
-                    gradient += s * _polar_of_gradient(gradient, delta[:, 0], tape.inputs[index], self._rng)
+        branches = Branches(error)  # of each layer's parameters beside the others and what passes between layers
+        for index, delta in self._feedback(tape, error, s):
+            branches.run(partial(self.chain.write, tape, index, delta, out), delta)
+            if self.feedback == "weight-gradient" and _given(s):
+                gradient = out[self.chain.names[index] + "weight"]
+                gradient += s * _polar_of_gradient(gradient, delta, tape.inputs[index], self._rng)
+        branches.join()
         self.chain.write_rest(tape, error, out)
 
-    def _transform(self, tape: Tape[ArrayT], error: ArrayT, s: Any, out: Mapping[str, ArrayT]) -> None:  # noqa: ANN401
-        """Compute sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e and the gradients of every layer."""
-        for index, sigma in Transforms(self.chain, tape).apply_feedback(error, s):
-            self.chain.write(tape, index, sigma, out)
+    def _feedback(self, tape: Tape[ArrayT], error: ArrayT, s: Any) -> Iterator[tuple[int, ArrayT]]:  # noqa: ANN401
+        """Yield (step, what it is sent [batch, *output of step])."""
+        if self.feedback == "random":
+            yield from ((index, self._aligned(tape, index, error)) for index in self.chain.parametrised)
+        elif self.feedback == "transform" and _given(s):  # sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e
+            yield from Transforms(self.chain, tape).apply_feedback(error, s)
+        else:
+            yield from ((index, delta[:, 0]) for index, delta in self.chain.walk(tape, error[:, None]))
 
     def _aligned(self, tape: Tape[ArrayT], index: int, error: ArrayT) -> ArrayT:
         """B(i)^T e with the fixed B(i) of layer `index`; that of a last layer is the identity, like T(d)."""

@@ -188,6 +188,35 @@ adam(float* theta, const float* gradient, float* mean, float* square, const floa
     }
 }
 
+// A transition for each thread, as learner/device_table.py draws them in PyTorch: chance [2, size], uniform.
+extern "C" __global__ void __launch_bounds__(THREADS)
+draw(const float* chance, const long long* steps, const float* ended, const float* terminated, const float* rewards,
+     const long long* chosen, const float* powers, long long* actions, float* sums, float* discounts, float* valid,
+     int* index, int rows, int streams, int n, int stack, int size)
+{
+    const int i = blockIdx.x * THREADS + threadIdx.x;
+    if (i >= size) return;
+    const long long now = *steps, held = (now < rows ? now : rows) - n;
+    const long long first = now - n - 1 - (long long)(chance[i] * (float)held);
+    const long long stream = (long long)(chance[size + i] * (float)streams);
+    const long long place = first % rows * streams + stream;
+    long long last = place;
+    float sum = 0;
+    int span = 0;
+    for (bool alive = true; alive && span < n; alive = ended[last] == 0) {
+        last = (first + span + 1) % rows * streams + stream;
+        sum += powers[span++] * rewards[last];
+    }
+    actions[i] = chosen[place];
+    sums[i] = sum;
+    discounts[i] = powers[span] * (1 - terminated[last]);
+    valid[i] = 1 - ended[place];
+    for (int f = 0; f < stack; f++) {
+        index[(long long)i * stack + f] = (int)(place * stack + f);
+        index[((long long)size + i) * stack + f] = (int)(last * stack + f);
+    }
+}
+
 // Four uint8 frames of each observation -> pixels in [0, 1], the four of a place side by side: float [n, pixels, 4].
 extern "C" __global__ void __launch_bounds__(THREADS)
 stack(const u8* frames, const int* index, float* out, int pixels)
@@ -276,6 +305,31 @@ def adam(
     )  # fmt: skip
 
 
+def draws(
+    chance: Tensor, steps: Tensor, columns: Sequence[Tensor], powers: Tensor, stack: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor] | None:
+    """Transitions of a `DeviceTable`; None if the kernels can't work there.
+
+    chance: float32 [2, size], uniform in [0, 1). steps: int64 [], rows so far. columns: ended, terminated and rewards,
+    float32 [rows, streams] each, and actions, int64 [rows, streams]. powers: float32 [n + 1], of gamma. Returns
+    actions, rewards, discounts, weights [size] each, and the rows of the frames, int32 [2 size stack].
+    """
+    if not usable(chance):
+        return None
+    module = _module(2, chance.device.index or 0)
+    assert module is not None
+    size, (rows, streams) = chance.shape[1], columns[0].shape
+    actions = torch.empty(size, dtype=torch.int64, device=chance.device)
+    rewards, discounts, weights = torch.empty(3, size, device=chance.device)
+    index = torch.empty(2 * size * stack, dtype=torch.int32, device=chance.device)
+    _launch(
+        module["draw"], (-(-size // _THREADS), 1, 1), chance, steps, *columns, powers,
+        actions, rewards, discounts, weights, index,
+        *map(ctypes.c_int, (rows, streams, len(powers) - 1, stack, size)),
+    )  # fmt: skip
+    return actions, rewards, discounts, weights, index
+
+
 def stacks(frames: Tensor, index: Tensor, count: int) -> Tensor | None:
     """Observations of four frames, as networks take them; None if these are not such frames on a GPU.
 
@@ -347,7 +401,7 @@ def _module(actions: int, device: int) -> dict[str, ctypes.c_void_p] | None:
             module = ctypes.c_void_p()
             _check(driver.cuModuleLoadData(ctypes.byref(module), code))
             found = {}
-            for name in ("weigh", "combine", "adam", "stack"):
+            for name in ("weigh", "combine", "adam", "draw", "stack"):
                 found[name] = ctypes.c_void_p()
                 _check(driver.cuModuleGetFunction(ctypes.byref(found[name]), module, name.encode()))
             return found
