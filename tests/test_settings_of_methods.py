@@ -80,7 +80,7 @@ def test_tables_of_methods_are_checked(text: str, words: str) -> None:
         (["--edl.feedback", "random", "--edl.rate", "1"], ["edl.rate"]),
         (["--edl.rate", "0", "--edl.noise", "normal"], ["edl.noise"]),
         (["--edl.decay", "1", "--edl.decay-every", "5"], ["edl.decay-every"]),
-        (["--learner.tf32", "false"], ["learner.tf32"]),
+        (["--learner.no-tf32"], ["learner.tf32"]),
         (["--preset", "catch", "--network.hidden", "3", "4"], ["network.hidden"]),
         (["--method", "dqn", "--learner.target-update-every", "5"], []),
         (
