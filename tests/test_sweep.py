@@ -80,8 +80,11 @@ def test_cells_share_the_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     try:
         for cell in grid.cells:
             assert executor.start(CellFolder(tmp_path, cell))
-            pid = executor._processes[cell.name].pid
-            seen += [one[21:] for one in Path(f"/proc/{pid}/environ").read_text().split("\0") if one[:21] == NAMED]
+            environ = Path(f"/proc/{executor._processes[cell.name].pid}/environ")
+            ends = time.monotonic() + 20
+            while not (named := [one[21:] for one in environ.read_text().split("\0") if one[:21] == NAMED]):
+                assert time.monotonic() < ends, "the variable is there once the program has begun"
+            seen += named
     finally:
         executor.stop(0)
     assert sorted(seen) == ["3", "3", "GPU-5", "GPU-5"]
