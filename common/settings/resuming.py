@@ -23,7 +23,8 @@ def settings_digest(config: RunConfig) -> str:
 
 
 def _is_free(path: tuple[str, ...]) -> bool:
-    return path[0] in (*_FREE, "total_steps", *_LIMITS)
+    of_machine = path[0] == "learner" and path[1] in OF_MACHINE
+    return of_machine or path[0] in (*_FREE, "total_steps", *_LIMITS)
 
 
 def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
