@@ -26,7 +26,7 @@ from common.errors import BadMessage, CoopError, RunError, UsageError
 from common.messaging.messages.insert import check_values
 from common.process import notices
 from common.settings.environment import EnvSettings
-from common.settings.resuming import check_resumed
+from common.settings.resuming import check_resumed, settings_digest
 from common.settings.tables import identity, load_tables, resolve
 from common.types import Array, EnvSpec
 from experiments.film import Film, short_gif
@@ -346,8 +346,10 @@ def test_policies_refuse_what_they_would_cast(trained: coop.SavedRun) -> None:
 
 def test_a_run_may_move_to_another_machine_s_device(tmp_path: Path) -> None:
     here = resolve(load_tables("cartpole", None))
-    there = replace(here, learner=replace(here.learner, device="cuda", threads=8))
+    there = replace(here, learner=replace(here.learner, device="cuda", threads=8, mirror="off"))
     assert identity(here) == identity(there)
+    assert settings_digest(here) == settings_digest(replace(there, total_steps=10**6)), "its checkpoints are the run's"
+    assert settings_digest(here) != settings_digest(replace(here, learner=replace(here.learner, gamma=0.5)))
     check_resumed(here, there, tmp_path / "config.toml")
     with pytest.raises(UsageError, match=r"learner\.gamma"):
         check_resumed(here, replace(there, learner=replace(there.learner, gamma=0.5)), tmp_path / "config.toml")

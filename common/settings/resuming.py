@@ -14,17 +14,19 @@ from common.settings.tables import to_tables
 _FREE = (*OUTSIDE, "target_return")
 _TELLS_APART = (("run",), ("method",), ("seed",), ("env", "id"))
 _LIMITS = ("total_updates", "total_episodes")  # 0: none
+_GROWING = ("total_steps", *_LIMITS)
 
 
 def settings_digest(config: RunConfig) -> str:
     """A checksum of the settings that stay the same in a resumed run, for its checkpoints."""
-    kept = [(path, value) for path, value in leaves(to_tables(config)) if path[0] != "methods" and not _is_free(path)]
+    values = leaves(to_tables(config))
+    kept = [(path, value) for path, value in values if not (_is_free(path) or path[0] in ("methods", *_GROWING))]
     return f"{zlib.crc32(repr(sorted(kept, key=str)).encode()):08x}"
 
 
 def _is_free(path: tuple[str, ...]) -> bool:
-    of_machine = path[0] == "learner" and path[1] in OF_MACHINE
-    return of_machine or path[0] in (*_FREE, "total_steps", *_LIMITS)
+    """Whether a setting may take any value in a resumed run."""
+    return path[0] in _FREE or (path[0] == "learner" and path[1] in OF_MACHINE)
 
 
 def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
@@ -58,7 +60,7 @@ def check_resumed(config: RunConfig, saved: RunConfig, source: Path) -> None:
 
 
 def _may_change(path: tuple[str, ...], here: Any, there: Any) -> bool:  # noqa: ANN401 (values of any field)
-    if here == there or path[0] in _FREE or (path[0] == "learner" and path[1] in OF_MACHINE):
+    if here == there or _is_free(path):
         return True
     if path == ("total_steps",):
         return bool(here > there)
@@ -66,4 +68,4 @@ def _may_change(path: tuple[str, ...], here: Any, there: Any) -> bool:  # noqa: 
 
 
 def _allowed(path: tuple[str, ...]) -> str:
-    return " (it may only grow)" if path[0] in ("total_steps", *_LIMITS) else ""
+    return " (it may only grow)" if path[0] in _GROWING else ""
