@@ -109,7 +109,7 @@ def linked(path: Path, to: Path) -> None:
 
 INSIDE = [
     *("episodes.csv", "config.toml.part", "summary.json.part", "run-id"),
-    *("checkpoints", "videos", "checkpoints/N/learner.pt", "checkpoints/N/replay"),
+    *("checkpoints", "videos", "checkpoints/N/learner.pt", "checkpoints/N/replay", "aside", "wandb"),
 ]
 
 

@@ -39,12 +39,8 @@ from common.process.checkpoints import (
 from common.process.files import Measured, aside_folder, measure, move_aside, truncate
 from common.process.run_ids import has_run_id, read_run_id
 from common.process.summaries import SUMMARY, read_summary
+from common.process.untrusted import LEFT
 
-LEFT = (
-    *("config.toml", *RECORDS, EVALUATIONS, SUMMARY, "learning_curve.png", "roster.json", "run-id"),
-    *(FOLDER, "journal", "logs", "tb", "videos", "wandb"),
-)
-"""Everything that a run leaves in its directory, but for the locks."""
 _STARTED = (*RECORDS, EVALUATIONS, SUMMARY, "learning_curve.png", "tb", "videos")  # by a run without a checkpoint
 
 

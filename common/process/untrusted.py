@@ -25,12 +25,12 @@ MAX_NAME_BYTES = 100
 MAX_TEXT = 1 << 30  # bytes of a text file that is read at once
 MAX_SETTINGS = 1 << 24  # bytes of one that holds settings
 _PATTERN = frozenset("*?[")
-# What the product writes in a run's folder; the rest of the folder is its user's.
-_FILES = (
+LEFT = (
     "config.toml", "episodes.csv", "metrics.jsonl", "evaluations.csv", "summary.json", "run-id", "roster.json",
-    "learning_curve.png", "run.log", ".learner.lock", ".replay.lock",
+    "learning_curve.png", "checkpoints", "journal", "videos", "logs", "tb", "wandb",
 )  # fmt: skip
-_FOLDERS = ("checkpoints", "journal", "videos", "logs", "tb", "archive")
+"""What a run leaves in its folder; the rest, but for _BESIDE, is its user's."""
+_BESIDE = ("run.log", ".learner.lock", ".replay.lock", "aside")
 _SIZES = {  # bytes of an item of PyTorch's storages
     "Double": 8, "Float": 4, "Half": 2, "BFloat16": 2, "Long": 8, "Int": 4, "Short": 2, "Char": 1, "Byte": 1, "Bool": 1,
 }  # fmt: skip
@@ -100,11 +100,10 @@ def check_links(folder: Path) -> None:
 
 def _own(folder: Path) -> Iterator[Path]:
     """The files and folders of a run that the product reads or writes, links not followed."""
-    for name in _FILES:
+    for name in (*LEFT, *_BESIDE):
         yield folder / name
         yield folder / f"{name}.part"
-    for name in _FOLDERS:
-        yield folder / name
+    for name in LEFT:
         for at, folders, files in os.walk(folder / name):
             if name == "checkpoints" and Path(at) == folder / name:
                 yield from (Path(at, each) for each in folders if each.isdecimal())
