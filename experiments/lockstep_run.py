@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from common.envs.make import check_filmed
-from common.errors import CoopError, RunError
+from common.errors import CoopError, RunError, first_line
 from common.process.console import say
-from common.process.lifecycle import Stop, first_line
+from common.process.lifecycle import Stop
 from common.process.locks import RunLock
 from common.process.resumption import Start
 from common.process.threads import use_threads

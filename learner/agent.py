@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.errors import UsageError
+from common.errors import UsageError, first_line
 from common.networks.network import FlatNetwork
 from common.process.notices import warn
 from common.process.randomness import generator_state, set_generator_state
@@ -171,7 +171,7 @@ class Agent:
         try:
             return self._recorded.run(self.acting, batch, s, rate)
         except RuntimeError as error:
-            self.eager = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            self.eager = first_line(error)
             self._recorded = None
             warn(f"updates are not recorded as CUDA graphs, and take longer: {self.eager}")
             return None

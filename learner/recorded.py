@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from common.errors import first_line
 from common.process.notices import warn
 from common.settings.config import RunConfig
 from common.types import Batch, EnvSpec
@@ -63,7 +64,7 @@ def cuda_graph(function: Callable[[], None], device: torch.device) -> Callable[[
         with branching():
             return captured(function, device)
     except RuntimeError as error:
-        warn(f"updates are recorded without parallel branches, and take longer: {str(error).splitlines()[0]}")
+        warn(f"updates are recorded without parallel branches, and take longer: {first_line(error)}")
         return captured(function, device)
 
 

@@ -57,7 +57,7 @@ def explain_listen_error(listen: Sequence[str], error: Exception) -> str:
         return f"the host {hosts[0]!r} is not known"
     found = _OS_ERROR.search(str(error))
     if found is None:
-        return first_line(error)
+        return zenoh_reason(error)
     number = int(found[1])
     return _WORDS.get(number, os.strerror(number).lower())
 
@@ -67,10 +67,10 @@ def explain_shared_memory(error: Exception) -> str:
     if "shm" not in str(error).lower():
         return ""
     found = _OS_ERROR.search(str(error))
-    return f"--shared-memory: /dev/shm: {os.strerror(int(found[1])).lower() if found else first_line(error)}"
+    return f"--shared-memory: /dev/shm: {os.strerror(int(found[1])).lower() if found else zenoh_reason(error)}"
 
 
-def first_line(error: Exception) -> str:
+def zenoh_reason(error: Exception) -> str:
     """The text of Zenoh's error without its source locations."""
     return str(error).splitlines()[0].split(" at /")[0]
 

@@ -12,7 +12,7 @@ import zenoh
 
 from common.bounds import MAX_PAYLOAD
 from common.errors import RunError, UsageError
-from common.messaging.endpoints import check_endpoints, explain_listen_error, explain_shared_memory, first_line
+from common.messaging.endpoints import check_endpoints, explain_listen_error, explain_shared_memory, zenoh_reason
 from common.messaging.links import never_linger, permit_many, wait_for_words
 from common.messaging.presence import LEASE
 from common.messaging.transport import NoAnswer
@@ -74,7 +74,7 @@ def open_session(
         config.insert_json5("connect/endpoints", json.dumps(list(connect)))
         config.insert_json5("connect/timeout_ms", "1000" if mode == "client" else "-1")  # a client waits for its link
     except zenoh.ZError as error:
-        raise UsageError(f"zenoh configuration: {first_line(error)}") from error
+        raise UsageError(f"zenoh configuration: {zenoh_reason(error)}") from error
     try:
         with _threads(mode, listens=bool(listen)):
             session = zenoh.open(config)

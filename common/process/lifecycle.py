@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from common.errors import CoopError, PeerLost
+from common.errors import CoopError, PeerLost, first_line
 from common.process.files import NO_SPACE
 from common.process.limits import memory_limit
 from common.process.notices import warn
@@ -197,12 +197,6 @@ def is_out_of_memory(error: BaseException) -> bool:
         or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
         or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error))
     )
-
-
-def first_line(error: BaseException | None) -> str:
-    """An exception's type and the first line of its text."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _where(error: BaseException) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from common.errors import first_line
 from common.process.notices import warn
 from learner.edl.polar import SCALES
 
@@ -406,7 +407,7 @@ def _module(actions: int, device: int) -> dict[str, ctypes.c_void_p] | None:
                 _check(driver.cuModuleGetFunction(ctypes.byref(found[name]), module, name.encode()))
             return found
     except (OSError, RuntimeError, AttributeError) as error:
-        warn(f"no kernels are compiled for the GPU, updates take longer: {str(error).splitlines()[0]}")
+        warn(f"no kernels are compiled for the GPU, updates take longer: {first_line(error)}")
         return None
 
 
