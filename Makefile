@@ -30,7 +30,7 @@ check: $(READY)
 # Every figure and table of results/, from the packed studies there.
 results: $(READY)
 	@for study in results/cartpole/*.parquet results/minatar/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
-	@$(BIN)/python -m experiments.registered figure results/minatar/study.parquet
+	@$(BIN)/python -m coop.studies.registered figure results/minatar/study.parquet
 	@$(BIN)/coop-report results/pong.parquet --curves results/pong
 
 # Checks that take longer; docs/robustness.md says what each shows.

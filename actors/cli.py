@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from common.process import cli
-from common.process.importing import importing
-from common.process.lifecycle import run_main
-from common.settings.options import HealthOptions, RoleOptions
+from coop.common.process import cli
+from coop.common.process.importing import importing
+from coop.common.process.lifecycle import run_main
+from coop.records.run_options import HealthOptions, RoleOptions
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,6 @@ def main() -> None:
 def _run() -> None:
     options = cli.parse(ActorOptions, "coop-actor", "Play emulators for a run; its learner sends the config.")
     with importing():
-        from actors.process import play  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+        from coop.actors.process import play  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
     play(options)

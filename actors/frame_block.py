@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Array, EnvSpec
+from coop.common.types import Array, EnvSpec
 
 Rows = NDArray[np.int32]
 

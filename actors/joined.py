@@ -6,11 +6,11 @@ from collections.abc import Collection
 
 import numpy as np
 
-from actors.policy import Policy
-from common.errors import JoinError
-from common.imports import check_allowed
-from common.messaging.messages.join import Joined
-from common.networks.acting import acting_network
+from coop.actors.policy import Policy
+from coop.common.errors import JoinError
+from coop.common.imports import check_allowed
+from coop.common.messaging.messages.join import Joined
+from coop.common.networks.acting import acting_network
 
 
 def make_policy(joined: Joined, allow_import: Collection[str], rng: np.random.Generator) -> Policy:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.policy import Policy
-from common.envs.protocol import Steps, VectorEnv
-from common.types import Array, EpisodeEnd
+from coop.actors.policy import Policy
+from coop.common.envs.protocol import Steps, VectorEnv
+from coop.common.types import Array, EpisodeEnd
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from common.networks.acting import ActingNetwork
-from common.types import Array, EnvSpec
+from coop.common.networks.acting import ActingNetwork
+from coop.common.types import Array, EnvSpec
 
 
 class Policy:

@@ -7,21 +7,21 @@ from collections.abc import Sequence
 import numpy as np
 import zenoh
 
-from actors.cli import ActorOptions
-from actors.joined import make_policy
-from actors.service import ActorService
-from common.envs.make import make_vector_env
-from common.errors import JoinError
-from common.messaging.joining import Membership, join, leave_run
-from common.messaging.messages.join import Join, Joined
-from common.messaging.route import ReplayRoute, RoutedReplay, open_client
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.console import Console, counted
-from common.process.health import answering
-from common.process.lifecycle import Stop
-from common.process.memory import keep_freed_memory
-from common.process.threads import use_threads
+from coop.actors.cli import ActorOptions
+from coop.actors.joined import make_policy
+from coop.actors.service import ActorService
+from coop.common.envs.make import make_vector_env
+from coop.common.errors import JoinError
+from coop.common.messaging.joining import Membership, join, leave_run
+from coop.common.messaging.messages.join import Join, Joined
+from coop.common.messaging.route import ReplayRoute, RoutedReplay, open_client
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.console import Console, counted
+from coop.common.process.lifecycle import Stop
+from coop.common.process.memory import keep_freed_memory
+from coop.common.process.threads import use_threads
+from coop.monitor.health import answering
 
 
 def play(options: ActorOptions) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Array
+from coop.common.types import Array
 
 
 def n_step_returns(

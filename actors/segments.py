@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.frame_block import FrameBlock
-from actors.returns import n_step_returns
-from common.envs.protocol import Steps
-from common.types import Array, EnvSpec, EpisodeEnd, Segment
+from coop.actors.frame_block import FrameBlock
+from coop.actors.returns import n_step_returns
+from coop.common.envs.protocol import Steps
+from coop.common.types import Array, EnvSpec, EpisodeEnd, Segment
 
 
 class SegmentAssembler:

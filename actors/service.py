@@ -5,19 +5,19 @@ from __future__ import annotations
 import time
 from functools import partial
 
-from actors.player import Player, Turn
-from actors.policy import Policy
-from actors.segments import SegmentAssembler
-from actors.weights import WeightsFollower
-from common.envs.protocol import VectorEnv
-from common.messaging.insert_client import InsertClient, QuerySender
-from common.messaging.messages.status import ActorStatus
-from common.messaging.transport import Node
-from common.process.console import Console
-from common.process.lifecycle import Stop
-from common.process.rates import Rate
-from common.settings import schedules
-from common.settings.config import RunConfig
+from coop.actors.player import Player, Turn
+from coop.actors.policy import Policy
+from coop.actors.segments import SegmentAssembler
+from coop.actors.weights import WeightsFollower
+from coop.common.envs.protocol import VectorEnv
+from coop.common.messaging.insert_client import InsertClient, QuerySender
+from coop.common.messaging.messages.status import ActorStatus
+from coop.common.messaging.transport import Node
+from coop.common.process.console import Console
+from coop.common.process.lifecycle import Stop
+from coop.common.process.rates import Rate
+from coop.common.settings import schedules
+from coop.common.settings.config import RunConfig
 
 STATUS_EVERY = 0.5  # seconds
 SPEED_OVER = 2.0  # seconds

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import time
 
-from actors.policy import Policy
-from common.errors import BadMessage
-from common.messaging.keys import role_key, weights_key
-from common.messaging.messages.weights import Current, Role, Weights
-from common.messaging.transport import NoAnswer, Node
-from common.messaging.wire import Message
+from coop.actors.policy import Policy
+from coop.common.errors import BadMessage
+from coop.common.messaging.keys import role_key, weights_key
+from coop.common.messaging.messages.weights import Current, Role, Weights
+from coop.common.messaging.transport import NoAnswer, Node
+from coop.common.messaging.wire import Message
 
 UNKNOWN = -1  # a version: no weights, or no role, received yet
 GRACE = 0.5  # seconds to wait for a broadcast before asking for the weights

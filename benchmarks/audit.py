@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from common.errors import RunError
-from common.process.checkpoints import REPLAY
-from common.types import Array
-from learner.records.epochs import newest_epoch
+from coop.common.errors import RunError
+from coop.common.types import Array
+from coop.records.checkpoints import REPLAY
+from coop.records.kept import newest_epoch
 
 RESET = 0.05  # CartPole begins an episode with all four numbers within this
 

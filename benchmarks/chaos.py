@@ -11,13 +11,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.errors import RunError, UsageError
-from common.messaging.transport import new_incarnation
-from common.process import cli
-from common.process.lifecycle import run_main
-from common.process.processes import ChildProcess, command, free_endpoint
-from common.process.summaries import read_summary
-from deploy.status import RunStatus
+from coop.common.errors import RunError, UsageError
+from coop.common.messaging.transport import new_incarnation
+from coop.common.process import cli
+from coop.common.process.lifecycle import run_main
+from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.monitor.status import RunStatus
+from coop.records.summaries import read_summary
 
 TICK = 0.05  # seconds
 ROLES = ("coop-learner", "coop-replay", "coop-actor")

@@ -35,8 +35,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from common.errors import CoopError
-from common.process.processes import command
+from coop.common.errors import CoopError
+from coop.common.process.processes import command
 
 LIMIT = 120  # seconds for a command, on a busy machine
 PAGE = 4096
@@ -290,15 +290,15 @@ def load(path: Path) -> None:
 
 def restore(path: Path) -> None:
     """What `coop-local --resume` reads: its own check, the learner's state, the table and the journal."""
-    from common.envs.make import env_spec  # noqa: PLC0415
-    from common.process.resumption import Start, go_back  # noqa: PLC0415
-    from common.process.run_ids import read_run_id  # noqa: PLC0415
-    from common.settings.tables import read_run_config  # noqa: PLC0415
-    from learner.records.epochs import load_learner  # noqa: PLC0415
-    from learner.roster import Roster  # noqa: PLC0415
-    from replay.core import ReplayCore  # noqa: PLC0415
-    from replay.persistence.epochs import ReplayEpochs  # noqa: PLC0415
-    from replay.persistence.recovery import recover  # noqa: PLC0415
+    from coop.common.envs.make import env_spec  # noqa: PLC0415
+    from coop.common.settings.tables import read_run_config  # noqa: PLC0415
+    from coop.learner.roster import Roster  # noqa: PLC0415
+    from coop.records.kept import load_learner  # noqa: PLC0415
+    from coop.records.resumption import Start, go_back  # noqa: PLC0415
+    from coop.records.run_ids import read_run_id  # noqa: PLC0415
+    from coop.replay.core import ReplayCore  # noqa: PLC0415
+    from coop.replay.persistence.epochs import ReplayEpochs  # noqa: PLC0415
+    from coop.replay.persistence.recovery import recover  # noqa: PLC0415
 
     config = read_run_config(path)
     found, told = Start(resume=True).prepare(path, replay=True, load=load_learner)

@@ -21,10 +21,10 @@ import numpy as np
 from roles import Roles, RunWatch, replay_stats, running, wait_until
 from soak import measure
 
-from common.errors import CoopError
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.processes import command, free_endpoint
+from coop.common.errors import CoopError
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.processes import command, free_endpoint
 
 RUN = "costs"
 FEW = "0.01"  # updates per step

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 from synthetic import PATIENCE, STEPS, Broadcasts, Space, SyntheticActor
 
-from actors.service import STATUS_EVERY
-from common.messaging.joining import IDLE_ASK_EVERY
-from common.process.memory import keep_freed_memory
+from coop.actors.service import STATUS_EVERY
+from coop.common.messaging.joining import IDLE_ASK_EVERY
+from coop.common.process.memory import keep_freed_memory
 
 AT_ONCE = 16  # actors of a process that join at the same time
 AGE_EVERY = 4.0  # seconds

@@ -22,9 +22,9 @@ from pathlib import Path
 from hosts import Host, network_of
 from roles import wait_until
 
-from common.errors import CoopError, RunError
-from common.process.processes import ChildProcess, command
-from common.process.summaries import read_summary
+from coop.common.errors import CoopError, RunError
+from coop.common.process.processes import ChildProcess, command
+from coop.records.summaries import read_summary
 
 TOTAL_STEPS = 2000
 GRID = f"""

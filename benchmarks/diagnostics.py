@@ -13,10 +13,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from common.process.threads import use_threads
-from common.returns import METRICS_EVERY
-from common.settings.sources import base_config
-from experiments.lockstep import Lockstep
+from coop.common.numbers import METRICS_EVERY
+from coop.common.process.threads import use_threads
+from coop.lockstep.lockstep import Lockstep
+from coop.records.sources import base_config
 
 START = 300  # steps before the first update
 BATCHES = 20  # drawn before the measurements

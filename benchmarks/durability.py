@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 HERE = Path(__file__).parents[1]
-LOCKSTEP = "import sys; from experiments.lockstep_cli import main; sys.argv[0] = 'coop-lockstep'; main()"
+LOCKSTEP = "import sys; from coop.lockstep.cli import main; sys.argv[0] = 'coop-lockstep'; main()"
 Figures = dict[str, float]
 
 

@@ -19,15 +19,15 @@ from collections.abc import Callable, Mapping
 import torch
 from made_up import random_batch
 
-from common.networks.network import build_network
-from common.process.threads import use_threads
-from common.settings.config import RunConfig
-from common.settings.tables import validated
-from common.types import Batch, EnvSpec
-from learner.agent import Agent
-from learner.edl.arrays import AnyArray, convert_like
-from learner.edl.feedback import FeedbackRule
-from learner.edl.passes import Tape
+from coop.common.networks.network import build_network
+from coop.common.process.threads import use_threads
+from coop.common.settings.config import RunConfig
+from coop.common.settings.tables import validated
+from coop.common.types import Batch, EnvSpec
+from coop.learner.agent import Agent
+from coop.learner.edl.arrays import AnyArray, convert_like
+from coop.learner.edl.feedback import FeedbackRule
+from coop.learner.edl.passes import Tape
 
 BATCH, GAMMA, RATE = 32, 0.99, 0.1
 BLOCKS = 5

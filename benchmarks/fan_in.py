@@ -30,10 +30,10 @@ from typing import Any, NamedTuple
 from crowd import Share, percentile, serve
 from roles import Roles, replay_stats, running
 
-from common.errors import RunError
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.processes import free_endpoint
+from coop.common.errors import RunError
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.processes import free_endpoint
 
 RUN = "fan-in"
 CAPACITY = 20_000  # transitions; the table is full before the actors join, so its growth is not theirs

@@ -19,7 +19,7 @@ import pandas as pd
 import torch
 from torch import Tensor, nn
 
-from learner.edl.feedback import edl_gradients
+from coop.learner.edl.feedback import edl_gradients
 
 GAMMA, BATCH, RATE, SWAP = 0.99, 32, 3e-4, 30
 S = 0.1

@@ -27,17 +27,17 @@ from mutations import mutate
 from roles import Roles, RunWatch, replay_stats, running, wait_until
 from targets import RUN, Target, extremes, targets
 
-from common.errors import BadMessage, CoopError, RunError
-from common.messaging import wire
-from common.messaging.joining import join
-from common.messaging.keys import replay_key
-from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.messages.join import Join
-from common.messaging.messages.weights import Current
-from common.messaging.session import open_session
-from common.messaging.transport import Node, Pending, Refused, new_incarnation
-from common.process.lifecycle import Stop
-from common.process.processes import free_endpoint
+from coop.common.errors import BadMessage, CoopError, RunError
+from coop.common.messaging import wire
+from coop.common.messaging.joining import join
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.weights import Current
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, Pending, Refused, new_incarnation
+from coop.common.process.lifecycle import Stop
+from coop.common.process.processes import free_endpoint
 
 EPOCH = 1  # the same number in the snapshots before and after
 WINDOW = 64  # broken messages in flight

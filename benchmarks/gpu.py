@@ -169,7 +169,7 @@ def part_facts(options: argparse.Namespace) -> None:
     row = {"torch": torch.__version__, "cuda": torch.version.cuda, "cores": os.cpu_count(), "python": sys.version[:6]}
     if torch.cuda.is_available():
         row["gpu"] = torch.cuda.get_device_name()
-        from learner.edl import kernels
+        from coop.learner.edl import kernels
 
         row["kernels"] = kernels.usable(torch.ones(1, device="cuda"))
     figure(**row)
@@ -179,12 +179,12 @@ def part_accuracy(options: argparse.Namespace) -> None:
     """The error of T^T e + s P^T e, and of P^T e alone, of each layer against SVDs in float64."""
     import torch
 
-    from common.networks.network import FlatNetwork, build_network, sample_inputs
-    from common.types import EnvSpec
-    from learner.edl import kernels
-    from learner.edl.completed import Jacobians
-    from learner.edl.layers import make_passes
-    from learner.edl.transforms import Transforms
+    from coop.common.networks.network import FlatNetwork, build_network, sample_inputs
+    from coop.common.types import EnvSpec
+    from coop.learner.edl import kernels
+    from coop.learner.edl.completed import Jacobians
+    from coop.learner.edl.layers import make_passes
+    from coop.learner.edl.transforms import Transforms
 
     device, batch = torch.device(options.device), 4 if options.quick else 32
     for actions in (2, 6, 18):
@@ -262,8 +262,8 @@ def drawn_updates(agent: Any, spec: Any, count: int, recorded: bool, branches: b
     """Updates with batches drawn on the device: `count` of them with each call."""
     import torch
 
-    from learner.device_table import DeviceTable
-    from learner.recorded import captured, cuda_graph
+    from coop.learner.device_table import DeviceTable
+    from coop.learner.recorded import captured, cuda_graph
 
     table = DeviceTable(spec, 10_000, 16, 3, 0.99, agent.device)
     table._obs.random_(0, 256)
@@ -296,8 +296,8 @@ def part_updates(options: argparse.Namespace) -> None:
     from made_up import random_batch
     from work import ATARI
 
-    from common.process.threads import use_threads
-    from learner.agent import Agent
+    from coop.common.process.threads import use_threads
+    from coop.learner.agent import Agent
 
     use_threads(1)
     device, seconds = options.device, 0.1 if options.quick else 0.6
@@ -342,7 +342,7 @@ def part_profile(options: argparse.Namespace) -> None:
     from torch.profiler import ProfilerActivity, profile
     from work import ATARI
 
-    from learner.agent import Agent
+    from coop.learner.agent import Agent
 
     activities = [ProfilerActivity.CUDA if options.device != "cpu" else ProfilerActivity.CPU]
     lines: list[str] = []
@@ -372,11 +372,11 @@ def part_pieces(options: argparse.Namespace) -> None:
     import torch
     from work import ATARI
 
-    from learner.agent import Agent
-    from learner.device_table import DeviceTable
-    from learner.edl.transforms import Transforms
-    from learner.losses import output_error, td_errors
-    from learner.recorded import cuda_graph
+    from coop.learner.agent import Agent
+    from coop.learner.device_table import DeviceTable
+    from coop.learner.edl.transforms import Transforms
+    from coop.learner.losses import output_error, td_errors
+    from coop.learner.recorded import cuda_graph
 
     on_gpu, count = options.device != "cpu", 20 if options.device != "cpu" else 1
     for batch in (4,) if options.quick else (32, 512):
@@ -506,7 +506,7 @@ def part_acting(options: argparse.Namespace) -> None:
     import numpy as np
     from work import ATARI
 
-    from common.networks.network import FlatNetwork, build_network
+    from coop.common.networks.network import FlatNetwork, build_network
 
     network = FlatNetwork(build_network("nature", ATARI, (), 0).to(options.device))
     obs = np.random.default_rng(0).integers(0, 256, (64, 4, 84, 84)).astype(np.uint8)
@@ -551,7 +551,7 @@ def part_run(options: argparse.Namespace) -> None:
         flags += ["--replay.learning-starts", "1000", "--replay.capacity", "10000", "--actors", str(actors)]
         if options.quick:
             flags += ["--network.kind", "nips2013"]
-        command = [sys.executable, "-m", "deploy.commands", "coop-local", *flags, "--run-dir", f"{folder}/run"]
+        command = [sys.executable, "-m", "coop.deploy.commands", "coop-local", *flags, "--run-dir", f"{folder}/run"]
         process = subprocess.Popen(command, stdout=sys.stderr, stderr=subprocess.STDOUT)
         busy, rows = [], []
         began = time.monotonic()

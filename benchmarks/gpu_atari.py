@@ -94,9 +94,9 @@ class Run:
     def __init__(self, options: argparse.Namespace, method: str) -> None:
         import torch
 
-        from common.process.threads import use_threads
-        from learner.agent import Agent
-        from learner.device_table import DeviceTable
+        from coop.common.process.threads import use_threads
+        from coop.learner.agent import Agent
+        from coop.learner.device_table import DeviceTable
 
         use_threads(1)
         self.method, self.out, self.starts = method, options.out, options.starts
@@ -189,7 +189,7 @@ class Run:
 
     def _update(self) -> None:
         """The updates of a step of all emulators: on a GPU one graph for each acting role."""
-        from learner.recorded import cuda_graph
+        from coop.learner.recorded import cuda_graph
 
         agent, acting = self.agent, self.agent.acting
 
@@ -263,8 +263,8 @@ class Emulators:
         import numpy as np
         from gymnasium.vector import AutoresetMode
 
-        from common.envs.atari import _emulators, atari_spec
-        from common.envs.make import _atari_game
+        from coop.common.envs.atari import _emulators, atari_spec
+        from coop.common.envs.make import _atari_game
 
         game = _atari_game(config.env)
         self.spec = atari_spec(config.env, game)
@@ -297,7 +297,7 @@ class Emulators:
 
 def settings(options: argparse.Namespace, method: str) -> Any:
     """The preset's, but for the buffer, the optimizer, s, and the exploration of so short a run."""
-    from common.settings.tables import load_tables, resolve
+    from coop.common.settings.tables import load_tables, resolve
 
     tables = load_tables("pong", None)
     tables.pop("methods", None)

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from common.errors import RunError
+from coop.common.errors import RunError
 
 WIRE = "wire"  # a host's interface; the other end, in the switch, has the host's name
 BRIDGE = "bridge0"

@@ -19,18 +19,18 @@ from pathlib import Path
 import msgspec
 from made_up import ATARI, segments
 
-from common.messaging.insert_client import InsertClient
-from common.messaging.keys import replay_key
-from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Node, new_incarnation
-from common.process.lifecycle import Stop
-from common.process.memory import keep_freed_memory
-from common.process.processes import ChildProcess, command, free_endpoint
-from common.settings.tables import validated
-from learner.join_service import JoinService
-from learner.roster import Roster
-from learner.shared_epochs import SharedEpochs
+from coop.common.messaging.insert_client import InsertClient
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
+from coop.common.process.lifecycle import Stop
+from coop.common.process.memory import keep_freed_memory
+from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.common.settings.tables import validated
+from coop.learner.join_service import JoinService
+from coop.learner.roster import Roster
+from coop.learner.shared_epochs import SharedEpochs
 
 STEPS, WINDOW, CAPACITY = 64, 16, 5000
 TICKS = os.sysconf("SC_CLK_TCK")

@@ -8,7 +8,7 @@ from itertools import count
 import msgspec
 import numpy as np
 
-from common.types import Batch, EnvSpec, Segment
+from coop.common.types import Batch, EnvSpec, Segment
 
 ATARI = EnvSpec("Atari", (84, 84), "uint8", 4, 4)
 

@@ -1,4 +1,4 @@
-"""Mutation testing of the algorithm: `make mutants`; `python benchmarks/mutants.py 'learner.trainer*'` is a part of it.
+"""Mutation testing of the algorithm: `make mutants`; `python benchmarks/mutants.py 'coop.learner.trainer*'` is a part of it.
 
 mutmut (extra `mutants`) changes one place at a time of the files named in pyproject.toml and runs the tests that reach
 it; texts of errors stay. For each file the table gives the mutants made, killed, and killed by their time limit. A
@@ -80,7 +80,7 @@ def tally(file: str, statuses: dict[str, int | None], justified: set[Change]) ->
 def main() -> None:
     """Run the mutants and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="mutants to run, such as 'learner.trainer*'; all if not given")
+    parser.add_argument("names", nargs="*", help="mutants to run, such as 'coop.learner.trainer*'; all if not given")
     parser.add_argument("--report", action="store_true", help="print the table of what has been run before")
     options = parser.parse_args()
     if not options.report:

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgpack
 
-from common.messaging import wire
+from coop.common.messaging import wire
 
 _PREFIX = struct.Struct("<II")
 _NASTY: tuple[Any, ...] = (

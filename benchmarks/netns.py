@@ -23,8 +23,8 @@ from audit import audit
 from hosts import Host, hosts_of, network_of, write_names
 from roles import Roles, RunWatch, running, wait_until
 
-from common.errors import CoopError, RunError
-from common.process.processes import command
+from coop.common.errors import CoopError, RunError
+from coop.common.process.processes import command
 
 RUN = "netns"
 PLACES = {"learner": "head", "replay": "rep", "actor 1": "act1", "actor 2": "act2"}

@@ -24,7 +24,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from common.process.processes import command
+from coop.common.process.processes import command
 
 EVERY = 1000  # updates between checkpoints
 GRID = 'preset = "cartpole"\nmethods = ["dqn"]\nseeds = {seeds}\n[fixed]\ntotal_steps = {steps}\n'

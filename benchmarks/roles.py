@@ -11,13 +11,13 @@ from typing import Any, Self
 
 import zenoh
 
-from common.errors import RunError
-from common.messaging import wire
-from common.messaging.keys import replay_key
-from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.transport import Node
-from common.process.processes import ChildProcess, command
-from common.process.summaries import read_summary
+from coop.common.errors import RunError
+from coop.common.messaging import wire
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.transport import Node
+from coop.common.process.processes import ChildProcess, command
+from coop.records.summaries import read_summary
 
 GRACE = 60.0  # seconds for a role to end
 

@@ -18,8 +18,8 @@ from statistics import median
 
 from roles import Roles, running
 
-from common.errors import CoopError, RunError
-from common.process.processes import free_endpoint
+from coop.common.errors import CoopError, RunError
+from coop.common.process.processes import free_endpoint
 
 ACTORS = 2
 WARM_UP = 60.0  # seconds

@@ -18,20 +18,20 @@ import zenoh
 from made_up import ATARI, segments
 from zenoh.handlers import FifoChannel, RingChannel
 
-from actors.weights import GRACE
-from common.errors import RunError
-from common.messaging import wire
-from common.messaging.insert_client import INSERT_TIMEOUT
-from common.messaging.joining import RETRY_PAUSE
-from common.messaging.keys import join_key, replay_key, role_key, run_key, status_key, weights_key
-from common.messaging.members import ROUTE
-from common.messaging.messages.answers import Ack
-from common.messaging.messages.insert import encode_segment
-from common.messaging.messages.join import Join, Leave
-from common.messaging.messages.status import ActorStatus
-from common.messaging.messages.weights import Current, Role
-from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Pending, new_incarnation
+from coop.actors.weights import GRACE
+from coop.common.errors import RunError
+from coop.common.messaging import wire
+from coop.common.messaging.insert_client import INSERT_TIMEOUT
+from coop.common.messaging.joining import RETRY_PAUSE
+from coop.common.messaging.keys import join_key, replay_key, role_key, run_key, status_key, weights_key
+from coop.common.messaging.members import ROUTE
+from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.messages.insert import encode_segment
+from coop.common.messaging.messages.join import Join, Leave
+from coop.common.messaging.messages.status import ActorStatus
+from coop.common.messaging.messages.weights import Current, Role
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Pending, new_incarnation
 
 STEPS, STREAMS = 32, 8  # of a segment; emulators of an actor
 WINDOW = 2 * STREAMS  # segments in flight, as many as an actor has by default

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from common.bounds import (
+from coop.common.bounds import (
     MAX_COUNT,
     MAX_ENV_ID,
     MAX_FLOAT32,
@@ -21,21 +21,21 @@ from common.bounds import (
     MAX_STREAMS,
     MAX_UPDATES,
 )
-from common.errors import BadMessage
-from common.messaging.keys import evaluations_key, join_key, replay_key, role_key, stop_key, weights_key
-from common.messaging.members import Origin
-from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
-from common.messaging.messages.insert import SegmentReader, encode_segment
-from common.messaging.messages.join import Join, Joined
-from common.messaging.messages.limits import Limit, LimitsQuestion
-from common.messaging.messages.sample import DrawRequest
-from common.messaging.messages.stats import StatsQuestion
-from common.messaging.messages.stop import EndOfRun
-from common.messaging.messages.weights import Current
-from common.messaging.transport import Node
-from common.messaging.wire import Message
-from common.types import EnvSpec, EpisodeEnd, Segment
+from coop.common.errors import BadMessage
+from coop.common.messaging.keys import evaluations_key, join_key, replay_key, role_key, stop_key, weights_key
+from coop.common.messaging.members import Origin
+from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
+from coop.common.messaging.messages.insert import SegmentReader, encode_segment
+from coop.common.messaging.messages.join import Join, Joined
+from coop.common.messaging.messages.limits import Limit, LimitsQuestion
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.stats import StatsQuestion
+from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.weights import Current
+from coop.common.messaging.transport import Node
+from coop.common.messaging.wire import Message
+from coop.common.types import EnvSpec, EpisodeEnd, Segment
 
 RUN = "fuzz"
 

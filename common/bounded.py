@@ -10,7 +10,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from common.bounds import MAX_COUNT, MAX_ENV_ID, MAX_FLOAT32, MAX_INTEGER, MAX_UPDATES
+from coop.common.bounds import MAX_COUNT, MAX_ENV_ID, MAX_FLOAT32, MAX_INTEGER, MAX_UPDATES
 
 Incarnation = Annotated[int, Meta(ge=0, le=MAX_INTEGER)]
 Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]

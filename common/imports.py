@@ -18,8 +18,8 @@ from secrets import token_hex
 from types import ModuleType
 from typing import Any
 
-from common.errors import JoinError, UsageError
-from common.places import working_directory
+from coop.common.errors import JoinError, UsageError
+from coop.common.places import working_directory
 
 _handed_over: list[Path] = []  # folders of runs whose settings this process reads
 _named: set[str] = set()  # modules that this process's user permits

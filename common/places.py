@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from common.errors import UsageError
+from coop.common.errors import UsageError
 
 _started_in: Path | None = None
 

@@ -11,8 +11,8 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from common.bounded import Count, Float32, Incarnation, Name, Share
-from common.bounds import (
+from coop.common.bounded import Count, Float32, Incarnation, Name, Share
+from coop.common.bounds import (
     MAX_ACTIONS,
     MAX_COUNT,
     MAX_RETURN,

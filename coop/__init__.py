@@ -14,14 +14,14 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from common.errors import CoopError, RunError, UsageError
-from common.places import absolute
-from common.settings.config import RunConfig
-from common.settings.methods import METHODS, Method
-from experiments.evaluation import Evaluation, evaluate
-from experiments.saved import SavedPolicy, SavedRun
-from experiments.sweep.run import SweepResult, sweep
-from experiments.training import TrainingRun, train
+from coop.common.errors import CoopError, RunError, UsageError
+from coop.common.places import absolute
+from coop.common.settings.config import RunConfig
+from coop.common.settings.methods import METHODS, Method
+from coop.evaluation.evaluate import Evaluation, evaluate
+from coop.evaluation.saved import SavedPolicy, SavedRun
+from coop.studies.sweep.run import SweepResult, sweep
+from coop.training import TrainingRun, train
 
 __all__ = [
     "CoopError",

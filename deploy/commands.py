@@ -1,6 +1,6 @@
 """The console commands: what each process sets up before anything else, and the imports, which take seconds.
 
-`python -m deploy.commands coop-local ...` starts one where no scripts are installed.
+`python -m coop.deploy.commands coop-local ...` starts one where no scripts are installed.
 """
 
 from __future__ import annotations
@@ -9,26 +9,26 @@ import importlib
 import sys
 from pathlib import Path
 
-from common.places import remember_working_directory
-from common.process.importing import importing
-from common.process.lifecycle import despite_threads, end_on_signals
-from common.process.limits import limit_threads
-from common.process.output import take_standard_files
+from coop.common.places import remember_working_directory
+from coop.common.process.importing import importing
+from coop.common.process.lifecycle import despite_threads, end_on_signals
+from coop.common.process.limits import limit_threads
+from coop.common.process.output import take_standard_files
 
 MODULES = {
-    "coop-actor": "actors.cli",
-    "coop-eval": "experiments.evaluation_cli",
-    "coop-export": "experiments.export_cli",
-    "coop-learner": "learner.cli",
-    "coop-limits": "replay.limits_cli",
-    "coop-local": "deploy.local",
-    "coop-lockstep": "experiments.lockstep_cli",
-    "coop-reexecute": "experiments.reexecute_cli",
-    "coop-replay": "replay.cli",
-    "coop-report": "experiments.report.cli",
-    "coop-router": "deploy.router",
-    "coop-sweep": "experiments.sweep.cli",
-    "coop-watch": "deploy.watch",
+    "coop-actor": "coop.actors.cli",
+    "coop-eval": "coop.evaluation.cli",
+    "coop-export": "coop.evaluation.export_cli",
+    "coop-learner": "coop.learner.cli",
+    "coop-limits": "coop.replay.limits_cli",
+    "coop-local": "coop.deploy.local",
+    "coop-lockstep": "coop.lockstep.cli",
+    "coop-reexecute": "coop.lockstep.reexecute_cli",
+    "coop-replay": "coop.replay.cli",
+    "coop-report": "coop.studies.report.cli",
+    "coop-router": "coop.deploy.router",
+    "coop-sweep": "coop.studies.sweep.cli",
+    "coop-watch": "coop.monitor.watch",
 }
 
 
@@ -48,5 +48,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.argv = sys.argv[1:] or ["python -m deploy.commands"]
+    sys.argv = sys.argv[1:] or ["python -m coop.deploy.commands"]
     main()

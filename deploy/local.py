@@ -6,24 +6,24 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.envs.make import check_filmed, env_spec
-from common.errors import RunError, UsageError
-from common.messaging.transport import new_incarnation
-from common.places import shown
-from common.process.console import say, stamped
-from common.process.files import make_folder, write_atomic
-from common.process.flags import HttpAddress
-from common.process.lifecycle import Stop, run_main
-from common.process.locks import RunLock
-from common.process.ports import check_can_listen, check_loopback
-from common.process.processes import ChildProcess, command, free_endpoint
-from common.settings.capacity import check_memory, check_messages
-from common.settings.config import RunConfig, check_distributed
-from common.settings.options import LearnerRunOptions, parse_run
-from common.settings.resuming import settings_digest
-from common.settings.tables import to_toml
-from deploy.status import Display, Page, RunStatus, live_page
-from deploy.supervisor import RestartPolicy
+from coop.common.envs.make import check_filmed, env_spec
+from coop.common.errors import RunError, UsageError
+from coop.common.messaging.transport import new_incarnation
+from coop.common.places import shown
+from coop.common.process.console import say, stamped
+from coop.common.process.files import make_folder, write_atomic
+from coop.common.process.flags import HttpAddress
+from coop.common.process.lifecycle import Stop, run_main
+from coop.common.process.ports import check_can_listen, check_loopback
+from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.common.settings.capacity import check_memory, check_messages
+from coop.common.settings.config import RunConfig, check_distributed
+from coop.common.settings.resuming import settings_digest
+from coop.common.settings.tables import to_toml
+from coop.deploy.supervisor import RestartPolicy
+from coop.monitor.status import Display, Page, RunStatus, live_page
+from coop.records.locks import RunLock
+from coop.records.run_options import LearnerRunOptions, parse_run
 
 TICK = 0.1  # seconds
 GRACE = 30.0  # seconds for a role's clean stop

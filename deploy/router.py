@@ -7,13 +7,13 @@ from pathlib import Path
 
 import zenoh
 
-from common.messaging.links import close, described
-from common.messaging.session import open_session
-from common.process import cli
-from common.process.console import Console, counted
-from common.process.health import answering
-from common.process.lifecycle import Stop, run_main
-from common.settings.options import HealthOptions
+from coop.common.messaging.links import close, described
+from coop.common.messaging.session import open_session
+from coop.common.process import cli
+from coop.common.process.console import Console, counted
+from coop.common.process.lifecycle import Stop, run_main
+from coop.monitor.health import answering
+from coop.records.run_options import HealthOptions
 
 TICK = 0.5  # seconds
 

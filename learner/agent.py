@@ -1,6 +1,6 @@
 """The learner of Algorithm 1: two networks, one of which acts and is trained, and the swap of their roles.
 
-The methods (`common.settings.methods`) differ only in these:
+The methods (`coop.common.settings.methods`) differ only in these:
 
     method   second network   target             feedback                              extra cost
     dqn      copy of first    copied every C     none                                  none
@@ -9,7 +9,7 @@ The methods (`common.settings.methods`) differ only in these:
     coop     independent      the other network  transform | weight-gradient | random  none
     medqn    copy of first    copied every C     none                                  Q away from the target network's
 
-A method without a replay buffer has an agent of its own (`learner.methods.stream_q`).
+A method without a replay buffer has an agent of its own (`coop.learner.methods.stream_q`).
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.errors import UsageError, first_line
-from common.networks.network import FlatNetwork
-from common.process.notices import warn
-from common.process.randomness import generator_state, set_generator_state
-from common.registry import loaded
-from common.settings import schedules
-from common.settings.config import RunConfig
-from common.settings.methods import METHODS
-from common.types import Array, Batch, EnvSpec
-from learner.edl.arrays import convert_like
-from learner.edl.beside import Branches
-from learner.given import Given
-from learner.losses import LOSSES, Values, output_error, td_errors
-from learner.methods.rule import Rule
-from learner.optimizers import make_optimizer
-from learner.qnetwork import as_float32, make_q_network, on_host
-from learner.recorded import Capture, Late, Recorded, cuda_graph
+from coop.common.errors import UsageError, first_line
+from coop.common.networks.network import FlatNetwork
+from coop.common.process.notices import warn
+from coop.common.process.randomness import generator_state, set_generator_state
+from coop.common.registry import loaded
+from coop.common.settings import schedules
+from coop.common.settings.config import RunConfig
+from coop.common.settings.methods import METHODS
+from coop.common.types import Array, Batch, EnvSpec
+from coop.learner.edl.arrays import convert_like
+from coop.learner.edl.beside import Branches
+from coop.learner.given import Given
+from coop.learner.losses import LOSSES, Values, output_error, td_errors
+from coop.learner.methods.rule import Rule
+from coop.learner.optimizers import make_optimizer
+from coop.learner.qnetwork import as_float32, make_q_network, on_host
+from coop.learner.recorded import Capture, Late, Recorded, cuda_graph
 
 LAG = 16  # updates of a GPU after which their TD errors are read
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from common.messaging.keys import role_key, weights_key
-from common.messaging.messages.weights import Current, Role, Weights
-from common.messaging.transport import Node
-from common.messaging.wire import Message
-from learner.protocol import Agent
+from coop.common.messaging.keys import role_key, weights_key
+from coop.common.messaging.messages.weights import Current, Role, Weights
+from coop.common.messaging.transport import Node
+from coop.common.messaging.wire import Message
+from coop.learner.protocol import Agent
 
 
 class Broadcaster:

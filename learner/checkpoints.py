@@ -7,18 +7,18 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from common.errors import CoopError, RunError
-from common.messaging.keys import replay_key
-from common.messaging.messages.answers import Retry
-from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.sample_client import SampleClient
-from common.messaging.transport import NoAnswer, Node
-from common.messaging.wire import Message
-from common.process.checkpoints import DONE, KEPT, checkpoint_numbers
-from common.process.files import Measured
-from learner.records.epochs import save_epoch
-from learner.records.run_directory import RunDirectory
-from learner.shared_epochs import SharedEpochs
+from coop.common.errors import CoopError, RunError
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.answers import Retry
+from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.transport import NoAnswer, Node
+from coop.common.messaging.wire import Message
+from coop.common.process.files import Measured
+from coop.learner.shared_epochs import SharedEpochs
+from coop.records.checkpoints import DONE, KEPT, checkpoint_numbers
+from coop.records.kept import save_epoch
+from coop.records.run_directory import RunDirectory
 
 PATIENCE = 5.0  # seconds to wait for the replay service's answer
 PAUSE = 0.05  # seconds between requests

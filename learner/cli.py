@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.envs.make import env_spec
-from common.errors import UsageError
-from common.process.importing import importing
-from common.process.lifecycle import run_main
-from common.process.ports import check_can_listen
-from common.settings.capacity import check_messages
-from common.settings.config import check_distributed
-from common.settings.options import HealthOptions, LearnerRunOptions, parse_run
+from coop.common.envs.make import env_spec
+from coop.common.errors import UsageError
+from coop.common.process.importing import importing
+from coop.common.process.lifecycle import run_main
+from coop.common.process.ports import check_can_listen
+from coop.common.settings.capacity import check_messages
+from coop.common.settings.config import check_distributed
+from coop.records.run_options import HealthOptions, LearnerRunOptions, parse_run
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,6 @@ def _run() -> None:
     spec = env_spec(config.env)
     check_messages(config, spec)
     with importing():
-        from learner.process import learn  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+        from coop.learner.process import learn  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 
     learn(options, config, spec)

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from common.types import EnvSpec
-from learner.edl import kernels
-from learner.given import Given
-from learner.losses import Columns
+from coop.common.types import EnvSpec
+from coop.learner.edl import kernels
+from coop.learner.given import Given
+from coop.learner.losses import Columns
 
 
 class DeviceTable:

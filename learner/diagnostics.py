@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from common.networks.inputs import preprocess
-from common.types import Batch
-from learner.losses import columns, td_errors
-from learner.protocol import Agent
-from learner.qnetwork import on_host
+from coop.common.networks.inputs import preprocess
+from coop.common.types import Batch
+from coop.learner.losses import columns, td_errors
+from coop.learner.protocol import Agent
+from coop.learner.qnetwork import on_host
 
 ARCHIVED = 64  # transitions
 RANK_STATES = 32  # of the archive: no effective rank is larger; its time grows with their cube

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from queue import Empty, SimpleQueue
 
-from common.errors import RunError
-from common.messaging.keys import evaluations_key
-from common.messaging.messages.answers import Ack
-from common.messaging.messages.evaluate import Evaluated, EvaluationRow, Video
-from common.messaging.transport import Node
-from common.messaging.wire import Message
+from coop.common.errors import RunError
+from coop.common.messaging.keys import evaluations_key
+from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow, Video
+from coop.common.messaging.transport import Node
+from coop.common.messaging.wire import Message
 
 
 class EvaluationInbox:

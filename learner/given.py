@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from common.types import Batch
-from learner.losses import Columns, columns
+from coop.common.types import Batch
+from coop.learner.losses import Columns, columns
 
 
 class Given(NamedTuple):

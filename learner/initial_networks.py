@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from common.errors import UsageError
-from common.places import absolute
-from common.process.untrusted import check_links
-from learner.protocol import Agent
-from learner.records.epochs import fitting, newest_epoch
+from coop.common.errors import UsageError
+from coop.common.places import absolute
+from coop.common.process.untrusted import check_links
+from coop.learner.protocol import Agent
+from coop.records.kept import fitting, newest_epoch
 
 
 def load_initial_networks(agent: Agent) -> None:

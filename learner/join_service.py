@@ -7,19 +7,19 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from common.errors import BadMessage
-from common.messaging.keys import join_key
-from common.messaging.members import JOINING, ROLES, Origin
-from common.messaging.messages.answers import Retry
-from common.messaging.messages.join import Farewell, Join, Joined, Leave
-from common.messaging.transport import Node
-from common.messaging.wire import Message
-from common.settings.config import RunConfig
-from common.settings.tables import to_tables
-from common.types import EnvSpec
-from learner.members import MemberTracker
-from learner.roster import AlreadyServed, Roster
-from learner.shared_epochs import SharedEpochs
+from coop.common.errors import BadMessage
+from coop.common.messaging.keys import join_key
+from coop.common.messaging.members import JOINING, ROLES, Origin
+from coop.common.messaging.messages.answers import Retry
+from coop.common.messaging.messages.join import Farewell, Join, Joined, Leave
+from coop.common.messaging.transport import Node
+from coop.common.messaging.wire import Message
+from coop.common.settings.config import RunConfig
+from coop.common.settings.tables import to_tables
+from coop.common.types import EnvSpec
+from coop.learner.members import MemberTracker
+from coop.learner.roster import AlreadyServed, Roster
+from coop.learner.shared_epochs import SharedEpochs
 
 
 class Departure:

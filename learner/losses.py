@@ -8,8 +8,8 @@ from typing import Any, Generic, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Batch
-from learner.edl.arrays import ArrayT, chosen, namespace, placed
+from coop.common.types import Batch
+from coop.learner.edl.arrays import ArrayT, chosen, namespace, placed
 
 Values = NDArray[np.float32]
 

@@ -6,9 +6,9 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from common.messaging.members import ROLES, Origin
-from common.messaging.messages.join import Join
-from common.messaging.messages.status import ActorStatus, Member
+from coop.common.messaging.members import ROLES, Origin
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.status import ActorStatus, Member
 
 FORGOTTEN = 60.0  # seconds after which a lost member is no longer listed as missing
 

@@ -13,9 +13,9 @@ from typing import Generic
 import torch
 from torch import Tensor
 
-from common.settings.config import LearnerSettings
-from learner.edl import kernels
-from learner.edl.arrays import ArrayT, Namespace, assign, namespace
+from coop.common.settings.config import LearnerSettings
+from coop.learner.edl import kernels
+from coop.learner.edl.arrays import ArrayT, Namespace, assign, namespace
 
 _TINY = 1e-37  # below any square that matters, above the denormals
 

@@ -5,33 +5,33 @@ from __future__ import annotations
 import time
 from contextlib import AbstractContextManager, nullcontext
 
-from common.errors import RunError, UsageError
-from common.messaging.links import locators
-from common.messaging.mirror import FrameMirror
-from common.messaging.sample_client import SampleClient
-from common.messaging.session import SHORT_QUEUE, open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.console import Console, say
-from common.process.health import answering
-from common.process.lifecycle import Stop
-from common.process.locks import RunLock
-from common.process.resumption import Survey
-from common.process.threads import use_threads
-from common.settings.capacity import mirror_slots
-from common.settings.config import RunConfig
-from common.settings.resuming import settings_digest
-from common.types import EnvSpec
-from learner.agent import Agent
-from learner.checkpoints import Checkpoints
-from learner.cli import LearnerOptions
-from learner.initial_networks import load_initial_networks
-from learner.join_service import JoinService
-from learner.records.epochs import fitting, load_learner
-from learner.records.run_directory import RunDirectory, claim_run_directory
-from learner.roster import Roster
-from learner.service import LearnerService
-from learner.shared_epochs import SharedEpochs
-from learner.trainer import Trainer
+from coop.common.errors import RunError, UsageError
+from coop.common.messaging.links import locators
+from coop.common.messaging.mirror import FrameMirror
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.session import SHORT_QUEUE, open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.console import Console, say
+from coop.common.process.lifecycle import Stop
+from coop.common.process.threads import use_threads
+from coop.common.settings.capacity import mirror_slots
+from coop.common.settings.config import RunConfig
+from coop.common.settings.resuming import settings_digest
+from coop.common.types import EnvSpec
+from coop.learner.agent import Agent
+from coop.learner.checkpoints import Checkpoints
+from coop.learner.cli import LearnerOptions
+from coop.learner.initial_networks import load_initial_networks
+from coop.learner.join_service import JoinService
+from coop.learner.roster import Roster
+from coop.learner.service import LearnerService
+from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.trainer import Trainer
+from coop.monitor.health import answering
+from coop.records.kept import fitting, load_learner
+from coop.records.locks import RunLock
+from coop.records.resumption import Survey
+from coop.records.run_directory import RunDirectory, claim_run_directory
 
 
 def learn(options: LearnerOptions, config: RunConfig, spec: EnvSpec) -> None:
@@ -131,7 +131,7 @@ def _exported(address: str, service: LearnerService) -> AbstractContextManager[o
     """Serve the learner's status to Prometheus; nothing if the address is empty."""
     if not address:
         return nullcontext()
-    from learner.exporter import exported  # noqa: PLC0415 (an extra)
+    from coop.monitor.exporter import exported  # noqa: PLC0415 (an extra)
 
     return exported(address, service.status)
 

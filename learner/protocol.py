@@ -7,16 +7,16 @@ from typing import Any, Protocol
 
 import torch
 
-from common.networks.network import FlatNetwork
-from common.settings.config import RunConfig
-from common.types import Array, Batch, EnvSpec
-from learner.agent import Update
-from learner.losses import Loss, Values
-from learner.methods.rule import Rule
+from coop.common.networks.network import FlatNetwork
+from coop.common.settings.config import RunConfig
+from coop.common.types import Array, Batch, EnvSpec
+from coop.learner.agent import Update
+from coop.learner.losses import Loss, Values
+from coop.learner.methods.rule import Rule
 
 
 class Agent(Protocol):
-    """See `learner.agent.Agent` for the attributes."""
+    """See `coop.learner.agent.Agent` for the attributes."""
 
     config: RunConfig
     spec: EnvSpec

@@ -9,19 +9,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.errors import UsageError
-from common.networks.inputs import preprocess
-from common.networks.network import FlatNetwork, sample_inputs
-from common.registry import loaded
-from common.settings.config import RunConfig
-from common.settings.methods import METHODS
-from common.types import EnvSpec
-from learner.edl import kernels
-from learner.edl.arrays import AnyArray, assign, convert_like
-from learner.edl.feedback import FeedbackRule
-from learner.edl.graph import Graph
-from learner.edl.passes import Tape, UnsupportedLayerError
-from learner.edl.trainable import Trainable
+from coop.common.errors import UsageError
+from coop.common.networks.inputs import preprocess
+from coop.common.networks.network import FlatNetwork, sample_inputs
+from coop.common.registry import loaded
+from coop.common.settings.config import RunConfig
+from coop.common.settings.methods import METHODS
+from coop.common.types import EnvSpec
+from coop.learner.edl import kernels
+from coop.learner.edl.arrays import AnyArray, assign, convert_like
+from coop.learner.edl.feedback import FeedbackRule
+from coop.learner.edl.graph import Graph
+from coop.learner.edl.passes import Tape, UnsupportedLayerError
+from coop.learner.edl.trainable import Trainable
 
 
 class QNetwork:

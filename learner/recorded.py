@@ -17,13 +17,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from common.errors import first_line
-from common.process.notices import warn
-from common.settings.config import RunConfig
-from common.types import Batch, EnvSpec
-from learner.edl.beside import branching
-from learner.given import Given, indices
-from learner.losses import Columns, Values, columns
+from coop.common.errors import first_line
+from coop.common.process.notices import warn
+from coop.common.settings.config import RunConfig
+from coop.common.types import Batch, EnvSpec
+from coop.learner.edl.beside import branching
+from coop.learner.given import Given, indices
+from coop.learner.losses import Columns, Values, columns
 
 Capture = Callable[[Callable[[], None], torch.device], Callable[[], None]]
 """Makes a function without arguments, of a device, repeatable; it may run before, but does not while it is recorded."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from common.bounds import MAX_POINTS
+from coop.common.bounds import MAX_POINTS
 
 
 class ReturnHistory:

@@ -12,12 +12,12 @@ from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from common.errors import BadMessage, RunError
-from common.messaging.members import Origin
-from common.messaging.messages.join import Join
-from common.messaging.presence import LEASE
-from common.process.files import sealed, unsealed, write_atomic
-from common.process.run_ids import check_owner
+from coop.common.errors import BadMessage, RunError
+from coop.common.messaging.members import Origin
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.presence import LEASE
+from coop.common.process.files import sealed, unsealed, write_atomic
+from coop.records.run_ids import check_owner
 
 ROSTER = "roster.json"
 RESERVE = 8  # a roster of n actors saves n / 8 numbers in advance, which a restarted learner leaves out

@@ -7,24 +7,24 @@ from typing import Any
 
 import msgspec
 
-from common.errors import RunError
-from common.messaging.keys import replay_key, stop_key
-from common.messaging.messages.evaluate import EvaluationRow
-from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.messages.status import LearnerStatus
-from common.messaging.messages.stop import EndOfRun
-from common.messaging.sample_client import SampleClient
-from common.messaging.transport import NoAnswer, Node
-from common.process.console import Console, progress_line
-from common.process.lifecycle import Stop
-from learner.broadcast import Broadcaster
-from learner.checkpoints import Checkpoints
-from learner.evaluations import EvaluationInbox
-from learner.join_service import JoinService
-from learner.records.run_directory import RunDirectory
-from learner.records.summary import Summary, summarise
-from learner.status import StatusReporter
-from learner.trainer import Effects, Trainer
+from coop.common.errors import RunError
+from coop.common.messaging.keys import replay_key, stop_key
+from coop.common.messaging.messages.evaluate import EvaluationRow
+from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import LearnerStatus
+from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.transport import NoAnswer, Node
+from coop.common.process.console import Console, progress_line
+from coop.common.process.lifecycle import Stop
+from coop.learner.broadcast import Broadcaster
+from coop.learner.checkpoints import Checkpoints
+from coop.learner.evaluations import EvaluationInbox
+from coop.learner.join_service import JoinService
+from coop.learner.status import StatusReporter
+from coop.learner.trainer import Effects, Trainer
+from coop.records.run_directory import RunDirectory
+from coop.records.summary import Summary, summarise
 
 STATUS_EVERY = 0.5  # seconds
 REPLAY_BACK = 30.0  # seconds to wait for an absent replay service when the run is complete

@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 
-from common.errors import UsageError
-from common.messaging.messages.join import Join
-from common.process.lifecycle import Stop
+from coop.common.errors import UsageError
+from coop.common.messaging.messages.join import Join
+from coop.common.process.lifecycle import Stop
 
 LOOK_EVERY = 0.1  # seconds
 REFUSAL = 0.5  # seconds for the refusal to reach the replay service before this process ends

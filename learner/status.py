@@ -7,10 +7,10 @@ from typing import Any
 
 import msgspec
 
-from common.errors import BadMessage
-from common.messaging.keys import incarnation_of, status_key
-from common.messaging.members import Origin
-from common.messaging.messages.status import (
+from coop.common.errors import BadMessage
+from coop.common.messaging.keys import incarnation_of, status_key
+from coop.common.messaging.members import Origin
+from coop.common.messaging.messages.status import (
     MAX_MEMBERS,
     ActorStatus,
     Held,
@@ -20,12 +20,12 @@ from common.messaging.messages.status import (
     ReplayStatus,
     Wait,
 )
-from common.messaging.sample_client import SampleClient
-from common.messaging.transport import Node
-from common.process.console import Console
-from common.process.rates import Rate
-from learner.join_service import JoinService
-from learner.trainer import Trainer
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.transport import Node
+from coop.common.process.console import Console
+from coop.common.process.rates import Rate
+from coop.learner.join_service import JoinService
+from coop.learner.trainer import Trainer
 
 SPEED_OVER = 2.0  # seconds
 TIME_LEFT_OVER = 30.0  # seconds whose speed gives the time left

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messaging.messages.sample import Drawn
-from common.returns import RETURN_WINDOW
-from common.types import Array, Batch
-from learner.diagnostics import Diagnostics
-from learner.losses import Values
-from learner.protocol import Agent
-from learner.return_history import ReturnHistory
+from coop.common.messaging.messages.sample import Drawn
+from coop.common.numbers import RETURN_WINDOW
+from coop.common.types import Array, Batch
+from coop.learner.diagnostics import Diagnostics
+from coop.learner.losses import Values
+from coop.learner.protocol import Agent
+from coop.learner.return_history import ReturnHistory
 
 
 class Telemetry:

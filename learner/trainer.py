@@ -16,12 +16,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messaging.messages.sample import Drawn, EpisodeRecord
-from common.returns import METRICS_EVERY
-from common.types import Batch
-from learner.agent import Update
-from learner.protocol import Agent
-from learner.telemetry import Telemetry
+from coop.common.messaging.messages.sample import Drawn, EpisodeRecord
+from coop.common.numbers import METRICS_EVERY
+from coop.common.types import Batch
+from coop.learner.agent import Update
+from coop.learner.protocol import Agent
+from coop.learner.telemetry import Telemetry
 
 NOTHING_DRAWN = Drawn(0, 0, 0, 0, 0, 0, ())
 

@@ -8,27 +8,27 @@ from pathlib import Path
 
 import msgspec
 
-from common.errors import RunError
-from common.messaging.endpoints import check_endpoints
-from common.messaging.joining import Membership, join, leave_run
-from common.messaging.links import locators
-from common.messaging.messages.join import MOST_EPOCHS, Join, Joined
-from common.messaging.presence import LEASE
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.places import absolute
-from common.process import cli
-from common.process.console import Console
-from common.process.health import answering
-from common.process.lifecycle import Stop, run_main
-from common.process.memory import keep_freed_memory
-from common.settings.options import HealthOptions, RoleOptions
-from replay.core import ReplayCore
-from replay.persistence.epochs import ReplayEpochs
-from replay.persistence.folder import ReplayFolder
-from replay.persistence.journal import Journal
-from replay.persistence.recovery import recover
-from replay.service import ReplayService
+from coop.common.errors import RunError
+from coop.common.messaging.endpoints import check_endpoints
+from coop.common.messaging.joining import Membership, join, leave_run
+from coop.common.messaging.links import locators
+from coop.common.messaging.messages.join import MOST_EPOCHS, Join, Joined
+from coop.common.messaging.presence import LEASE
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.places import absolute
+from coop.common.process import cli
+from coop.common.process.console import Console
+from coop.common.process.lifecycle import Stop, run_main
+from coop.common.process.memory import keep_freed_memory
+from coop.monitor.health import answering
+from coop.records.run_options import HealthOptions, RoleOptions
+from coop.replay.core import ReplayCore
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.folder import ReplayFolder
+from coop.replay.persistence.journal import Journal
+from coop.replay.persistence.recovery import recover
+from coop.replay.service import ReplayService
 
 
 @dataclass(frozen=True)

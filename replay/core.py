@@ -9,17 +9,17 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from common.errors import RunError
-from common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
-from common.settings.capacity import check_memory
-from common.settings.config import RunConfig
-from common.types import Array, Batch, EnvSpec, Segment
-from replay.dedup import DuplicateFilter
-from replay.episodes import EpisodeLog
-from replay.limiter import RateLimiter
-from replay.mirrored import MirroredFrames
-from replay.recorder import NullRecorder, Recorder
-from replay.table.table import PinnedBatch, Table, TableSnapshot
+from coop.common.errors import RunError
+from coop.common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
+from coop.common.settings.capacity import check_memory
+from coop.common.settings.config import RunConfig
+from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.replay.dedup import DuplicateFilter
+from coop.replay.episodes import EpisodeLog
+from coop.replay.limiter import RateLimiter
+from coop.replay.mirrored import MirroredFrames
+from coop.replay.recorder import NullRecorder, Recorder
+from coop.replay.table.table import PinnedBatch, Table, TableSnapshot
 
 LEARNERS_KEPT = 64  # superseded learners, which are refused
 

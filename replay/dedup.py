@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any
 
-from common.bounds import MAX_GAPS, MAX_INTEGER, MAX_STREAMS
+from coop.common.bounds import MAX_GAPS, MAX_INTEGER, MAX_STREAMS
 
 _start = attrgetter("start")
 

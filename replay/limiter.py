@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from math import ceil, floor, isfinite
 from typing import Any
 
-from common.errors import UsageError
+from coop.common.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.errors import RunError
-from common.messaging.joining import join
-from common.messaging.keys import replay_key
-from common.messaging.messages.join import Join
-from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
-from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
-from common.process import cli
-from common.process.lifecycle import Stop, run_main
-from common.process.untrusted import check_run
-from common.settings.options import RoleOptions
+from coop.common.errors import RunError
+from coop.common.messaging.joining import join
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
+from coop.common.process import cli
+from coop.common.process.lifecycle import Stop, run_main
+from coop.common.process.untrusted import check_run
+from coop.records.run_options import RoleOptions
 
 
 @dataclass(frozen=True)

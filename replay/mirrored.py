@@ -1,7 +1,7 @@
 """What the learner's mirror of the table's frames holds, according to the answers that it was sent. Without I/O.
 
 It decides which frames an answer carries. It need not be right: the learner finds out what it lacks, see
-`common.messaging.mirror`, and asks for the same draw again.
+`coop.common.messaging.mirror`, and asks for the same draw again.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messaging.messages.sample import DrawRequest
-from replay.table.frames import Slots
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.replay.table.frames import Slots
 
 
 class MirroredFrames:

@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messaging.messages.sample import DrawRequest
-from replay.limiter import RateLimiter
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.replay.limiter import RateLimiter
 
 
 class Recorder(Protocol):

@@ -15,23 +15,23 @@ from typing import TypeVar
 
 import numpy as np
 
-from common.errors import BadMessage, CoopError, RunError
-from common.messaging.keys import replay_key
-from common.messaging.members import ROUTE
-from common.messaging.messages.answers import Ack, Retry
-from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.messages.insert import SegmentReader
-from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
-from common.messaging.messages.sample import DrawRequest, Draws, Memory, encode_batch, encode_named
-from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.messages.status import Ratio, ReplayStatus
-from common.messaging.transport import Node, new_incarnation
-from common.messaging.wire import Message
-from common.process.console import Console
-from common.process.lifecycle import Stop
-from replay.core import ReplayCore, Reply, Wait
-from replay.gate import HOLD, Gate
-from replay.persistence.epochs import ReplayEpochs
+from coop.common.errors import BadMessage, CoopError, RunError
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.members import ROUTE
+from coop.common.messaging.messages.answers import Ack, Retry
+from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.insert import SegmentReader
+from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from coop.common.messaging.messages.sample import DrawRequest, Draws, Memory, encode_batch, encode_named
+from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import Ratio, ReplayStatus
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.messaging.wire import Message
+from coop.common.process.console import Console
+from coop.common.process.lifecycle import Stop
+from coop.replay.core import ReplayCore, Reply, Wait
+from coop.replay.gate import HOLD, Gate
+from coop.replay.persistence.epochs import ReplayEpochs
 
 LEAVING = "the replay service is stopping"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Array
-from replay.table.frames import PinnedFrames
+from coop.common.types import Array
+from coop.replay.table.frames import PinnedFrames
 
 REUSE_BUCKETS = 16
 _BUCKETS = 2 ** np.arange(REUSE_BUCKETS - 1, dtype=np.int32)  # the fewest draws of each bucket but the first

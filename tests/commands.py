@@ -13,7 +13,7 @@ from pathlib import Path
 TESTS = str(Path(__file__).parent)
 _SERVER = multiprocessing.get_context("forkserver")
 _SERVER.set_forkserver_preload(
-    ["actors.process", "experiments.evaluation", "experiments.lockstep_run", "learner.process"]
+    ["coop.actors.process", "coop.evaluation.evaluate", "coop.lockstep.run", "coop.learner.process"]
 )
 
 

@@ -15,11 +15,11 @@ import hypothesis
 import pytest
 import torch
 
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.threads import use_threads
-from common.settings.methods import METHODS
-from common.types import EnvSpec
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.threads import use_threads
+from coop.common.settings.methods import METHODS
+from coop.common.types import EnvSpec
 
 # torch.compile's own processes would outlive the tests.
 os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"

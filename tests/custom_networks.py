@@ -5,7 +5,7 @@ from math import prod
 import torch
 from torch import Tensor, nn
 
-from common.types import EnvSpec
+from coop.common.types import EnvSpec
 
 
 class Duel(nn.Module):

@@ -16,9 +16,9 @@ from pathlib import Path
 import yaml
 from commands import Command, run_command
 
-from common.process.processes import free_endpoint
-from common.settings.tables import resolve
-from experiments.sweep.grid import parse_grid
+from coop.common.process.processes import free_endpoint
+from coop.common.settings.tables import resolve
+from coop.studies.sweep.grid import parse_grid
 from website.pages import LANGUAGES, ROOT, Block, blocks
 
 TRAINS = ("coop-local", "coop-lockstep", "coop-learner")

@@ -5,12 +5,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from actors.segments import SegmentAssembler
-from common.envs.make import make_vector_env
-from common.envs.protocol import Steps
-from common.messaging.transport import Node
-from common.settings.environment import EnvSettings
-from common.types import Array, EnvSpec, EpisodeEnd, Segment
+from coop.actors.segments import SegmentAssembler
+from coop.common.envs.make import make_vector_env
+from coop.common.envs.protocol import Steps
+from coop.common.messaging.transport import Node
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import Array, EnvSpec, EpisodeEnd, Segment
 
 INCARNATION = 77
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from common.types import Array, Batch, EnvSpec, Segment
-from replay.table.table import Table
+from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.replay.table.table import Table
 
 
 def make_spec(stack: int, dtype: str = "float32", shape: tuple[int, ...] = (2, 3)) -> EnvSpec:

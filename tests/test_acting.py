@@ -6,10 +6,10 @@ import sys
 import numpy as np
 import pytest
 
-from common.networks.acting import Mlp, acting_network
-from common.networks.network import FlatNetwork, build_network, sample_inputs, sample_observations
-from common.settings.config import NetworkSettings
-from common.types import EnvSpec
+from coop.common.networks.acting import Mlp, acting_network
+from coop.common.networks.network import FlatNetwork, build_network, sample_inputs, sample_observations
+from coop.common.settings.config import NetworkSettings
+from coop.common.types import EnvSpec
 
 CARTPOLE = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 STACKED = EnvSpec("made-up", (3,), "float32", 4, 5)
@@ -47,8 +47,8 @@ def test_parameters_of_another_network_are_refused() -> None:
 
 def test_an_actor_of_an_mlp_imports_no_pytorch() -> None:
     code = (
-        "import sys, actors.process; from common.networks.acting import acting_network\n"
-        "from common.envs.make import make_vector_env; from common.settings.config import RunConfig\n"
+        "import sys, coop.actors.process; from coop.common.networks.acting import acting_network\n"
+        "from coop.common.envs.make import make_vector_env; from coop.common.settings.config import RunConfig\n"
         "config = RunConfig(); env = make_vector_env(config.env, 1, 0)\n"
         "acting_network(config.network, env.spec).q_values(env.reset(), env.spec); print('torch' in sys.modules)"
     )

@@ -7,12 +7,12 @@ import pytest
 import torch
 from samples import make_segment
 
-from common.errors import UsageError
-from common.settings.config import EdlSettings, LearnerSettings, NetworkSettings, RunConfig
-from common.types import Batch, EnvSpec
-from learner.agent import Agent, _decay_vector
-from learner.qnetwork import make_network
-from replay.table.table import Table
+from coop.common.errors import UsageError
+from coop.common.settings.config import EdlSettings, LearnerSettings, NetworkSettings, RunConfig
+from coop.common.types import Batch, EnvSpec
+from coop.learner.agent import Agent, _decay_vector
+from coop.learner.qnetwork import make_network
+from coop.replay.table.table import Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 

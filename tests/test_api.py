@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import coop
-from common.settings.methods import METHODS
-from experiments import lockstep_cli
-from learner.losses import Values
-from learner.methods.rule import Rule
+from coop.common.settings.methods import METHODS
+from coop.learner.losses import Values
+from coop.learner.methods.rule import Rule
+from coop.lockstep import cli as lockstep_cli
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from common.networks.convolution import ConvolutionNetwork
-from common.networks.dense import Dense
-from learner.edl.backprop import Chain
-from learner.edl.convolution import ConvolutionChain
-from learner.edl.dense import DenseChain
-from learner.edl.passes import UnsupportedLayerError
+from coop.common.networks.convolution import ConvolutionNetwork
+from coop.common.networks.dense import Dense
+from coop.learner.edl.backprop import Chain
+from coop.learner.edl.convolution import ConvolutionChain
+from coop.learner.edl.dense import DenseChain
+from coop.learner.edl.passes import UnsupportedLayerError
 
 
 def _uneven() -> nn.Sequential:

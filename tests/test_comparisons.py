@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.errors import RunError
-from common.settings.tables import resolve
-from experiments.report.answer import answer
-from experiments.report.comparisons import common_breaking_table, interaction_table, learning_table, sizes_table
-from experiments.report.figures import figures
-from experiments.report.intervals import over_seeds
-from experiments.report.learning import area, course, end_of_running_mean, reward_threshold
-from experiments.report.page import page
-from experiments.report.results import runs_table, settings_table, tables
-from experiments.report.study import Run, load_study
+from coop.common.errors import RunError
+from coop.common.settings.tables import resolve
+from coop.studies.report.answer import answer
+from coop.studies.report.comparisons import common_breaking_table, interaction_table, learning_table, sizes_table
+from coop.studies.report.figures import figures
+from coop.studies.report.intervals import over_seeds
+from coop.studies.report.learning import area, course, end_of_running_mean, reward_threshold
+from coop.studies.report.page import page
+from coop.studies.report.results import runs_table, settings_table, tables
+from coop.studies.report.study import Run, load_study
 
 METHODS, SEEDS, CAPACITIES = ("dqn", "coop"), (0, 1, 2), (500, 600, 5000)
 

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.errors import UsageError
-from common.messaging import wire
-from common.settings import schedules
-from common.settings.capacity import check_messages
-from common.settings.options import RunOptions, parse_run
-from common.settings.sources import base_config
-from common.settings.tables import first_difference, load_tables, preset_names, resolve, to_tables, to_toml
-from common.types import EnvSpec
+from coop.common.errors import UsageError
+from coop.common.messaging import wire
+from coop.common.settings import schedules
+from coop.common.settings.capacity import check_messages
+from coop.common.settings.tables import first_difference, load_tables, preset_names, resolve, to_tables, to_toml
+from coop.common.types import EnvSpec
+from coop.records.run_options import RunOptions, parse_run
+from coop.records.sources import base_config
 
 
 @pytest.mark.parametrize("preset", preset_names())

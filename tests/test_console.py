@@ -5,10 +5,10 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from common.messaging.members import Origin
-from common.messaging.messages.join import Join
-from common.process.console import RECENT, STALL_AFTER, Console, PeerMonitor, StallDetector, counted, progress_line
-from learner.members import FORGOTTEN, MemberTracker
+from coop.common.messaging.members import Origin
+from coop.common.messaging.messages.join import Join
+from coop.common.process.console import RECENT, STALL_AFTER, Console, PeerMonitor, StallDetector, counted, progress_line
+from coop.learner.members import FORGOTTEN, MemberTracker
 
 STATUS = {
     "env_steps": 9964,

@@ -7,14 +7,14 @@ import pytest
 import torch
 from torch import nn
 
-from common.networks.convolution import ConvolutionNetwork
-from common.networks.network import FlatNetwork
-from common.settings.config import LearnerSettings
-from common.types import Array
-from learner.edl.backprop import Chain
-from learner.edl.convolution import ConvolutionChain
-from learner.edl.feedback import FEEDBACKS, FeedbackRule
-from learner.optimizers import make_optimizer
+from coop.common.networks.convolution import ConvolutionNetwork
+from coop.common.networks.network import FlatNetwork
+from coop.common.settings.config import LearnerSettings
+from coop.common.types import Array
+from coop.learner.edl.backprop import Chain
+from coop.learner.edl.convolution import ConvolutionChain
+from coop.learner.edl.feedback import FEEDBACKS, FeedbackRule
+from coop.learner.optimizers import make_optimizer
 
 
 def _network(geometry: tuple[Any, ...], shape: tuple[int, int], hidden: list[int], actions: int) -> nn.Sequential:

@@ -11,15 +11,15 @@ import torch
 from commands import run_command
 from samples import make_segment
 
-from common.settings.tables import resolve
-from common.types import Batch, EnvSpec
-from experiments.stacked.dissect import AGREE, agreement
-from learner.agent import Agent
-from learner.device_table import DeviceTable
-from learner.edl import kernels
-from learner.edl.completed import Jacobians
-from learner.recorded import captured
-from replay.table.table import Table
+from coop.common.settings.tables import resolve
+from coop.common.types import Batch, EnvSpec
+from coop.learner.agent import Agent
+from coop.learner.device_table import DeviceTable
+from coop.learner.edl import kernels
+from coop.learner.edl.completed import Jacobians
+from coop.learner.recorded import captured
+from coop.replay.table.table import Table
+from coop.studies.stacked.dissect import AGREE, agreement
 
 pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU"),

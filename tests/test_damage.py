@@ -20,23 +20,23 @@ from test_epochs import CONFIG, save, save_learner
 from test_journal import _insert, _use
 
 import coop
-from common.errors import RunError, UsageError
-from common.process import checkpoints, resumption
-from common.process.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, write_manifest
-from common.process.files import Measured, measure, sealed, unsealed
-from common.process.resumption import survey
-from common.types import EnvSpec
-from experiments.evaluation import evaluate_checkpoint
-from experiments.export import export
-from experiments.report.packed import PackedStudy, pack, unpack
-from experiments.report.study import load_study
-from experiments.sweep.folder import CellFolder
-from experiments.sweep.grid import load_grid
-from learner.records.reading import read_csv, read_jsonl, read_lines
-from replay.core import ReplayCore, Wait
-from replay.persistence.epochs import ReplayEpochs
-from replay.persistence.journal import HEADER_BYTES, Journal
-from replay.persistence.recovery import recover
+from coop.common.errors import RunError, UsageError
+from coop.common.process.files import Measured, measure, sealed, unsealed
+from coop.common.types import EnvSpec
+from coop.evaluation.evaluate import evaluate_checkpoint
+from coop.evaluation.export import export
+from coop.records import checkpoints, resumption
+from coop.records.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, write_manifest
+from coop.records.reading import read_csv, read_jsonl, read_lines
+from coop.records.resumption import survey
+from coop.replay.core import ReplayCore, Wait
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.journal import HEADER_BYTES, Journal
+from coop.replay.persistence.recovery import recover
+from coop.studies.report.packed import PackedStudy, pack, unpack
+from coop.studies.report.study import load_study
+from coop.studies.sweep.folder import CellFolder
+from coop.studies.sweep.grid import load_grid
 
 pytestmark = pytest.mark.timeout(300)  # whole commands, also on a busy machine
 
@@ -320,7 +320,7 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
         (tmp_path / name).write_text("a line\n")
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(Path, "replace", renamed)
-    from learner.records.epochs import save_epoch  # noqa: PLC0415 (with what is patched)
+    from coop.records.kept import save_epoch  # noqa: PLC0415 (with what is patched)
 
     records = {name: measure(tmp_path / name) for name in checkpoints.RECORDS}
     save_epoch(tmp_path, 5, 100, {"a": 1}, lambda _: calls.append("replay"), records=records)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from commands import Command, run_command
 
-from experiments.sweep.cli import main
+from coop.studies.sweep.cli import main
 
 pytestmark = pytest.mark.timeout(300)
 GRID = 'methods = ["dqn"]\nseeds = {seeds}\n[fixed]\ntotal_steps = {steps}\n'
@@ -125,7 +125,7 @@ def refused(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 
 def test_other_versions_are_named() -> None:
-    dask = pytest.importorskip("experiments.sweep.dask", reason="needs the extra dask", exc_type=ImportError)
+    dask = pytest.importorskip("coop.studies.sweep.dask", reason="needs the extra dask", exc_type=ImportError)
     here = {"packages": {"python": "3.11.7.final.0", "dask": "2026.8.0", "distributed": "2026.8.0", "coop-rl": "0.2.0"}}
 
     def other(**packages: str | None) -> dict[str, object]:

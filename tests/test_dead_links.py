@@ -12,17 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from common.messaging.links import locators
-from common.messaging.messages.answers import Ack
-from common.messaging.messages.weights import Current
-from common.messaging.route import CLOSING, ReplayRoute
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
+from coop.common.messaging.links import locators
+from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.messages.weights import Current
+from coop.common.messaging.route import CLOSING, ReplayRoute
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
 
 FROZEN = 3  # more than the threads that Zenoh receives with, left to itself
 LISTENER = """
 import sys, time
-from common.messaging.session import open_session
+from coop.common.messaging.session import open_session
 session = open_session((), (sys.argv[1],))
 subscriber = session.declare_subscriber("coop/test/weights/1", lambda sample: None)
 print("ready", flush=True)

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.bounds import MAX_COUNT, MAX_GAPS
-from replay.dedup import DuplicateFilter
+from coop.common.bounds import MAX_COUNT, MAX_GAPS
+from coop.replay.dedup import DuplicateFilter
 
 arrivals = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(0, 30)), max_size=200)
 

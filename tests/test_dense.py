@@ -9,12 +9,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from common.networks.dense import Dense
-from common.networks.network import FlatNetwork, build_network
-from common.types import Array, EnvSpec
-from learner.edl.backprop import Chain
-from learner.edl.dense import DenseChain
-from learner.edl.feedback import FEEDBACKS, FeedbackRule, feedback_matrices
+from coop.common.networks.dense import Dense
+from coop.common.networks.network import FlatNetwork, build_network
+from coop.common.types import Array, EnvSpec
+from coop.learner.edl.backprop import Chain
+from coop.learner.edl.dense import DenseChain
+from coop.learner.edl.feedback import FEEDBACKS, FeedbackRule, feedback_matrices
 
 
 def _mlp(widths: list[int], seed: int) -> nn.Sequential:

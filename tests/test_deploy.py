@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 import yaml
 
-from actors.cli import ActorOptions
-from common.process import cli
-from common.process.ports import http_address
-from common.settings.options import parse_run
-from deploy.router import RouterOptions
-from learner.cli import LearnerOptions
-from replay.cli import ReplayOptions
+from coop.actors.cli import ActorOptions
+from coop.common.process import cli
+from coop.common.process.ports import http_address
+from coop.deploy.router import RouterOptions
+from coop.learner.cli import LearnerOptions
+from coop.records.run_options import parse_run
+from coop.replay.cli import ReplayOptions
 
 DEPLOY = Path(__file__).parents[1] / "deploy"
 ROLES = ("learner", "replay", "actor")

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from common.types import EnvSpec
-from learner.device_table import DeviceTable
-from learner.edl import kernels
+from coop.common.types import EnvSpec
+from coop.learner.device_table import DeviceTable
+from coop.learner.edl import kernels
 
 SPEC = EnvSpec("pictures", (2, 3), "uint8", 4, 3)
 CPU = torch.device("cpu")

@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from common.settings.config import LearnerSettings, NetworkSettings, RunConfig
-from common.types import Batch, EnvSpec
-from learner.agent import Agent
-from learner.diagnostics import Diagnostics, dormant, effective_ranks, hidden_layers
-from learner.losses import Values
-from learner.telemetry import Telemetry
+from coop.common.settings.config import LearnerSettings, NetworkSettings, RunConfig
+from coop.common.types import Batch, EnvSpec
+from coop.learner.agent import Agent
+from coop.learner.diagnostics import Diagnostics, dormant, effective_ranks, hidden_layers
+from coop.learner.losses import Values
+from coop.learner.telemetry import Telemetry
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 CONFIG = RunConfig(method="coop", learner=LearnerSettings(gamma=0.5, double=False), network=NetworkSettings(hidden=()))

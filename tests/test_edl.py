@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from common.networks.dense import Dense
-from common.networks.network import build_network
-from common.types import EnvSpec
-from learner.edl.backprop import Chain
-from learner.edl.dense import DenseChain
-from learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
-from learner.edl.transforms import Transforms, _basis
+from coop.common.networks.dense import Dense
+from coop.common.networks.network import build_network
+from coop.common.types import EnvSpec
+from coop.learner.edl.backprop import Chain
+from coop.learner.edl.dense import DenseChain
+from coop.learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
+from coop.learner.edl.transforms import Transforms, _basis
 
 
 def _spec(kind: str, actions: int) -> EnvSpec:

@@ -14,9 +14,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from common.networks.network import build_network
-from common.types import EnvSpec
-from learner.edl.feedback import edl_gradients
+from coop.common.networks.network import build_network
+from coop.common.types import EnvSpec
+from coop.learner.edl.feedback import edl_gradients
 
 
 def _network(seed: int, actions: int, widths: tuple[int, ...]) -> nn.Sequential:

@@ -4,13 +4,13 @@ import socket
 
 import pytest
 
-from common.errors import RunError, UsageError
-from common.messaging.endpoints import check_endpoints, unknown_hosts
-from common.messaging.joining import join
-from common.messaging.messages.join import Join
-from common.messaging.session import open_session
-from common.messaging.transport import Node
-from common.process.lifecycle import Stop
+from coop.common.errors import RunError, UsageError
+from coop.common.messaging.endpoints import check_endpoints, unknown_hosts
+from coop.common.messaging.joining import join
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node
+from coop.common.process.lifecycle import Stop
 
 
 @pytest.mark.parametrize(

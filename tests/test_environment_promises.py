@@ -18,18 +18,18 @@ from commands import run_command
 from gymnasium.spaces import Box, Discrete
 
 import coop
-from common.bounds import LONGEST_EPISODE
-from common.envs.gymnasium_env import GymnasiumEnv
-from common.envs.make import env_spec, make_filmed_env, make_vector_env
-from common.envs.protocol import VectorEnv
-from common.errors import BadMessage, CoopError, RunError, UsageError
-from common.messaging.messages.insert import check_values
-from common.process import notices
-from common.settings.environment import EnvSettings
-from common.settings.resuming import check_resumed, settings_digest
-from common.settings.tables import identity, load_tables, resolve
-from common.types import Array, EnvSpec
-from experiments.film import Film, short_gif
+from coop.common.bounds import LONGEST_EPISODE
+from coop.common.envs.gymnasium_env import GymnasiumEnv
+from coop.common.envs.make import env_spec, make_filmed_env, make_vector_env
+from coop.common.envs.protocol import VectorEnv
+from coop.common.errors import BadMessage, CoopError, RunError, UsageError
+from coop.common.messaging.messages.insert import check_values
+from coop.common.process import notices
+from coop.common.settings.environment import EnvSettings
+from coop.common.settings.resuming import check_resumed, settings_digest
+from coop.common.settings.tables import identity, load_tables, resolve
+from coop.common.types import Array, EnvSpec
+from coop.evaluation.film import Film, short_gif
 
 ODD = "test/Odd-v0"
 SHORT = {"total_steps": 60, "replay": {"capacity": 50, "learning_starts": 20}, "network": {"hidden": [8]}}
@@ -394,7 +394,7 @@ def test_what_is_beside_a_training_does_not_end_it(
 
     gymnasium.register("test/Later-v0", entry_point=Later)
     monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path))
-    monkeypatch.setattr("learner.records.run_directory.draw_learning_curve", lambda *_: 1 / 0)
+    monkeypatch.setattr("coop.records.run_directory.draw_learning_curve", lambda *_: 1 / 0)
     run = coop.train(run_dir=tmp_path / "a", env={"id": "test/Later-v0"}, eval_every=20, video_every=30, **SHORT)
     summary = run.wait()
     assert summary is not None

@@ -5,17 +5,17 @@ from typing import Any
 
 import pytest
 
-from common.errors import UsageError
-from common.messaging import wire
-from common.messaging.messages.join import Joined
-from common.process.cli import parse
-from common.settings.config import RunConfig
-from common.settings.environment import EnvSettings
-from common.settings.options import RunOptions, parse_run
-from common.settings.resuming import check_resumed
-from common.settings.sources import base_config
-from common.settings.tables import resolve, to_tables, to_toml
-from common.types import EnvSpec
+from coop.common.errors import UsageError
+from coop.common.messaging import wire
+from coop.common.messaging.messages.join import Joined
+from coop.common.process.cli import parse
+from coop.common.settings.config import RunConfig
+from coop.common.settings.environment import EnvSettings
+from coop.common.settings.resuming import check_resumed
+from coop.common.settings.tables import resolve, to_tables, to_toml
+from coop.common.types import EnvSpec
+from coop.records.run_options import RunOptions, parse_run
+from coop.records.sources import base_config
 
 TABLE = {"side": 12, "kind": "x y", "deep": {"rate": 0.5, "on": True}, "walls": [[1, 2], [3]], "none": {}}
 INLINE = "{side = 12, kind = 'x y', deep = {rate = 0.5, on = true}, walls = [[1, 2], [3]], none = {}}"

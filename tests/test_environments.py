@@ -9,14 +9,14 @@ import gymnasium
 import numpy as np
 import pytest
 
-from common.envs import catch
-from common.envs.catch import Catch
-from common.envs.make import env_spec, make_vector_env
-from common.envs.protocol import Steps
-from common.errors import UsageError
-from common.settings.environment import EnvSettings
-from common.settings.tables import load_tables, resolve
-from common.types import Array, EnvSpec
+from coop.common.envs import catch
+from coop.common.envs.catch import Catch
+from coop.common.envs.make import env_spec, make_vector_env
+from coop.common.envs.protocol import Steps
+from coop.common.errors import UsageError
+from coop.common.settings.environment import EnvSettings
+from coop.common.settings.tables import load_tables, resolve
+from coop.common.types import Array, EnvSpec
 
 
 def played(config: EnvSettings, num_envs: int, actions: Any, seed: int = 0) -> tuple[Array, list[Steps]]:
@@ -104,8 +104,8 @@ def test_a_seed_repeats_and_emulators_differ(env_id: str) -> None:
 
 def test_nothing_is_printed_or_warned() -> None:
     code = (
-        "import numpy as np; from common.envs.make import make_vector_env as make\n"
-        "from common.settings.environment import EnvSettings as S\n"
+        "import numpy as np; from coop.common.envs.make import make_vector_env as make\n"
+        "from coop.common.settings.environment import EnvSettings as S\n"
         "for name in ('CartPole-v0', 'coop/Catch-v0', 'pong'):\n"
         "    env = make(S(id=name), 1, 0); env.reset(); env.step(np.zeros(1, np.int32)); env.close()"
     )
@@ -114,7 +114,7 @@ def test_nothing_is_printed_or_warned() -> None:
 
 
 def test_settings_alone_import_no_emulator() -> None:
-    code = "import sys, common.envs.make; print({'gymnasium', 'ale_py', 'torch'} & set(sys.modules))"
+    code = "import sys, coop.common.envs.make; print({'gymnasium', 'ale_py', 'torch'} & set(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "set()"
 

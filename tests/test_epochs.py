@@ -11,16 +11,16 @@ import torch
 from samples import make_segment
 from table_reference import check_references
 
-from common.errors import RunError
-from common.messaging.messages.sample import DrawRequest, EpisodeRecord
-from common.process.checkpoints import DONE, checkpoint_numbers
-from common.process.resumption import go_back, survey
-from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
-from common.types import EnvSpec
-from learner.records.epochs import load_learner, newest_epoch, save_epoch
-from replay.core import ReplayCore, Wait
-from replay.episodes import MOST, EpisodeLog
-from replay.persistence.epochs import ReplayEpochs
+from coop.common.errors import RunError
+from coop.common.messaging.messages.sample import DrawRequest, EpisodeRecord
+from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+from coop.common.types import EnvSpec
+from coop.records.checkpoints import DONE, checkpoint_numbers
+from coop.records.kept import load_learner, newest_epoch, save_epoch
+from coop.records.resumption import go_back, survey
+from coop.replay.core import ReplayCore, Wait
+from coop.replay.episodes import MOST, EpisodeLog
+from coop.replay.persistence.epochs import ReplayEpochs
 
 CONFIG = RunConfig(
     run="test",
@@ -116,7 +116,7 @@ def test_a_writer_that_dies_of_anything_has_written_nothing(
         raise OverflowError
 
     epochs = ReplayEpochs(tmp_path, 5)
-    monkeypatch.setattr("replay.persistence.storage.write_manifest", fails)
+    monkeypatch.setattr("coop.replay.persistence.storage.write_manifest", fails)
     monkeypatch.setattr(threading, "excepthook", lambda args: None)
     epochs.begin(_used_core(spec), threading.Condition(), 10, [])
     with pytest.raises(RunError, match="10/replay: OverflowError"):

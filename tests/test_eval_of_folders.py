@@ -13,18 +13,18 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from common.envs.catch import Catch
-from common.envs.make import check_filmed, make_filmed_env, make_vector_env
-from common.envs.pictures import grayscale, make_resizer
-from common.errors import UsageError
-from common.settings.config import NetworkSettings
-from common.settings.environment import EnvSettings
-from common.settings.sources import base_config
-from experiments import evaluation_cli
-from experiments.evaluation import Evaluation, evaluate_checkpoint, film_checkpoint
-from experiments.film import Film, short_gif, write_video
-from experiments.lockstep import Lockstep
-from learner.records.run_directory import RunDirectory
+from coop.common.envs.catch import Catch
+from coop.common.envs.make import check_filmed, make_filmed_env, make_vector_env
+from coop.common.envs.pictures import grayscale, make_resizer
+from coop.common.errors import UsageError
+from coop.common.settings.config import NetworkSettings
+from coop.common.settings.environment import EnvSettings
+from coop.evaluation import cli as evaluation_cli
+from coop.evaluation.evaluate import Evaluation, evaluate_checkpoint, film_checkpoint
+from coop.evaluation.film import Film, short_gif, write_video
+from coop.lockstep.lockstep import Lockstep
+from coop.records.run_directory import RunDirectory
+from coop.records.sources import base_config
 
 
 def run_with(path: Path, acting: int, action: int) -> None:
@@ -224,7 +224,7 @@ def test_a_gif_of_a_run_s_network(
 
 
 def test_a_gif_for_tensorboard_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("experiments.film.LONGEST", 4)
+    monkeypatch.setattr("coop.evaluation.film.LONGEST", 4)
     content = short_gif(Film(lambda obs: np.array([0]), EnvSettings(id="coop/Catch-v0"), 0))
     with Image.open(io.BytesIO(content)) as gif:
         assert gif.n_frames == 4

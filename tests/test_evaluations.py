@@ -17,34 +17,34 @@ from samples import await_service
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_topology import running, wait_for
 
-from common.envs.make import make_vector_env
-from common.errors import UsageError
-from common.messaging.keys import evaluations_key, stop_key
-from common.messaging.messages.answers import Ack
-from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow
-from common.messaging.messages.join import Joined
-from common.messaging.messages.stop import EndOfRun
-from common.messaging.transport import Node, Refused
-from common.process.checkpoints import Manifest
-from common.process.console import Console
-from common.process.lifecycle import Stop
-from common.process.processes import free_endpoint
-from common.process.resumption import Start, Survey, Whole
-from common.settings.config import NetworkSettings, RunConfig
-from common.settings.environment import EnvSettings
-from common.settings.sources import base_config
-from common.types import EnvSpec
-from experiments.episodes import Evaluator, exploring, play
-from experiments.evaluator import EvaluatorService, Plan, Schedule
-from experiments.lockstep_run import LockstepRun
-from experiments.report.figures import evaluations
-from experiments.report.packed import pack
-from experiments.report.study import load_study
-from learner.agent import Agent
-from learner.broadcast import Broadcaster
-from learner.evaluations import EvaluationInbox
-from learner.records.evaluations import returns_by_step
-from learner.records.run_directory import RunDirectory
+from coop.common.envs.make import make_vector_env
+from coop.common.errors import UsageError
+from coop.common.messaging.keys import evaluations_key, stop_key
+from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow
+from coop.common.messaging.messages.join import Joined
+from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.transport import Node, Refused
+from coop.common.process.console import Console
+from coop.common.process.lifecycle import Stop
+from coop.common.process.processes import free_endpoint
+from coop.common.settings.config import NetworkSettings, RunConfig
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import EnvSpec
+from coop.evaluation.episodes import Evaluator, exploring, play
+from coop.evaluation.evaluator import EvaluatorService, Plan, Schedule
+from coop.learner.agent import Agent
+from coop.learner.broadcast import Broadcaster
+from coop.learner.evaluations import EvaluationInbox
+from coop.lockstep.run import LockstepRun
+from coop.records.checkpoints import Manifest
+from coop.records.evaluations import returns_by_step
+from coop.records.resumption import Start, Survey, Whole
+from coop.records.run_directory import RunDirectory
+from coop.records.sources import base_config
+from coop.studies.report.figures import evaluations
+from coop.studies.report.packed import pack
+from coop.studies.report.study import load_study
 
 COLUMNS = "env_step,update,network,episodes,return_mean,return_sd,epsilon,seconds"
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)

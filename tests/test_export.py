@@ -18,15 +18,15 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from common.errors import RunError
-from common.networks.network import FlatNetwork, build_network, sample_observations
-from common.settings.tables import resolve
-from common.types import EnvSpec
-from experiments import export_cli
-from experiments.export import export
-from experiments.export_onnx import NotExportedError, onnx_model
-from experiments.lockstep import Lockstep
-from learner.records.run_directory import RunDirectory
+from coop.common.errors import RunError
+from coop.common.networks.network import FlatNetwork, build_network, sample_observations
+from coop.common.settings.tables import resolve
+from coop.common.types import EnvSpec
+from coop.evaluation import export_cli
+from coop.evaluation.export import export
+from coop.evaluation.export_onnx import NotExportedError, onnx_model
+from coop.lockstep.lockstep import Lockstep
+from coop.records.run_directory import RunDirectory
 from website.pages import blocks
 
 PACKAGES = ("actors", "common", "deploy", "experiments", "learner", "replay")

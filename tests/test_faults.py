@@ -6,22 +6,22 @@ from pathlib import Path
 import pytest
 from samples import await_service, make_segment, until
 
-from common.messaging.keys import replay_key
-from common.messaging.messages.answers import Ack, Retry
-from common.messaging.messages.epoch import Snapshot
-from common.messaging.messages.insert import encode_segment
-from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.messages.weights import Current
-from common.messaging.session import open_session
-from common.messaging.transport import Node, Refused, new_incarnation
-from common.messaging.wire import Message
-from common.process.console import Console
-from common.process.lifecycle import Stop
-from common.settings.config import RunConfig
-from common.types import EnvSpec
-from replay.core import ReplayCore
-from replay.persistence.epochs import ReplayEpochs
-from replay.service import ReplayService
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.answers import Ack, Retry
+from coop.common.messaging.messages.epoch import Snapshot
+from coop.common.messaging.messages.insert import encode_segment
+from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.weights import Current
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, Refused, new_incarnation
+from coop.common.messaging.wire import Message
+from coop.common.process.console import Console
+from coop.common.process.lifecycle import Stop
+from coop.common.settings.config import RunConfig
+from coop.common.types import EnvSpec
+from coop.replay.core import ReplayCore
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.service import ReplayService
 
 
 def test_a_serving_thread_outlives_an_error(nodes: tuple[Node, Node], capfd: pytest.CaptureFixture[str]) -> None:

@@ -13,18 +13,18 @@ import pytest
 from matplotlib.figure import Figure as Canvas
 from test_comparisons import write_runs
 
-from common.errors import UsageError
-from experiments.report.answer import answer
-from experiments.report.baseline import baseline_figure, baseline_table, find_baseline
-from experiments.report.figures import buffers
-from experiments.report.intervals import Interval
-from experiments.report.page import page
-from experiments.report.plots import STYLE, WIDTH, Figure, Line, Panel, _finish_panel, draw
-from experiments.report.results import tables
-from experiments.report.study import Study, load_study
-from experiments.report.summaries import final_returns
-from experiments.report.table import ResultTable, Value
-from experiments.report.writer import write_report
+from coop.common.errors import UsageError
+from coop.studies.report.answer import answer
+from coop.studies.report.baseline import baseline_figure, baseline_table, find_baseline
+from coop.studies.report.figures import buffers
+from coop.studies.report.intervals import Interval
+from coop.studies.report.page import page
+from coop.studies.report.plots import STYLE, WIDTH, Figure, Line, Panel, _finish_panel, draw
+from coop.studies.report.results import tables
+from coop.studies.report.study import Study, load_study
+from coop.studies.report.summaries import final_returns
+from coop.studies.report.table import ResultTable, Value
+from coop.studies.report.writer import write_report
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 MEASURE = """<script>

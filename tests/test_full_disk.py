@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from common.errors import RunError
-from common.process.checkpoints import checkpoint_numbers
-from common.process.files import LineFile
-from common.process.lifecycle import Stop
-from common.settings.sources import base_config
-from experiments.lockstep import Lockstep
-from experiments.lockstep_run import play_lockstep
-from learner.records.run_directory import RunDirectory
-from learner.records.summary import summarise
+from coop.common.errors import RunError
+from coop.common.process.files import LineFile
+from coop.common.process.lifecycle import Stop
+from coop.lockstep.lockstep import Lockstep
+from coop.lockstep.run import play_lockstep
+from coop.records.checkpoints import checkpoint_numbers
+from coop.records.run_directory import RunDirectory
+from coop.records.sources import base_config
+from coop.records.summary import summarise
 
 
 def _fill(disk: Path) -> Path:
@@ -102,8 +102,8 @@ def test_a_lockstep_run_goes_on_without_its_epochs(small_disk: Path, capsys: pyt
 )
 def test_a_full_log(body: str, status: int, problem: str) -> None:
     code = f"""
-from common.process.console import Console
-from common.process.lifecycle import run_main
+from coop.common.process.console import Console
+from coop.common.process.lifecycle import run_main
 console = Console()
 run_main("coop-x", lambda: {body})
 """

@@ -5,14 +5,14 @@ import torch
 from custom_networks import Borrowed, Centred, Doubled, Duel, Pictures, Recurrent, Residual, Tied, Twice
 from torch import Tensor, nn
 
-from common.networks.network import build_network
-from common.types import EnvSpec
-from learner.edl.backprop import Chain
-from learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
-from learner.edl.graph import Graph
-from learner.edl.layers import _examined, make_passes
-from learner.edl.passes import UnsupportedLayerError
-from learner.edl.transforms import Transforms
+from coop.common.networks.network import build_network
+from coop.common.types import EnvSpec
+from coop.learner.edl.backprop import Chain
+from coop.learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
+from coop.learner.edl.graph import Graph
+from coop.learner.edl.layers import _examined, make_passes
+from coop.learner.edl.passes import UnsupportedLayerError
+from coop.learner.edl.transforms import Transforms
 
 
 def _inputs(shape: tuple[int, ...], actions: int, batch: int, seed: int = 1) -> tuple[Tensor, Tensor]:

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from common.errors import UsageError
-from common.process.console import Console
-from common.process.health import STUCK, answering, state
-from common.process.processes import free_endpoint
+from coop.common.errors import UsageError
+from coop.common.process.console import Console
+from coop.common.process.processes import free_endpoint
+from coop.monitor.health import STUCK, answering, state
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_a_role_that_waits_for_another_one_works(address: str, console: Console)
 def test_a_role_whose_loop_stands_still_does_not_work(address: str, console: Console) -> None:
     console.reported = time.monotonic() - STUCK
     assert ask(address, "/") == ask(address, "/ready") == (503, "stuck")
-    asked = [sys.executable, "-m", "common.process.health", address]
+    asked = [sys.executable, "-m", "coop.monitor.health", address]
     stuck = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
     console.progress(0, "", str)
     well = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
@@ -66,7 +66,7 @@ def test_the_states() -> None:
 
 
 def test_nobody_answers(address: str) -> None:
-    asked = [sys.executable, "-m", "common.process.health", address]
+    asked = [sys.executable, "-m", "coop.monitor.health", address]
     done = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (1, f"health: error: {address}: Connection refused\n")
 

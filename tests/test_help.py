@@ -14,10 +14,10 @@ from typing import Any, get_type_hints
 
 import pytest
 
-from common.process.cli import PACKAGE
-from common.process.help import EXIT_STATUSES
-from common.settings.methods import METHODS
-from common.settings.options import COMMON, RunOptions, parse_run
+from coop.common.process.cli import PACKAGE
+from coop.common.process.help import EXIT_STATUSES
+from coop.common.settings.methods import METHODS
+from coop.records.run_options import COMMON, RunOptions, parse_run
 from website.reference import COMMANDS as OPTIONS
 
 ROOT = Path(__file__).parents[1]

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from common.errors import RunError
-from learner.records.epochs import load_learner
+from coop.common.errors import RunError
+from coop.records.kept import load_learner
 
 FUZZ = Path(__file__).parents[1] / "benchmarks" / "fuzz.py"
 

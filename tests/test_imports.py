@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import JoinError, UsageError
-from common.imports import check_allowed, import_object
+from coop.common.errors import JoinError, UsageError
+from coop.common.imports import check_allowed, import_object
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import torch
 from commands import run_command
 from torch import Tensor
 
-from experiments.reexecute import reexecute
-from learner.records.epochs import newest_epoch
+from coop.lockstep.reexecute import reexecute
+from coop.records.kept import newest_epoch
 
 FLAGS = ("--learner.learning-rate", "1e-30")  # keeps the networks as they are
 SHORT = ("--total-steps", "300", "--replay.learning-starts", "100")

@@ -8,28 +8,28 @@ import pytest
 from msgspec.structs import replace
 from samples import await_service, make_segment
 
-from common.errors import JoinError
-from common.messaging import joining, wire
-from common.messaging.joining import difference, join, leave_run
-from common.messaging.keys import join_key, replay_key
-from common.messaging.members import Origin
-from common.messaging.messages.join import Join, Joined, Leave
-from common.messaging.messages.limits import Limit, Limits, LimitsQuestion
-from common.messaging.messages.sample import DrawRequest
-from common.messaging.messages.stop import EndOfRun
-from common.messaging.messages.weights import Current
-from common.messaging.session import open_session
-from common.messaging.transport import Node, Refused
-from common.process.lifecycle import Stop
-from common.settings.config import RunConfig
-from common.types import EnvSpec
-from deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
-from learner.join_service import JoinService
-from learner.roster import Roster
-from learner.shared_epochs import SharedEpochs
-from replay.core import ReplayCore
-from replay.persistence.epochs import ReplayEpochs
-from replay.service import ReplayService
+from coop.common.errors import JoinError
+from coop.common.messaging import joining, wire
+from coop.common.messaging.joining import difference, join, leave_run
+from coop.common.messaging.keys import join_key, replay_key
+from coop.common.messaging.members import Origin
+from coop.common.messaging.messages.join import Join, Joined, Leave
+from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.weights import Current
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, Refused
+from coop.common.process.lifecycle import Stop
+from coop.common.settings.config import RunConfig
+from coop.common.types import EnvSpec
+from coop.deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
+from coop.learner.join_service import JoinService
+from coop.learner.roster import Roster
+from coop.learner.shared_epochs import SharedEpochs
+from coop.replay.core import ReplayCore
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.service import ReplayService
 
 REQUEST = Join("actor", 3, [])
 

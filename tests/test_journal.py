@@ -8,14 +8,14 @@ import pytest
 from samples import make_segment
 from test_epochs import CONFIG, save
 
-from common.errors import RunError
-from common.messaging.messages.insert import encode_segment
-from common.messaging.messages.sample import DrawRequest
-from common.types import EnvSpec
-from replay.core import ReplayCore, Wait
-from replay.persistence.epochs import ReplayEpochs
-from replay.persistence.journal import Journal, journal_files
-from replay.persistence.recovery import recover
+from coop.common.errors import RunError
+from coop.common.messaging.messages.insert import encode_segment
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.types import EnvSpec
+from coop.replay.core import ReplayCore, Wait
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.journal import Journal, journal_files
+from coop.replay.persistence.recovery import recover
 
 
 def _insert(core: ReplayCore, spec: EnvSpec, sequence: int) -> int | Wait:

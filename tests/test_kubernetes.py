@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 import yaml
 
-from actors.cli import ActorOptions
-from common.process import cli
-from common.settings.options import parse_run
-from deploy.router import RouterOptions
-from experiments.sweep.cli import SweepOptions
-from experiments.sweep.grid import load_grid
-from learner.cli import LearnerOptions
-from replay.cli import ReplayOptions
+from coop.actors.cli import ActorOptions
+from coop.common.process import cli
+from coop.deploy.router import RouterOptions
+from coop.learner.cli import LearnerOptions
+from coop.records.run_options import parse_run
+from coop.replay.cli import ReplayOptions
+from coop.studies.sweep.cli import SweepOptions
+from coop.studies.sweep.grid import load_grid
 
 K8S = Path(__file__).parents[1] / "deploy" / "k8s"
 FOLDERS = ["base", "sweep", *(f"overlays/{path.name}" for path in sorted((K8S / "overlays").iterdir()))]

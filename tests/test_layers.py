@@ -6,10 +6,10 @@ from custom_networks import Centred, Duel, Negative, Residual
 from test_graph import _by_svd, _inputs, _networks, _relative
 from torch import Tensor, nn
 
-from learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
-from learner.edl.graph import Graph, Layer
-from learner.edl.layers import _range, make_passes
-from learner.edl.passes import Tape, UnsupportedLayerError
+from coop.learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
+from coop.learner.edl.graph import Graph, Layer
+from coop.learner.edl.layers import _range, make_passes
+from coop.learner.edl.passes import Tape, UnsupportedLayerError
 
 
 class Odd(nn.Module):

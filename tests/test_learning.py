@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from common.envs.corridor import CELLS, LEFT, RIGHT, optimal_values
-from common.settings import schedules
-from common.settings.config import RunConfig
-from common.settings.tables import load_tables, resolve
-from experiments.lockstep import Lockstep
-from learner.agent import Agent
-from learner.records.epochs import newest_epoch
+from coop.common.envs.corridor import CELLS, LEFT, RIGHT, optimal_values
+from coop.common.settings import schedules
+from coop.common.settings.config import RunConfig
+from coop.common.settings.tables import load_tables, resolve
+from coop.learner.agent import Agent
+from coop.lockstep.lockstep import Lockstep
+from coop.records.kept import newest_epoch
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 

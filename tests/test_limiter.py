@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import UsageError
-from replay.limiter import RateLimiter
+from coop.common.errors import UsageError
+from coop.replay.limiter import RateLimiter
 
 THOUSAND = RateLimiter(ratio=1.0, start=1000, tolerance=40, total=50_000)
 QUARTER = RateLimiter(ratio=0.25, start=100, tolerance=10, total=None)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from common.process.limits import MIB, cores, memory_kills, memory_limit
-from deploy.supervisor import HEALTHY, MEMORY_RESTARTS, RestartPolicy
+from coop.common.process.limits import MIB, cores, memory_kills, memory_limit
+from coop.deploy.supervisor import HEALTHY, MEMORY_RESTARTS, RestartPolicy
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 MACHINE = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -105,7 +105,7 @@ def test_memory_that_the_system_refuses_is_one_line() -> None:
     code = """
 import resource
 import numpy as np
-from common.process.lifecycle import run_main
+from coop.common.process.lifecycle import run_main
 resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32))
 run_main("coop-x", lambda: np.zeros(2**33, np.uint8))
 """
@@ -139,8 +139,8 @@ def control_group(size: int) -> Iterator[Path]:
 SUPERVISES = """
 import sys, time
 from pathlib import Path
-from common.process.limits import memory_limit
-from common.process.processes import ChildProcess
+from coop.common.process.limits import memory_limit
+from coop.common.process.processes import ChildProcess
 print(memory_limit())
 for code in ("data = b'x' * 2**28", "import os; os.kill(os.getpid(), 9)"):
     child = ChildProcess("replay", [sys.executable, "-c", code], Path(sys.argv[1], "log"))

@@ -14,13 +14,13 @@ import pytest
 import zenoh
 from samples import await_service, until
 
-from common.messaging import links
-from common.messaging.keys import weights_key
-from common.messaging.links import close, locators
-from common.messaging.messages.weights import Current
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.processes import ChildProcess, command
+from coop.common.messaging import links
+from coop.common.messaging.keys import weights_key
+from coop.common.messaging.links import close, locators
+from coop.common.messaging.messages.weights import Current
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.processes import ChildProcess, command
 
 LINKS = 20
 

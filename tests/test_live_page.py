@@ -17,12 +17,12 @@ from commands import run_command
 from msgspec.structs import replace
 from test_screen import EVENTS, STATUS
 
-from common.errors import UsageError
-from common.messaging.messages.status import Member, Ratio
-from common.process.ports import http_address
-from deploy.curves import COLUMNS, MOST, Curves
-from deploy.facts import facts
-from deploy.live_page import LivePage
+from coop.common.errors import UsageError
+from coop.common.messaging.messages.status import Member, Ratio
+from coop.common.process.ports import http_address
+from coop.monitor.curves import COLUMNS, MOST, Curves
+from coop.monitor.facts import facts
+from coop.monitor.live_page import LivePage
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 STRANGER = Member("<b>actor</b>", "actor", "\x1b[2J", 1, "waiting", 0.0, "<script>document.title = 'x'</script>")

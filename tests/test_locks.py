@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from samples import until
 
-from common.errors import RunError
-from common.process import locks
-from common.process.locks import RunLock
+from coop.common.errors import RunError
+from coop.records import locks
+from coop.records.locks import RunLock
 
 pytestmark = pytest.mark.timeout(300)  # eight sweeps on a busy machine
 
@@ -24,9 +24,9 @@ pytestmark = pytest.mark.timeout(300)  # eight sweeps on a busy machine
 HOST = """
 import fcntl, secrets, sys, time
 from pathlib import Path
-from common.errors import RunError
-from common.process import locks
-from common.process.files import LineFile
+from coop.common.errors import RunError
+from coop.records import locks
+from coop.common.process.files import LineFile
 locks.LOCAL, locks.BEAT, locks.LEASE, locks.SETTLE = frozenset(), 0.1, float(sys.argv[2]), 0.3
 boot = secrets.token_hex(8)
 locks._place = lambda descriptor: boot

@@ -12,11 +12,11 @@ import pytest
 from commands import run_command
 from table_reference import whole_state
 
-from common.settings.methods import METHODS
-from common.settings.sources import base_config
-from experiments.lockstep import Lockstep
-from learner.records.epochs import newest_epoch
-from learner.records.run_directory import RunDirectory
+from coop.common.settings.methods import METHODS
+from coop.lockstep.lockstep import Lockstep
+from coop.records.kept import newest_epoch
+from coop.records.run_directory import RunDirectory
+from coop.records.sources import base_config
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 

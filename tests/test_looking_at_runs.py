@@ -23,10 +23,10 @@ from typing import Any
 import pytest
 from commands import run_command
 
-from common.messaging.messages.status import LearnerStatus
-from common.messaging.transport import new_incarnation
-from common.process.processes import free_endpoint
-from deploy.status import RunStatus
+from coop.common.messaging.messages.status import LearnerStatus
+from coop.common.messaging.transport import new_incarnation
+from coop.common.process.processes import free_endpoint
+from coop.monitor.status import RunStatus
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 # Unbuffered, Python drops what is left of a write that a signal has cut short.
@@ -160,7 +160,7 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
 
 NOISY = """
 import sys
-from common.process.display import LiveDisplay
+from coop.monitor.display import LiveDisplay
 
 class Pictures(LiveDisplay):
     def picture(self):

@@ -8,13 +8,13 @@ import pytest
 import torch
 from test_agent import SPEC, batches
 
-from common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
-from common.settings.medqn import MedqnSettings
-from common.settings.sources import base_config
-from common.settings.tables import preset_names
-from common.types import Batch, EnvSpec
-from learner.agent import Agent
-from learner.methods.medqn import Consolidation
+from coop.common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
+from coop.common.settings.medqn import MedqnSettings
+from coop.common.settings.tables import preset_names
+from coop.common.types import Batch, EnvSpec
+from coop.learner.agent import Agent
+from coop.learner.methods.medqn import Consolidation
+from coop.records.sources import base_config
 
 ONE = EnvSpec("one", (1,), "float32", 1, 2)
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import make_segment
 
-from common.bounds import (
+from coop.common.bounds import (
     MAX_AHEAD,
     MAX_COUNT,
     MAX_EVALUATED,
@@ -26,16 +26,16 @@ from common.bounds import (
     MAX_UPDATES,
     MAX_VIDEO,
 )
-from common.errors import BadMessage, RunError
-from common.messaging import wire
-from common.messaging.members import Origin
-from common.messaging.messages.answers import Ack, Error, Retry
-from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
-from common.messaging.messages.insert import OPTIONAL, SegmentReader, encode_segment
-from common.messaging.messages.join import Join, Joined, Leave
-from common.messaging.messages.limits import Limit, Limits
-from common.messaging.messages.sample import (
+from coop.common.errors import BadMessage, RunError
+from coop.common.messaging import wire
+from coop.common.messaging.members import Origin
+from coop.common.messaging.messages.answers import Ack, Error, Retry
+from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
+from coop.common.messaging.messages.insert import OPTIONAL, SegmentReader, encode_segment
+from coop.common.messaging.messages.join import Join, Joined, Leave
+from coop.common.messaging.messages.limits import Limit, Limits
+from coop.common.messaging.messages.sample import (
     BatchReader,
     Drawn,
     DrawRequest,
@@ -45,14 +45,14 @@ from common.messaging.messages.sample import (
     encode_batch,
     encode_named,
 )
-from common.messaging.messages.stats import ReplayStats
-from common.messaging.messages.stop import EndOfRun
-from common.messaging.messages.weights import Current, Role, Weights
-from common.messaging.wire import Message
-from common.settings.config import RunConfig
-from common.settings.tables import to_tables
-from common.types import EnvSpec, EpisodeEnd
-from replay.table.table import PinnedBatch, Table
+from coop.common.messaging.messages.stats import ReplayStats
+from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.weights import Current, Role, Weights
+from coop.common.messaging.wire import Message
+from coop.common.settings.config import RunConfig
+from coop.common.settings.tables import to_tables
+from coop.common.types import EnvSpec, EpisodeEnd
+from coop.replay.table.table import PinnedBatch, Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]

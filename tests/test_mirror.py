@@ -17,28 +17,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import await_service, make_segment
 
-from common.messaging import wire
-from common.messaging.insert_client import InsertClient
-from common.messaging.keys import replay_key
-from common.messaging.links import locators
-from common.messaging.messages.sample import NAMED, DrawRequest, NamedBatch, NamedBatchReader
-from common.messaging.mirror import FIRST_SLOTS, FrameMirror
-from common.messaging.sample_client import SampleClient
-from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
-from common.messaging.wire import Message
-from common.process.lifecycle import Stop
-from common.process.limits import MemoryLimit
-from common.process.memory import GrowingRows
-from common.settings.capacity import MIRROR_SHARE, estimated_bytes, mirror_slots
-from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
-from common.settings.effects import without_effect
-from common.settings.resuming import check_resumed
-from common.types import Batch, EnvSpec, Segment
-from replay.core import ReplayCore, Reply
-from replay.mirrored import MirroredFrames
-from replay.persistence.epochs import ReplayEpochs
-from replay.service import ReplayService
+from coop.common.messaging import wire
+from coop.common.messaging.insert_client import InsertClient
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.links import locators
+from coop.common.messaging.messages.sample import NAMED, DrawRequest, NamedBatch, NamedBatchReader
+from coop.common.messaging.mirror import FIRST_SLOTS, FrameMirror
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
+from coop.common.messaging.wire import Message
+from coop.common.process.lifecycle import Stop
+from coop.common.process.limits import MemoryLimit
+from coop.common.process.memory import GrowingRows
+from coop.common.settings.capacity import MIRROR_SHARE, estimated_bytes, mirror_slots
+from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+from coop.common.settings.effects import without_effect
+from coop.common.settings.resuming import check_resumed
+from coop.common.types import Batch, EnvSpec, Segment
+from coop.replay.core import ReplayCore, Reply
+from coop.replay.mirrored import MirroredFrames
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.service import ReplayService
 
 NUMBERS = EnvSpec("numbers", (2,), "float32", 1, 2)  # frame n holds n, and is the observation of transition n
 CAPACITY = 12
@@ -524,7 +524,7 @@ def test_priorities_arrive_with_requests_for_several_batches(nodes: tuple[Node, 
 
 
 def test_the_mirror_takes_a_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("common.settings.capacity.memory_limit", lambda: MemoryLimit(2**30, "this test allows"))
+    monkeypatch.setattr("coop.common.settings.capacity.memory_limit", lambda: MemoryLimit(2**30, "this test allows"))
     atari, each = EnvSpec("Atari", (84, 84), "uint8", 4, 4), 84 * 84 + 8
 
     def slots(capacity: int, eviction: str = "fifo") -> int:

@@ -13,13 +13,13 @@ from msgspec.structs import replace
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_screen import STATUS
 
-from common.errors import UsageError
-from common.messaging.messages.status import LearnerStatus
-from common.process.extras import check_extra
-from common.process.processes import free_endpoint
-from common.settings.sources import base_config
-from experiments.lockstep import Lockstep
-from learner.records.run_directory import RunDirectory
+from coop.common.errors import UsageError
+from coop.common.messaging.messages.status import LearnerStatus
+from coop.common.process.extras import check_extra
+from coop.common.process.processes import free_endpoint
+from coop.lockstep.lockstep import Lockstep
+from coop.records.run_directory import RunDirectory
+from coop.records.sources import base_config
 
 PAGE = (Path(__file__).parents[1] / "docs" / "watching.md").read_text(encoding="utf-8")
 BLOCK, HEADER = 32768, 7  # bytes, of the log in which wandb keeps its records
@@ -29,7 +29,7 @@ def test_a_status_for_prometheus() -> None:
     pytest.importorskip("prometheus_client", reason="needs the extra prometheus")
     from prometheus_client.parser import text_string_to_metric_families  # noqa: PLC0415
 
-    from learner.exporter import exported  # noqa: PLC0415
+    from coop.monitor.exporter import exported  # noqa: PLC0415
 
     status: LearnerStatus | None = None
 

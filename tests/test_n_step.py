@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from samples import INCARNATION
 from table_reference import Stream, make_spec, whole_state
 
-from actors.segments import SegmentAssembler
-from common.envs.protocol import Steps
-from common.messaging import wire
-from common.messaging.messages.insert import SegmentReader, encode_segment
-from common.types import EnvSpec, EpisodeEnd, Segment
-from replay.table.table import Table
+from coop.actors.segments import SegmentAssembler
+from coop.common.envs.protocol import Steps
+from coop.common.messaging import wire
+from coop.common.messaging.messages.insert import SegmentReader, encode_segment
+from coop.common.types import EnvSpec, EpisodeEnd, Segment
+from coop.replay.table.table import Table
 
 GAMMA = 0.5
 SPEC = EnvSpec("made-up", (1,), "float32", 1, 2)

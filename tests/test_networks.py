@@ -10,19 +10,19 @@ import pytest
 import torch
 from commands import run_command
 
-from actors.policy import Policy
-from common.errors import UsageError
-from common.networks.network import FlatNetwork, build_network
-from common.process.resumption import survey
-from common.settings.config import NETWORK_KINDS, NetworkSettings, RunConfig
-from common.settings.sources import base_config
-from common.settings.tables import validated
-from common.types import EnvSpec
-from experiments.evaluation import evaluate_checkpoint
-from experiments.lockstep import Lockstep
-from learner.edl.graph import Graph
-from learner.records.epochs import load_learner
-from learner.records.run_directory import RunDirectory
+from coop.actors.policy import Policy
+from coop.common.errors import UsageError
+from coop.common.networks.network import FlatNetwork, build_network
+from coop.common.settings.config import NETWORK_KINDS, NetworkSettings, RunConfig
+from coop.common.settings.tables import validated
+from coop.common.types import EnvSpec
+from coop.evaluation.evaluate import evaluate_checkpoint
+from coop.learner.edl.graph import Graph
+from coop.lockstep.lockstep import Lockstep
+from coop.records.kept import load_learner
+from coop.records.resumption import survey
+from coop.records.run_directory import RunDirectory
+from coop.records.sources import base_config
 
 SPEC = EnvSpec("made-up", (4,), "float32", 1, 3)
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from common.settings.config import LearnerSettings, OptimizerName
-from learner.edl.arrays import AnyArray
-from learner.optimizers import MnihRMSProp, make_optimizer
+from coop.common.settings.config import LearnerSettings, OptimizerName
+from coop.learner.edl.arrays import AnyArray
+from coop.learner.optimizers import MnihRMSProp, make_optimizer
 
 SIZE = 50
 OPTIMIZERS: list[OptimizerName] = ["sgd", "rmsprop", "rmsprop-mnih", "adam"]

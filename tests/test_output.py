@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from common.process.lifecycle import Stop
-from learner.records.epochs import newest_epoch
+from coop.common.process.lifecycle import Stop
+from coop.records.kept import newest_epoch
 
 pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
 
@@ -134,8 +134,8 @@ def test_no_file_takes_the_place_of_a_closed_descriptor(tmp_path: Path) -> None:
     code = """
 import os, sys
 from pathlib import Path
-from common.process.files import LineFile, SyncedFile
-from common.process.locks import FileLock
+from coop.common.process.files import LineFile, SyncedFile
+from coop.records.locks import FileLock
 for opened in (FileLock, SyncedFile, lambda path: LineFile(path, go_on=False)):
     os.close(1)
     file = opened(Path(sys.argv[1], "file"))
@@ -183,7 +183,7 @@ def test_sighup_requests_a_stop_unless_it_is_ignored() -> None:
 def test_a_signal_ends_commands_that_hold_no_state_in_order(number: signal.Signals) -> None:
     code = f"""
 import os, time
-from common.process.lifecycle import raise_on_signals, run_main
+from coop.common.process.lifecycle import raise_on_signals, run_main
 def main():
     try:
         os.kill(os.getpid(), {int(number)})

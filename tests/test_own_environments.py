@@ -10,15 +10,15 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from common.envs import registry
-from common.envs.make import env_spec, make_vector_env
-from common.envs.pictures import grayscale, make_resizer
-from common.errors import UsageError
-from common.networks.inputs import preprocess
-from common.networks.network import FlatNetwork, build_network
-from common.settings.environment import EnvSettings
-from common.settings.tables import load_tables, resolve
-from common.types import Array, EnvSpec
+from coop.common.envs import registry
+from coop.common.envs.make import env_spec, make_vector_env
+from coop.common.envs.pictures import grayscale, make_resizer
+from coop.common.errors import UsageError
+from coop.common.networks.inputs import preprocess
+from coop.common.networks.network import FlatNetwork, build_network
+from coop.common.settings.environment import EnvSettings
+from coop.common.settings.tables import load_tables, resolve
+from coop.common.types import Array, EnvSpec
 
 
 class Scene(gymnasium.Env[Array, int]):

@@ -15,13 +15,13 @@ import pytest
 from commands import Command, run_command
 from test_topology import wait_for
 
-from common.errors import RunError
-from common.process.processes import free_endpoint
-from common.settings.environment import EnvSettings
-from common.settings.sources import base_config
-from experiments.lockstep import Lockstep
-from learner.records.epochs import newest_epoch
-from learner.records.run_directory import RunDirectory
+from coop.common.errors import RunError
+from coop.common.process.processes import free_endpoint
+from coop.common.settings.environment import EnvSettings
+from coop.lockstep.lockstep import Lockstep
+from coop.records.kept import newest_epoch
+from coop.records.run_directory import RunDirectory
+from coop.records.sources import base_config
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 SCRIPTS = Path(sysconfig.get_path("scripts"))

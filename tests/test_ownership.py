@@ -16,27 +16,27 @@ from commands import run_command
 from samples import make_segment
 from test_epochs import CONFIG, save, save_learner
 
-from common.errors import RunError, UsageError
-from common.messaging.joining import join
-from common.messaging.messages.join import Join
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.checkpoints import Manifest
-from common.process.files import Measured, truncate
-from common.process.lifecycle import Stop
-from common.process.locks import INHERITED, RunLock
-from common.process.resumption import Survey, Whole, go_back, survey
-from common.process.run_ids import RUN_ID, claim, read_run_id
-from common.settings.options import RunOptions
-from common.types import EnvSpec
-from learner.join_service import JoinService
-from learner.records.run_directory import RunDirectory, claim_run_directory
-from learner.roster import Roster
-from learner.shared_epochs import SharedEpochs
-from replay.core import ReplayCore
-from replay.persistence.epochs import ReplayEpochs, part_path
-from replay.persistence.folder import ReplayFolder
-from replay.persistence.journal import Journal, journal_files
+from coop.common.errors import RunError, UsageError
+from coop.common.messaging.joining import join
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.files import Measured, truncate
+from coop.common.process.lifecycle import Stop
+from coop.common.types import EnvSpec
+from coop.learner.join_service import JoinService
+from coop.learner.roster import Roster
+from coop.learner.shared_epochs import SharedEpochs
+from coop.records.checkpoints import Manifest
+from coop.records.locks import INHERITED, RunLock
+from coop.records.resumption import Survey, Whole, go_back, survey
+from coop.records.run_directory import RunDirectory, claim_run_directory
+from coop.records.run_ids import RUN_ID, claim, read_run_id
+from coop.records.run_options import RunOptions
+from coop.replay.core import ReplayCore
+from coop.replay.persistence.epochs import ReplayEpochs, part_path
+from coop.replay.persistence.folder import ReplayFolder
+from coop.replay.persistence.journal import Journal, journal_files
 
 pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
 
@@ -101,7 +101,7 @@ def test_a_new_folder_is_the_run_s_from_its_first_write(tmp_path: Path) -> None:
 HOLD = """
 import sys
 from pathlib import Path
-from common.process.locks import RunLock
+from coop.records.locks import RunLock
 with RunLock(Path(sys.argv[1]), "coop-lockstep", ("learner", "replay")).sign():
     print("held", flush=True)
     sys.stdin.read()

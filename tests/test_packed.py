@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import RunError, UsageError
-from experiments.report import cli
-from experiments.report.packed import FILES, PackedStudy, pack, unpack
-from experiments.report.study import load_study
-from experiments.report.writer import write_report
-from experiments.sweep.grid import load_grid
+from coop.common.errors import RunError, UsageError
+from coop.studies.report import cli
+from coop.studies.report.packed import FILES, PackedStudy, pack, unpack
+from coop.studies.report.study import load_study
+from coop.studies.report.writer import write_report
+from coop.studies.sweep.grid import load_grid
 
 CONFIG = 'method = "{method}"\nseed = {seed}\ntotal_steps = 4000\n'
 HEADER = "episode,env_step,actor,return,epsilon,s,q1_mean,q2_mean\n"

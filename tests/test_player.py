@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from gymnasium.envs.classic_control import CartPoleEnv
 
-from actors.player import Player, Turn
-from actors.policy import Policy
-from common.envs.make import make_vector_env
-from common.envs.protocol import VectorEnv
-from common.networks.network import FlatNetwork, build_network
-from common.settings import schedules
-from common.settings.config import ActorSettings
-from common.settings.environment import EnvSettings
+from coop.actors.player import Player, Turn
+from coop.actors.policy import Policy
+from coop.common.envs.make import make_vector_env
+from coop.common.envs.protocol import VectorEnv
+from coop.common.networks.network import FlatNetwork, build_network
+from coop.common.settings import schedules
+from coop.common.settings.config import ActorSettings
+from coop.common.settings.environment import EnvSettings
 
 
 class Generous(CartPoleEnv):

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.image import imread
 from matplotlib.text import Text
 
-from experiments.report.intervals import Interval
-from experiments.report.plots import Figure, Line, Panel, draw
+from coop.studies.report.intervals import Interval
+from coop.studies.report.plots import Figure, Line, Panel, draw
 
 SIZES = np.array([0.0, 50, 100, 200, 300, 500, 1000, 1500, 2000, 3000, 3500, 4000, 5000])
 
@@ -43,7 +43,7 @@ def test_no_size_covers_another(
         drawn.extend(map(labels, canvas.axes))
         return FigureCanvasPdf(canvas)
 
-    monkeypatch.setattr("experiments.report.plots.FigureCanvasPdf", pdf)
+    monkeypatch.setattr("coop.studies.report.plots.FigureCanvasPdf", pdf)
     draw(figure_of(["dqn", "coop"], panels, sizes), tmp_path / "figure.png")
     assert len(drawn) == panels
     for axis in drawn:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from common.types import Array
-from learner.edl.polar import polar, polar_by_svd, polar_of_product, whitened
+from coop.common.types import Array
+from coop.learner.edl.polar import polar, polar_by_svd, polar_of_product, whitened
 
 LIBRARIES = pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
 

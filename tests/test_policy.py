@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from actors.policy import Policy
-from common.networks.network import FlatNetwork, build_network
-from common.types import EnvSpec
+from coop.actors.policy import Policy
+from coop.common.networks.network import FlatNetwork, build_network
+from coop.common.types import EnvSpec
 
 SPEC = EnvSpec("made-up", (84, 84), "uint8", 4, 6)
 

@@ -7,9 +7,9 @@ import pytest
 from commands import run_command
 
 import coop
-from common.process.lifecycle import run_main
-from common.process.processes import ChildProcess
-from deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
+from coop.common.process.lifecycle import run_main
+from coop.common.process.processes import ChildProcess
+from coop.deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
 
 pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
 

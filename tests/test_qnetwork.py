@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from common.errors import UsageError
-from common.networks.network import build_network
-from common.settings.config import EdlSettings, NetworkSettings, RunConfig
-from common.types import Batch, EnvSpec
-from learner.edl.arrays import AnyArray
-from learner.edl.feedback import edl_gradients
-from learner.given import Given
-from learner.qnetwork import QNetwork, make_network, make_q_network
+from coop.common.errors import UsageError
+from coop.common.networks.network import build_network
+from coop.common.settings.config import EdlSettings, NetworkSettings, RunConfig
+from coop.common.types import Batch, EnvSpec
+from coop.learner.edl.arrays import AnyArray
+from coop.learner.edl.feedback import edl_gradients
+from coop.learner.given import Given
+from coop.learner.qnetwork import QNetwork, make_network, make_q_network
 
 CPU = torch.device("cpu")
 VECTOR = EnvSpec("made-up", (4,), "float32", 1, 3)

@@ -10,11 +10,11 @@ import torch
 from samples import make_segment
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from common.settings.tables import resolve
-from common.types import Batch, EnvSpec
-from learner.agent import Agent
-from learner.recorded import plain_call
-from replay.table.table import Table
+from coop.common.settings.tables import resolve
+from coop.common.types import Batch, EnvSpec
+from coop.learner.agent import Agent
+from coop.learner.recorded import plain_call
+from coop.replay.table.table import Table
 
 PICTURES = EnvSpec("pictures", (36, 36), "uint8", 4, 5)
 ON_HOST = ("_local_scalar_dense", "nonzero", "masked_select", "_to_copy", "item", "is_nonzero", "equal")

@@ -8,20 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import UsageError
-from common.registry import Registry
-from common.settings.methods import METHODS, Method
-from experiments.report.plots import OTHERS, _colour
+from coop.common.errors import UsageError
+from coop.common.registry import Registry
+from coop.common.settings.methods import METHODS, Method
+from coop.studies.report.plots import OTHERS, _colour
 
 MODULE = """
 from dataclasses import dataclass
 
 import numpy as np
 
-from common.settings.conditions import Condition
-from common.settings.methods import Method
-from common.settings.policies import EvictionPolicy, SamplingPolicy
-from replay.table.policies import Eviction, Sampling
+from coop.common.settings.conditions import Condition
+from coop.common.settings.methods import Method
+from coop.common.settings.policies import EvictionPolicy, SamplingPolicy
+from coop.replay.table.policies import Eviction, Sampling
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ EVICTION = EvictionPolicy("most-drawn", MostDrawn)
 SAMPLER = SamplingPolicy("newest", make_newest)
 """
 RULES = """
-from learner.methods.rule import Rule
+from coop.learner.methods.rule import Rule
 
 
 class Soft(Rule):
@@ -89,7 +89,7 @@ def package(tmp_path: Path) -> Path:
 
 def methods() -> Registry[Method]:
     return Registry(
-        "method", "coop.methods", Method, {"dqn": METHODS.get("dqn"), "medqn": "common.settings.medqn:MEDQN"}
+        "method", "coop.methods", Method, {"dqn": METHODS.get("dqn"), "medqn": "coop.common.settings.medqn:MEDQN"}
     )
 
 
@@ -130,8 +130,8 @@ def test_a_name_belongs_to_one(package: Path, monkeypatch: pytest.MonkeyPatch) -
     assert methods().get("dqn") is METHODS.get("dqn"), "no package takes the name of a method of ours"
 
 
-LOCKSTEP = "import sys; sys.argv[0] = 'coop-lockstep'; from deploy.commands import main; main()"
-OPTIONS = "from common.settings.options import RunOptions, parse_run; parse_run(RunOptions, 'coop-local', '')"
+LOCKSTEP = "import sys; sys.argv[0] = 'coop-lockstep'; from coop.deploy.commands import main; main()"
+OPTIONS = "from coop.records.run_options import RunOptions, parse_run; parse_run(RunOptions, 'coop-local', '')"
 
 
 def test_figures_have_the_methods_colours_and_other_ones_for_the_rest() -> None:
@@ -166,17 +166,17 @@ def test_a_run_with_parts_of_another_package(package: Path, tmp_path: Path) -> N
 
 def test_entry_points_of_the_backport_are_read_alike(package: Path) -> None:
     """Dask imports `importlib_metadata`, which takes the standard library's place in the whole process."""
-    code = "from common.settings.methods import METHODS; print(METHODS.get('soft-max').summary)"
+    code = "from coop.common.settings.methods import METHODS; print(METHODS.get('soft-max').summary)"
     run = python(package, f"import importlib_metadata; {code}")
     assert (run.stdout, run.stderr) == ("a mean of both\n", "")
 
 
 def test_the_replay_service_knows_every_name_without_torch() -> None:
     code = (
-        "import sys, replay.cli\n"
-        "from common.settings.tables import resolve\n"
-        "from common.types import EnvSpec\n"
-        "from replay.core import ReplayCore\n"
+        "import sys, coop.replay.cli\n"
+        "from coop.common.settings.tables import resolve\n"
+        "from coop.common.types import EnvSpec\n"
+        "from coop.replay.core import ReplayCore\n"
         "spec = EnvSpec('x', (4,), 'float32', 1, 2)\n"
         "for method in ('dqn', 'edql', 'g-coop', 'coop', 'medqn'):\n"
         "    ReplayCore(resolve({'replay': {'eviction': 'prioritized'}}, method), spec)\n"

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from common.errors import UsageError
-from common.process import notices
-from common.settings.config import LearnerSettings, RunConfig
-from common.settings.options import RunOptions, parse_run
-from common.settings.tables import load_tables, resolve, to_tables
-from experiments.sweep.grid import load_grid
+from coop.common.errors import UsageError
+from coop.common.process import notices
+from coop.common.settings.config import LearnerSettings, RunConfig
+from coop.common.settings.tables import load_tables, resolve, to_tables
+from coop.records.run_options import RunOptions, parse_run
+from coop.studies.sweep.grid import load_grid
 
 # The parts with other names of `config.toml` as version 0.1.0 wrote it, which held every field.
 OLD = """

@@ -10,26 +10,26 @@ import numpy as np
 import pytest
 from samples import await_service, make_segment, until
 
-from common.bounds import MAX_COUNT
-from common.errors import RunError
-from common.messaging.insert_client import InsertClient
-from common.messaging.keys import replay_key
-from common.messaging.links import locators
-from common.messaging.members import ROUTE
-from common.messaging.messages.answers import Ack, Retry
-from common.messaging.messages.epoch import Snapshot, Written
-from common.messaging.messages.insert import encode_segment
-from common.messaging.messages.sample import DrawRequest
-from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.sample_client import SampleClient
-from common.messaging.session import open_session
-from common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation
-from common.process.lifecycle import Stop
-from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
-from common.types import EnvSpec
-from replay.core import ReplayCore, Wait
-from replay.persistence.epochs import ReplayEpochs
-from replay.service import ReplayService
+from coop.common.bounds import MAX_COUNT
+from coop.common.errors import RunError
+from coop.common.messaging.insert_client import InsertClient
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.links import locators
+from coop.common.messaging.members import ROUTE
+from coop.common.messaging.messages.answers import Ack, Retry
+from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.insert import encode_segment
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation
+from coop.common.process.lifecycle import Stop
+from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+from coop.common.types import EnvSpec
+from coop.replay.core import ReplayCore, Wait
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.service import ReplayService
 
 CONFIG = RunConfig(
     run="test",
@@ -221,7 +221,7 @@ def test_segments_wait_behind_their_window_without_being_sent_again(
 def test_actors_share_what_may_be_in_flight(
     nodes: tuple[Node, Node], endpoint: str, spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("replay.service.IN_FLIGHT", 5)
+    monkeypatch.setattr("coop.replay.service.IN_FLIGHT", 5)
     server, client = nodes
     _serve(server, ReplayCore(CONFIG, spec), tmp_path, client)
 

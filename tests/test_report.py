@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.errors import RunError, UsageError
-from common.returns import running_mean
-from common.settings.tables import sealed_toml
-from experiments.lockstep import Lockstep
-from experiments.report import cli
-from experiments.report.figures import NETWORKS, figures
-from experiments.report.intervals import (
+from coop.common.errors import RunError, UsageError
+from coop.common.numbers import running_mean
+from coop.common.settings.tables import sealed_toml
+from coop.lockstep.lockstep import Lockstep
+from coop.records.run_directory import RunDirectory
+from coop.records.summary import summarise
+from coop.studies.report import cli
+from coop.studies.report.figures import NETWORKS, figures
+from coop.studies.report.intervals import (
     drawn_seeds,
     improvement,
     iqm,
@@ -30,14 +32,12 @@ from experiments.report.intervals import (
     profiles,
     tail,
 )
-from experiments.report.measures import breaking_point
-from experiments.report.paper import table_1
-from experiments.report.results import breaking_table
-from experiments.report.study import load_study
-from experiments.report.writer import write_report
-from experiments.sweep.grid import load_grid
-from learner.records.run_directory import RunDirectory
-from learner.records.summary import summarise
+from coop.studies.report.measures import breaking_point
+from coop.studies.report.paper import table_1
+from coop.studies.report.results import breaking_table
+from coop.studies.report.study import load_study
+from coop.studies.report.writer import write_report
+from coop.studies.sweep.grid import load_grid
 
 pytestmark = pytest.mark.timeout(300)  # eight small runs come before the first test
 GRID = """

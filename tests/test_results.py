@@ -11,15 +11,15 @@ import pandas as pd
 import pytest
 
 from benchmarks import feedback
-from experiments import controls, registered
-from experiments.film import Film
-from experiments.report import comparisons, results
-from experiments.report.baseline import baseline_table, find_baseline
-from experiments.report.measures import shorter_runs
-from experiments.report.sources import open_source
-from experiments.report.study import Study, load_study
-from experiments.saved import SavedRun
-from experiments.stacked import verdict
+from coop.evaluation.film import Film
+from coop.evaluation.saved import SavedRun
+from coop.studies import controls, registered
+from coop.studies.report import comparisons, results
+from coop.studies.report.baseline import baseline_table, find_baseline
+from coop.studies.report.measures import shorter_runs
+from coop.studies.report.sources import open_source
+from coop.studies.report.study import Study, load_study
+from coop.studies.stacked import verdict
 
 RESULTS = Path(__file__).parent.parent / "results"
 CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]

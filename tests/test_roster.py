@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-import learner.roster
-from common.errors import BadMessage, RunError
-from common.messaging.members import Origin
-from common.messaging.messages.join import Join
-from common.messaging.presence import LEASE
-from common.process.files import write_atomic
-from learner.roster import AlreadyServed, Roster
+import coop.learner.roster
+from coop.common.errors import BadMessage, RunError
+from coop.common.messaging.members import Origin
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.presence import LEASE
+from coop.common.process.files import write_atomic
+from coop.learner.roster import AlreadyServed, Roster
 
 
 def actor(incarnation: int, index: int = -1) -> Join:
@@ -38,7 +38,7 @@ def test_no_number_is_given_twice_also_after_a_restart_of_the_learner(tmp_path: 
 def test_many_actors_do_not_each_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     saved: list[bytes] = []
     monkeypatch.setattr(
-        learner.roster, "write_atomic", lambda path, data: (saved.append(data), write_atomic(path, data))
+        coop.learner.roster, "write_atomic", lambda path, data: (saved.append(data), write_atomic(path, data))
     )
     roster = Roster(tmp_path)
     assert [roster.actor(actor(incarnation)) for incarnation in range(1000)] == list(range(1000))

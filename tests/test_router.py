@@ -13,16 +13,16 @@ import pytest
 from commands import run_command
 from samples import until
 
-from common.errors import JoinError
-from common.messaging.keys import replay_key
-from common.messaging.links import close
-from common.messaging.messages.answers import Ack
-from common.messaging.route import RoutedReplay, open_client
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.lifecycle import Stop
-from common.process.processes import free_endpoint
-from deploy.router import links
+from coop.common.errors import JoinError
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.links import close
+from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.route import RoutedReplay, open_client
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.lifecycle import Stop
+from coop.common.process.processes import free_endpoint
+from coop.deploy.router import links
 
 wait_for = partial(until, seconds=60.0)
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from common.settings import schedules
-from common.settings.config import ActorSettings, EdlSettings, LearnerSettings
+from coop.common.settings import schedules
+from coop.common.settings.config import ActorSettings, EdlSettings, LearnerSettings
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,12 @@ import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
-from common.errors import BadMessage
-from common.messaging import wire
-from common.messaging.messages.status import LearnerStatus, Measured, Member, Ratio, Wait
-from common.process.display import LiveDisplay
-from deploy.screen import RunScreen, sparkline
-from deploy.watch import report
+from coop.common.errors import BadMessage
+from coop.common.messaging import wire
+from coop.common.messaging.messages.status import LearnerStatus, Measured, Member, Ratio, Wait
+from coop.monitor.display import LiveDisplay
+from coop.monitor.screen import RunScreen, sparkline
+from coop.monitor.watch import report
 
 EVENTS = [f"14:50:{number:02} actor {number} on node{number} (pid {number}) joined" for number in range(30)]
 STATUS = LearnerStatus(

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import INCARNATION, cut, record
 
-from actors.segments import SegmentAssembler
-from common.envs.protocol import Steps
-from common.settings.environment import EnvSettings
-from common.types import Array, EnvSpec, EpisodeEnd, Segment
+from coop.actors.segments import SegmentAssembler
+from coop.common.envs.protocol import Steps
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import Array, EnvSpec, EpisodeEnd, Segment
 
 
 def rebuilt(segments: list[Segment], spec: EnvSpec) -> dict[int, list[Array]]:

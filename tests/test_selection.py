@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from replay.table.policies import Floats, Rows, TableView
-from replay.table.selection import Fifo, LowestPriority, Proportional, Reservoir, SumTree, Uniform
+from coop.replay.table.policies import Floats, Rows, TableView
+from coop.replay.table.selection import Fifo, LowestPriority, Proportional, Reservoir, SumTree, Uniform
 
 
 def view(capacity: int, rng: np.random.Generator | None = None, priorities: Floats | None = None) -> TableView:

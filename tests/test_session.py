@@ -6,14 +6,14 @@ import sys
 
 import pytest
 
-from common.messaging.links import close
-from common.messaging.session import THREADS, open_session
+from coop.common.messaging.links import close
+from coop.common.messaging.session import THREADS, open_session
 
 ZENOHS = {"acc", "net", "rx", "tx"}
 OPEN = """
 import os, sys, time
 from pathlib import Path
-from common.messaging.session import open_session
+from coop.common.messaging.session import open_session
 
 process, there, *wanted = sys.argv[1:]
 before = dict(os.environ)

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import RunError, UsageError
-from common.settings.config import RunConfig, value_of
-from common.settings.medqn import MedqnSettings
-from common.settings.options import RunOptions, parse_run
-from common.settings.resuming import check_resumed
-from common.settings.sources import base_config
-from common.settings.tables import load_tables, preset_names, resolve, to_tables, to_toml, validated
+from coop.common.errors import RunError, UsageError
+from coop.common.settings.config import RunConfig, value_of
+from coop.common.settings.medqn import MedqnSettings
+from coop.common.settings.resuming import check_resumed
+from coop.common.settings.tables import load_tables, preset_names, resolve, to_tables, to_toml, validated
+from coop.records.run_options import RunOptions, parse_run
+from coop.records.sources import base_config
 
 METHODS = ["dqn", "edql", "g-coop", "coop", "medqn", "stream-q"]
 

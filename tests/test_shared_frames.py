@@ -13,25 +13,25 @@ import numpy as np
 import pytest
 from samples import await_service, make_segment
 
-from common.errors import BadMessage
-from common.messaging.keys import replay_key
-from common.messaging.messages.insert import encode_segment
-from common.messaging.messages.sample import BatchReader, DrawRequest, Memory, NamedBatchReader
-from common.messaging.sample_client import SampleClient
-from common.messaging.session import open_session
-from common.messaging.shared_frames import SharedFrames
-from common.messaging.transport import Node, Refused, new_incarnation
-from common.messaging.wire import Message
-from common.process.lifecycle import Stop
-from common.process.shared_memory import SharedMemory, SharedMemoryReader
-from common.settings.config import LearnerSettings, ReplaySettings, RunConfig
-from common.types import Batch, EnvSpec
-from replay.core import ReplayCore, Reply
-from replay.persistence.epochs import ReplayEpochs
-from replay.persistence.journal import Journal
-from replay.persistence.recovery import recover
-from replay.service import ReplayService
-from replay.table.frames import FIRST_SLOTS
+from coop.common.errors import BadMessage
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.insert import encode_segment
+from coop.common.messaging.messages.sample import BatchReader, DrawRequest, Memory, NamedBatchReader
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.session import open_session
+from coop.common.messaging.shared_frames import SharedFrames
+from coop.common.messaging.transport import Node, Refused, new_incarnation
+from coop.common.messaging.wire import Message
+from coop.common.process.lifecycle import Stop
+from coop.common.process.shared_memory import SharedMemory, SharedMemoryReader
+from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+from coop.common.types import Batch, EnvSpec
+from coop.replay.core import ReplayCore, Reply
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.journal import Journal
+from coop.replay.persistence.recovery import recover
+from coop.replay.service import ReplayService
+from coop.replay.table.frames import FIRST_SLOTS
 
 SPEC = EnvSpec("pictures", (12, 12), "uint8", 1, 2)
 CONFIG = RunConfig(
@@ -88,7 +88,7 @@ def test_batches_are_equal_while_the_table_grows_and_evicts(
     nodes: tuple[Node, Node], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server, asker = nodes
-    monkeypatch.setattr("replay.service.encode_batch", None)  # no frame travels
+    monkeypatch.setattr("coop.replay.service.encode_batch", None)  # no frame travels
     config = replace(CONFIG, replay=replace(CONFIG.replay, capacity=3 * FIRST_SLOTS))
     core, twin = ReplayCore(config, SPEC, shared_memory=True), ReplayCore(config, SPEC)
     _serve(server, core, tmp_path, asker)
@@ -227,7 +227,7 @@ def test_the_journal_does_not_know_the_memory(tmp_path: Path) -> None:
 
 WRITER = """
 import sys
-from common.process.shared_memory import SharedMemory
+from coop.common.process.shared_memory import SharedMemory
 memory = SharedMemory(4096)
 memory.mapped[:5] = b"first"
 print(memory.address, flush=True)

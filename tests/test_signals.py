@@ -11,8 +11,8 @@ import pytest
 from commands import run_command
 from test_topology import lines, running, wait_for
 
-from common.errors import PeerLost
-from common.process.lifecycle import Stop
+from coop.common.errors import PeerLost
+from coop.common.process.lifecycle import Stop
 
 pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
 
@@ -46,7 +46,7 @@ def test_while_a_command_starts(name: str, number: signal.Signals, tmp_path: Pat
 
 INSIDE_WAIT = """
 import os, signal, time
-from common.process.lifecycle import Stop
+from coop.common.process.lifecycle import Stop
 stop = Stop()
 stop.on_signals()
 with stop._changed:  # as `wait` does for a moment

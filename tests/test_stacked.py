@@ -7,8 +7,8 @@ import pytest
 import torch
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 
-from common.errors import UsageError
-from common.settings.config import (
+from coop.common.errors import UsageError
+from coop.common.settings.config import (
     ActorSettings,
     EdlSettings,
     LearnerSettings,
@@ -16,15 +16,15 @@ from common.settings.config import (
     ReplaySettings,
     RunConfig,
 )
-from common.settings.environment import EnvSettings
-from common.types import Batch, EnvSpec
-from experiments.stacked import networks
-from experiments.stacked.cartpole import Chance, bits, keys_of, move, normal
-from experiments.stacked.networks import Shape
-from experiments.stacked.settings import Runs, StackSettings, from_config
-from experiments.stacked.stack import Stack
-from learner.agent import Agent
-from learner.edl.feedback import feedback_matrices
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import Batch, EnvSpec
+from coop.learner.agent import Agent
+from coop.learner.edl.feedback import feedback_matrices
+from coop.studies.stacked import networks
+from coop.studies.stacked.cartpole import Chance, bits, keys_of, move, normal
+from coop.studies.stacked.networks import Shape
+from coop.studies.stacked.settings import Runs, StackSettings, from_config
+from coop.studies.stacked.stack import Stack
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 CPU = torch.device("cpu")

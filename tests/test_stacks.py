@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import Seen, cut, record
 
-from common.settings.environment import EnvSettings
-from common.types import EnvSpec
-from replay.table.table import Table
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import EnvSpec
+from coop.replay.table.table import Table
 
 
 @cache

@@ -3,14 +3,14 @@
 import pytest
 from msgspec.structs import replace
 
-from common.messaging.members import Origin
-from common.messaging.messages.join import Join
-from common.messaging.messages.status import ActorStatus, Held, Member, Ratio, ReplayStatus, Wait
-from common.process.rates import Rate
-from learner.members import FORGOTTEN, MemberTracker
-from learner.return_history import ReturnHistory
-from learner.status import waits
-from replay.gate import HOLD, Gate
+from coop.common.messaging.members import Origin
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.status import ActorStatus, Held, Member, Ratio, ReplayStatus, Wait
+from coop.common.process.rates import Rate
+from coop.learner.members import FORGOTTEN, MemberTracker
+from coop.learner.return_history import ReturnHistory
+from coop.learner.status import waits
+from coop.replay.gate import HOLD, Gate
 
 
 def test_who_waits_for_whom() -> None:

@@ -19,18 +19,18 @@ import torch
 from commands import run_command
 
 import coop
-from common.errors import RunError, UsageError
-from common.imports import hand_over, import_module, permit, remember
-from common.process import untrusted
-from common.process.checkpoints import read_manifest, write_manifest
-from common.process.files import LineFile, measure, write_atomic
-from common.process.summaries import SUMMARY, read_summary, summary_text
-from common.process.untrusted import check_links, check_run_name, check_torch_file, load_array
-from common.settings.tables import sealed_toml
-from experiments.report import packed
-from experiments.report.packed import PackedStudy, unpack
-from experiments.report.sources import open_source
-from experiments.sweep.grid import parse_grid
+from coop.common.errors import RunError, UsageError
+from coop.common.imports import hand_over, import_module, permit, remember
+from coop.common.process import untrusted
+from coop.common.process.files import LineFile, measure, write_atomic
+from coop.common.process.untrusted import check_links, check_run_name, check_torch_file, load_array
+from coop.common.settings.tables import sealed_toml
+from coop.records.checkpoints import read_manifest, write_manifest
+from coop.records.summaries import SUMMARY, read_summary, summary_text
+from coop.studies.report import packed
+from coop.studies.report.packed import PackedStudy, unpack
+from coop.studies.report.sources import open_source
+from coop.studies.sweep.grid import parse_grid
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -249,9 +249,9 @@ def test_reading_records_runs_nothing(trained: Path, tmp_path: Path) -> None:
 
 def test_one_s_own_run_is_known_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The module that a run was trained with may lie beside it, as long as it is that file and that run."""
-    monkeypatch.setattr("common.imports._handed_over", [])
-    monkeypatch.setattr("common.imports._named", set())
-    monkeypatch.setattr("common.imports._files", {})
+    monkeypatch.setattr("coop.common.imports._handed_over", [])
+    monkeypatch.setattr("coop.common.imports._named", set())
+    monkeypatch.setattr("coop.common.imports._files", {})
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(sys, "path", [*sys.path])
     here = tmp_path / "here"
@@ -267,7 +267,7 @@ def test_one_s_own_run_is_known_again(tmp_path: Path, monkeypatch: pytest.Monkey
     permit(["my_trained:Room"])
     import_module("my_trained", "env.id")
     remember(run)
-    monkeypatch.setattr("common.imports._named", set())
+    monkeypatch.setattr("coop.common.imports._named", set())
     del sys.modules["my_trained"]
     import_module("my_trained", "env.id")
     del sys.modules["my_trained"]

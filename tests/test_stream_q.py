@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from common.errors import UsageError
-from common.networks.network import FlatNetwork, sample_inputs
-from common.networks.normalised import NormalisedNetwork
-from common.networks.sparse import sparse_, sparse_network
-from common.settings.config import LearnerSettings, NetworkSettings, RunConfig
-from common.settings.stream_q import StreamQSettings
-from common.types import Array, EnvSpec
-from learner.methods.moments import RewardScale, RunningMoments
-from learner.methods.stream_q import StreamAgent, Transition
-from learner.methods.traces import Traces, bounded_step
+from coop.common.errors import UsageError
+from coop.common.networks.network import FlatNetwork, sample_inputs
+from coop.common.networks.normalised import NormalisedNetwork
+from coop.common.networks.sparse import sparse_, sparse_network
+from coop.common.settings.config import LearnerSettings, NetworkSettings, RunConfig
+from coop.common.settings.stream_q import StreamQSettings
+from coop.common.types import Array, EnvSpec
+from coop.learner.methods.moments import RewardScale, RunningMoments
+from coop.learner.methods.stream_q import StreamAgent, Transition
+from coop.learner.methods.traces import Traces, bounded_step
 
 ONE = EnvSpec("one", (1,), "float32", 1, 2)
 FOUR = EnvSpec("four", (4,), "float32", 1, 3)

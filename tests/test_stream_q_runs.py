@@ -11,16 +11,16 @@ import torch
 from safetensors.numpy import load_file
 
 import coop
-from common.networks.normalised import NormalisedNetwork
-from common.settings.stream_q import StreamQSettings
-from common.settings.tables import resolve, to_toml
-from experiments.export import export
-from experiments.report.comparisons import paired_table, sizes_table
-from experiments.report.figures import buffers, figures
-from experiments.report.plots import draw
-from experiments.report.results import aggregate_table, breaking_table, settings_table, tables
-from experiments.report.study import Study, load_study
-from experiments.sweep.grid import load_grid
+from coop.common.networks.normalised import NormalisedNetwork
+from coop.common.settings.stream_q import StreamQSettings
+from coop.common.settings.tables import resolve, to_toml
+from coop.evaluation.export import export
+from coop.studies.report.comparisons import paired_table, sizes_table
+from coop.studies.report.figures import buffers, figures
+from coop.studies.report.plots import draw
+from coop.studies.report.results import aggregate_table, breaking_table, settings_table, tables
+from coop.studies.report.study import Study, load_study
+from coop.studies.sweep.grid import load_grid
 
 COMMAND = str(Path(sysconfig.get_path("scripts")) / "coop-lockstep")
 

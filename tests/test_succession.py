@@ -14,23 +14,23 @@ import zenoh
 from samples import await_service, make_segment
 from test_topology import lines, running, wait_for
 
-from common.messaging.insert_client import InsertClient
-from common.messaging.keys import replay_key, status_key
-from common.messaging.messages.answers import Ack, Retry
-from common.messaging.messages.insert import encode_segment
-from common.messaging.messages.sample import DrawRequest
-from common.messaging.messages.status import LearnerStatus
-from common.messaging.route import ReplayRoute
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.lifecycle import Stop
-from common.process.processes import free_endpoint
-from common.settings.config import RunConfig
-from common.types import EnvSpec
-from learner.records.epochs import newest_epoch
-from replay.core import ReplayCore
-from replay.persistence.epochs import ReplayEpochs
-from replay.service import ReplayService
+from coop.common.messaging.insert_client import InsertClient
+from coop.common.messaging.keys import replay_key, status_key
+from coop.common.messaging.messages.answers import Ack, Retry
+from coop.common.messaging.messages.insert import encode_segment
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.status import LearnerStatus
+from coop.common.messaging.route import ReplayRoute
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.lifecycle import Stop
+from coop.common.process.processes import free_endpoint
+from coop.common.settings.config import RunConfig
+from coop.common.types import EnvSpec
+from coop.records.kept import newest_epoch
+from coop.replay.core import ReplayCore
+from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.service import ReplayService
 
 pytestmark = pytest.mark.timeout(300)  # processes that start one after the other, also on a busy machine
 

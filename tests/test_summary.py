@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from common.settings.config import RunConfig
-from common.settings.environment import EnvSettings
-from learner.records.run_directory import RunDirectory
-from learner.records.summary import Summary
+from coop.common.settings.config import RunConfig
+from coop.common.settings.environment import EnvSettings
+from coop.records.run_directory import RunDirectory
+from coop.records.summary import Summary
 
 
 @pytest.mark.parametrize(

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from common.errors import UsageError
-from common.settings.medqn import MedqnSettings
-from common.settings.tables import resolve
-from experiments.sweep.cli import SweepOptions, chosen, main
-from experiments.sweep.folder import CellFolder
-from experiments.sweep.grid import load_grid, shipped_grids
-from experiments.sweep.local import LocalProcesses
+from coop.common.errors import UsageError
+from coop.common.settings.medqn import MedqnSettings
+from coop.common.settings.tables import resolve
+from coop.studies.sweep.cli import SweepOptions, chosen, main
+from coop.studies.sweep.folder import CellFolder
+from coop.studies.sweep.grid import load_grid, shipped_grids
+from coop.studies.sweep.local import LocalProcesses
 
 pytestmark = pytest.mark.timeout(300)  # a dozen processes, one after the other, also on a machine that is busy
 SCRIPTS = Path(sysconfig.get_path("scripts"))

@@ -13,9 +13,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from table_reference import Copies, Stream, check_references, held_ids, make_spec, whole_state
 
-from common.settings.policies import EVICTIONS, SAMPLERS
-from common.types import Batch
-from replay.table.table import Table
+from coop.common.settings.policies import EVICTIONS, SAMPLERS
+from coop.common.types import Batch
+from coop.replay.table.table import Table
 
 
 def assert_same(one: Batch, other: Batch) -> None:

@@ -10,12 +10,12 @@ from msgspec.structs import replace
 from samples import make_segment
 from table_reference import Copies, Stream, check_references, make_spec, whole_state
 
-from common.errors import UsageError
-from common.settings.capacity import estimated_bytes
-from common.types import Batch, EnvSpec, Segment
-from replay.stats import reuse_histogram
-from replay.table import streams
-from replay.table.table import Table
+from coop.common.errors import UsageError
+from coop.common.settings.capacity import estimated_bytes
+from coop.common.types import Batch, EnvSpec, Segment
+from coop.replay.stats import reuse_histogram
+from coop.replay.table import streams
+from coop.replay.table.table import Table
 
 
 def test_terminal_transitions_are_counted_as_they_come_and_go(spec: EnvSpec) -> None:

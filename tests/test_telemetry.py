@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from common.settings.sources import base_config
-from experiments.lockstep import Lockstep
-from learner.records.run_directory import RunDirectory
-from learner.telemetry import powers_of_two
+from coop.learner.telemetry import powers_of_two
+from coop.lockstep.lockstep import Lockstep
+from coop.records.run_directory import RunDirectory
+from coop.records.sources import base_config
 
 
 @pytest.mark.parametrize(

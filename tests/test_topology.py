@@ -18,8 +18,8 @@ import pytest
 import torch
 from commands import run_command
 
-from experiments.reexecute import reexecute
-from learner.records.epochs import load_learner
+from coop.lockstep.reexecute import reexecute
+from coop.records.kept import load_learner
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 
@@ -264,5 +264,5 @@ def test_bad_flags_of_a_command() -> None:
 
 
 def test_replay_runs_without_torch() -> None:
-    code = "import sys, replay.cli; sys.exit(bool({'torch', 'gymnasium'} & sys.modules.keys()))"
+    code = "import sys, coop.replay.cli; sys.exit(bool({'torch', 'gymnasium'} & sys.modules.keys()))"
     assert subprocess.run([SCRIPTS / "python", "-c", code], check=False).returncode == 0

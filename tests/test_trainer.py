@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from samples import make_segment
 
-from common.messaging.messages.sample import Drawn, EpisodeRecord
-from common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
-from common.types import Batch, EnvSpec, EpisodeEnd
-from learner.agent import Agent
-from learner.trainer import Effects, Trainer
-from replay.table.table import Table
+from coop.common.messaging.messages.sample import Drawn, EpisodeRecord
+from coop.common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
+from coop.common.types import Batch, EnvSpec, EpisodeEnd
+from coop.learner.agent import Agent
+from coop.learner.trainer import Effects, Trainer
+from coop.replay.table.table import Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 CONFIG = RunConfig(

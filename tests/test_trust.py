@@ -14,19 +14,19 @@ import pytest
 import zenoh
 from samples import until
 
-from common.messaging.keys import evaluations_key, join_key, replay_key
-from common.messaging.members import ROUTE
-from common.messaging.messages.epoch import Snapshot
-from common.messaging.messages.evaluate import Evaluated, EvaluationRow
-from common.messaging.messages.join import Join, Leave
-from common.messaging.messages.limits import Limit
-from common.messaging.messages.sample import DrawRequest
-from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.messages.stop import EndOfRun
-from common.messaging.messages.weights import Current
-from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
-from common.process.processes import ChildProcess, command, free_endpoint
+from coop.common.messaging.keys import evaluations_key, join_key, replay_key
+from coop.common.messaging.members import ROUTE
+from coop.common.messaging.messages.epoch import Snapshot
+from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow
+from coop.common.messaging.messages.join import Join, Leave
+from coop.common.messaging.messages.limits import Limit
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.weights import Current
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
+from coop.common.process.processes import ChildProcess, command, free_endpoint
 
 MAKE_KEYS = Path(__file__).parents[1] / "deploy" / "zenoh" / "make_keys.sh"
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="the script that makes keys needs openssl")

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from experiments.stacked import packed, verdict
+from coop.studies.stacked import packed, verdict
 
 RESULTS = Path(__file__).parent.parent / "results"
 EDL = RESULTS / "cartpole" / "edl"

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 import coop
-from common.process.cli import PACKAGE
-from common.settings.config import RunConfig
+from coop.common.process.cli import PACKAGE
+from coop.common.settings.config import RunConfig
 from website import pages, pictures, places, reference
 from website.assemble import assembled
 

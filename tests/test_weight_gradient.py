@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from common.networks.network import build_network
-from common.types import EnvSpec
-from learner.edl.feedback import edl_gradients
-from learner.edl.polar import polar, polar_of_product
+from coop.common.networks.network import build_network
+from coop.common.types import EnvSpec
+from coop.learner.edl.feedback import edl_gradients
+from coop.learner.edl.polar import polar, polar_of_product
 
 S = 0.3
 RNG = np.random.default_rng(0)

@@ -9,19 +9,19 @@ import zenoh
 from msgspec.structs import replace as changed
 from samples import await_service
 
-from actors.joined import make_policy
-from actors.policy import Policy
-from actors.weights import GRACE, WeightsFollower
-from common.errors import JoinError
-from common.messaging.keys import role_key, weights_key
-from common.messaging.messages.join import Joined
-from common.messaging.messages.weights import Role, Weights
-from common.messaging.transport import Node
-from common.networks.network import FlatNetwork, build_network
-from common.settings.config import NetworkSettings, RunConfig
-from common.types import EnvSpec
-from learner.agent import Agent
-from learner.broadcast import Broadcaster
+from coop.actors.joined import make_policy
+from coop.actors.policy import Policy
+from coop.actors.weights import GRACE, WeightsFollower
+from coop.common.errors import JoinError
+from coop.common.messaging.keys import role_key, weights_key
+from coop.common.messaging.messages.join import Joined
+from coop.common.messaging.messages.weights import Role, Weights
+from coop.common.messaging.transport import Node
+from coop.common.networks.network import FlatNetwork, build_network
+from coop.common.settings.config import NetworkSettings, RunConfig
+from coop.common.types import EnvSpec
+from coop.learner.agent import Agent
+from coop.learner.broadcast import Broadcaster
 
 CONFIG = RunConfig(method="coop", network=NetworkSettings(hidden=(8,)))
 
@@ -99,7 +99,7 @@ def test_an_actor_that_has_everything_asks_for_nothing(
     Broadcaster(learner, Agent(CONFIG, spec))
     follower = WeightsFollower(actor, own_policy(spec))
     refresh_until(follower, 0)
-    monkeypatch.setattr("actors.weights.GRACE", 0.02)
+    monkeypatch.setattr("coop.actors.weights.GRACE", 0.02)
     monkeypatch.setattr(follower, "fetch", lambda: pytest.fail("asked"))
     end = time.monotonic() + 0.06
     while time.monotonic() < end:
@@ -128,7 +128,7 @@ def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(nodes: tuple[No
 def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
     silent: str, nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("actors.weights.ANSWER_TIMEOUT", 0.1)
+    monkeypatch.setattr("coop.actors.weights.ANSWER_TIMEOUT", 0.1)
     learner, actor = nodes
     policy = own_policy(spec)
     follower = WeightsFollower(actor, policy)

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.errors import BadMessage
-from common.messaging import wire
+from coop.common.errors import BadMessage
+from coop.common.messaging import wire
 
 ARRAYS = hnp.arrays(
     st.sampled_from([np.dtype(name) for name in sorted(wire.DTYPES)]),

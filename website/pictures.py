@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from common.returns import running_mean
-from common.settings.methods import METHODS
-from experiments.report.measures import score
-from experiments.report.study import load_study
+from coop.common.numbers import running_mean
+from coop.common.settings.methods import METHODS
+from coop.studies.report.measures import score
+from coop.studies.report.study import load_study
 from website.pages import ROOT
 
 STUDIES = ROOT / "results" / "cartpole"

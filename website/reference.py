@@ -8,24 +8,24 @@ from typing import Any
 
 import pydantic
 
-from actors.cli import ActorOptions
-from common.bounds import MAX_INTEGER
-from common.process.flags import Flag, sections
-from common.settings.config import RunConfig
-from common.settings.methods import METHODS, table_of
-from common.settings.options import RunOptions, with_methods
-from common.settings.tables import load_tables, preset_names, resolve
-from deploy.local import LocalOptions
-from deploy.router import RouterOptions
-from deploy.watch import WatchOptions
-from experiments.evaluation_cli import EvalOptions
-from experiments.export_cli import ExportOptions
-from experiments.reexecute_cli import ReexecuteOptions
-from experiments.report.cli import ReportOptions
-from experiments.sweep.cli import SweepOptions
-from learner.cli import LearnerOptions
-from replay.cli import ReplayOptions
-from replay.limits_cli import LimitsOptions
+from coop.actors.cli import ActorOptions
+from coop.common.bounds import MAX_INTEGER
+from coop.common.process.flags import Flag, sections
+from coop.common.settings.config import RunConfig
+from coop.common.settings.methods import METHODS, table_of
+from coop.common.settings.tables import load_tables, preset_names, resolve
+from coop.deploy.local import LocalOptions
+from coop.deploy.router import RouterOptions
+from coop.evaluation.cli import EvalOptions
+from coop.evaluation.export_cli import ExportOptions
+from coop.learner.cli import LearnerOptions
+from coop.lockstep.reexecute_cli import ReexecuteOptions
+from coop.monitor.watch import WatchOptions
+from coop.records.run_options import RunOptions, with_methods
+from coop.replay.cli import ReplayOptions
+from coop.replay.limits_cli import LimitsOptions
+from coop.studies.report.cli import ReportOptions
+from coop.studies.sweep.cli import SweepOptions
 
 COMMANDS: dict[str, type[Any]] = {
     "coop-local": LocalOptions,

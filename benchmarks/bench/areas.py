@@ -138,7 +138,7 @@ def _overheads() -> Iterator[Comparison]:
 def _start() -> Iterator[Comparison]:
     waits = {
         "import torch": "torch",
-        "import learner.edl": "edl",
+        "import coop.learner.edl": "edl",
         "coop-local to its first update": "local",
         "coop-report of 336 runs": "report",
     }
@@ -195,7 +195,7 @@ TARGETS = (
     Target("updates of coop on nature, bfloat16", "updates/s", "in a topology", ("constant batch",), 0.95),
     Target("what users wait for", "seconds", "coop-report of 336 runs", (), 10.0, at_most=True),
     Target("what users wait for", "seconds", "coop-local to its first update", (), 3.0, at_most=True),
-    Target("what users wait for", "seconds", "import learner.edl", (), 1.5, at_most=True),
+    Target("what users wait for", "seconds", "import coop.learner.edl", (), 1.5, at_most=True),
     Target("learning cartpole", "seconds", "coop lockstep", RIVALS, 1 / 2, at_most=True),
     Target("learning minatar-breakout", "seconds", "coop lockstep", RIVALS, 1 / 3, at_most=True),
 )

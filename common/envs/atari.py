@@ -11,10 +11,10 @@ from ale_py.vector_env import AtariVectorEnv
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from common.envs.protocol import Steps
-from common.errors import UsageError
-from common.settings.environment import EnvSettings
-from common.types import Array, EnvSpec
+from coop.common.envs.protocol import Steps
+from coop.common.errors import UsageError
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import Array, EnvSpec
 
 FRAMES_PER_S = 60
 SCREEN = (210, 160)  # height, width

@@ -54,4 +54,4 @@ class Catch(gymnasium.Env[NDArray[np.uint8], np.int64]):
         return cells.repeat(CELL, axis=0).repeat(CELL, axis=1)
 
 
-gymnasium.register("coop/Catch-v0", entry_point="common.envs.catch:Catch")
+gymnasium.register("coop/Catch-v0", entry_point="coop.common.envs.catch:Catch")

@@ -12,11 +12,11 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from common.bounds import MAX_MAGNITUDE
-from common.errors import RunError, UsageError
-from common.imports import describe
-from common.process.notices import warn, warn_once
-from common.types import Array
+from coop.common.bounds import MAX_MAGNITUDE
+from coop.common.errors import RunError, UsageError
+from coop.common.imports import describe
+from coop.common.process.notices import warn, warn_once
+from coop.common.types import Array
 
 RAISED = (Exception, SystemExit)  # by users' code, which may end neither a process nor a run by itself
 _STEP = "gymnasium's step gives (observation, reward, terminated, truncated, info)"

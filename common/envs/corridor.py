@@ -53,4 +53,4 @@ def optimal_values(gamma: float) -> NDArray[np.float64]:
     return np.stack((left, right), axis=1)
 
 
-gymnasium.register("coop/Corridor-v0", entry_point="common.envs.corridor:Corridor", max_episode_steps=50)
+gymnasium.register("coop/Corridor-v0", entry_point="coop.common.envs.corridor:Corridor", max_episode_steps=50)

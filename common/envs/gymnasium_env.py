@@ -12,17 +12,17 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from common.bounds import LONGEST_EPISODE, MAX_ACTIONS, MAX_SIDE
-from common.envs.checked import RAISED, CheckedEnv
-from common.envs.observations import FrameMaker
-from common.envs.pictures import coloured
-from common.envs.protocol import Steps
-from common.envs.registry import find_registered
-from common.errors import UsageError
-from common.imports import describe
-from common.process.notices import warn_once
-from common.settings.environment import EnvSettings
-from common.types import Array, EnvSpec
+from coop.common.bounds import LONGEST_EPISODE, MAX_ACTIONS, MAX_SIDE
+from coop.common.envs.checked import RAISED, CheckedEnv
+from coop.common.envs.observations import FrameMaker
+from coop.common.envs.pictures import coloured
+from coop.common.envs.protocol import Steps
+from coop.common.envs.registry import find_registered
+from coop.common.errors import UsageError
+from coop.common.imports import describe
+from coop.common.process.notices import warn_once
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import Array, EnvSpec
 
 PICTURES_PER_S = 10.0  # where the environment does not say
 SLOWEST, FASTEST = 0.1, 1000.0  # pictures a second

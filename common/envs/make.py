@@ -10,11 +10,11 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from common.envs.protocol import FilmedEnv, VectorEnv
-from common.errors import UsageError
-from common.process.notices import warn_once
-from common.settings.environment import EnvSettings
-from common.types import EnvSpec
+from coop.common.envs.protocol import FilmedEnv, VectorEnv
+from coop.common.errors import UsageError
+from coop.common.process.notices import warn_once
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import EnvSpec
 
 ALE_VERSION = "5"
 
@@ -31,10 +31,10 @@ def make_vector_env(settings: EnvSettings, num_envs: int, seed: int, *, bounded:
         raise UsageError(f"envs: {num_envs} is not allowed; at least 1")
     seeds = np.random.SeedSequence(seed).generate_state(num_envs) & 0x7FFFFFFF  # ALE takes 31 bits
     if (game := _atari_game(settings)) is not None:
-        from common.envs.atari import AtariEnv  # noqa: PLC0415
+        from coop.common.envs.atari import AtariEnv  # noqa: PLC0415
 
         return AtariEnv(settings, game, seeds.tolist())
-    from common.envs.gymnasium_env import GymnasiumEnv  # noqa: PLC0415
+    from coop.common.envs.gymnasium_env import GymnasiumEnv  # noqa: PLC0415
 
     return GymnasiumEnv(settings, seeds.tolist(), bounded=bounded)
 
@@ -47,10 +47,10 @@ def make_filmed_env(settings: EnvSettings, seed: int) -> FilmedEnv:
     """
     (first,) = np.random.SeedSequence(seed).generate_state(1) & 0x7FFFFFFF
     if (game := _atari_game(settings)) is not None:
-        from common.envs.atari import FilmedAtari  # noqa: PLC0415
+        from coop.common.envs.atari import FilmedAtari  # noqa: PLC0415
 
         return FilmedAtari(settings, game, int(first))
-    from common.envs.gymnasium_env import FilmedGymnasium  # noqa: PLC0415
+    from coop.common.envs.gymnasium_env import FilmedGymnasium  # noqa: PLC0415
 
     return FilmedGymnasium(settings, int(first))
 
@@ -73,10 +73,10 @@ def env_spec(settings: EnvSettings) -> EnvSpec:
         UsageError: as `make_vector_env`.
     """
     if (game := _atari_game(settings)) is not None:
-        from common.envs.atari import atari_spec  # noqa: PLC0415
+        from coop.common.envs.atari import atari_spec  # noqa: PLC0415
 
         return atari_spec(settings, game)
-    from common.envs.gymnasium_env import gymnasium_spec  # noqa: PLC0415
+    from coop.common.envs.gymnasium_env import gymnasium_spec  # noqa: PLC0415
 
     return gymnasium_spec(settings)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from gymnasium.spaces import Box
 
-from common.envs.checked import of_flags
-from common.envs.pictures import grayscale, make_resizer
-from common.errors import UsageError
-from common.process.notices import warn_once
-from common.settings.environment import EnvSettings
-from common.types import Array
+from coop.common.envs.checked import of_flags
+from coop.common.envs.pictures import grayscale, make_resizer
+from coop.common.errors import UsageError
+from coop.common.process.notices import warn_once
+from coop.common.settings.environment import EnvSettings
+from coop.common.types import Array
 
 KEPT = ("uint8", "bool")  # dtypes that are stored as they are; all others become float32
 

@@ -8,7 +8,7 @@ from colorsys import hsv_to_rgb
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Array
+from coop.common.types import Array
 
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 

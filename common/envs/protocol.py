@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Array, EnvSpec
+from coop.common.types import Array, EnvSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,11 +10,11 @@ from importlib.metadata import EntryPoint, entry_points
 import gymnasium
 from gymnasium.envs.registration import EnvSpec, namespace
 
-from common.envs import catch as _registers_catch  # noqa: F401
-from common.envs import corridor as _registers_corridor  # noqa: F401
-from common.errors import UsageError
-from common.imports import describe, import_module
-from common.settings.environment import EnvSettings
+from coop.common.envs import catch as _registers_catch  # noqa: F401
+from coop.common.envs import corridor as _registers_corridor  # noqa: F401
+from coop.common.errors import UsageError
+from coop.common.imports import describe, import_module
+from coop.common.settings.environment import EnvSettings
 
 _PACKAGES = {"MinAtar": "minatar"}  # known packages by the namespace of their ids
 _ANY_NAMESPACE = "__root__"  # name of entry points that register ids of any namespace

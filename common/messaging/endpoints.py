@@ -8,7 +8,7 @@ import re
 import socket
 from collections.abc import Sequence
 
-from common.errors import UsageError
+from coop.common.errors import UsageError
 
 PORTS = ("tcp", "tls", "udp", "quic", "ws")  # protocols whose address is HOST:PORT
 OTHERS = ("unixsock-stream", "unixpipe", "serial", "vsock")

@@ -12,15 +12,15 @@ from typing import Protocol
 
 import msgspec
 
-from common.errors import BadMessage
-from common.messaging.keys import KeySpace, replay_key
-from common.messaging.messages.answers import Ack, Retry
-from common.messaging.messages.insert import encode_segment
-from common.messaging.repeating import BAD_ANSWER, NO_ANSWER, Backoff
-from common.messaging.transport import NoAnswer, Pending
-from common.messaging.wire import Message
-from common.process.lifecycle import Stop
-from common.types import Segment
+from coop.common.errors import BadMessage
+from coop.common.messaging.keys import KeySpace, replay_key
+from coop.common.messaging.messages.answers import Ack, Retry
+from coop.common.messaging.messages.insert import encode_segment
+from coop.common.messaging.repeating import BAD_ANSWER, NO_ANSWER, Backoff
+from coop.common.messaging.transport import NoAnswer, Pending
+from coop.common.messaging.wire import Message
+from coop.common.process.lifecycle import Stop
+from coop.common.types import Segment
 
 # Seconds. A segment may wait behind its whole window while the limiter admits segments one by one; a lost peer is
 # noticed sooner, by its link.

@@ -9,15 +9,15 @@ from typing import Any, Self
 
 import msgspec
 
-from common.errors import BadMessage, JoinError
-from common.messaging.endpoints import unknown_hosts
-from common.messaging.keys import join_key
-from common.messaging.messages.answers import Retry
-from common.messaging.messages.join import Join, Joined, Leave
-from common.messaging.transport import NoAnswer, Node, Refused
-from common.process.console import PeerMonitor, StallDetector
-from common.process.lifecycle import Stop
-from common.settings.tables import first_difference, identity
+from coop.common.errors import BadMessage, JoinError
+from coop.common.messaging.endpoints import unknown_hosts
+from coop.common.messaging.keys import join_key
+from coop.common.messaging.messages.answers import Retry
+from coop.common.messaging.messages.join import Join, Joined, Leave
+from coop.common.messaging.transport import NoAnswer, Node, Refused
+from coop.common.process.console import PeerMonitor, StallDetector
+from coop.common.process.lifecycle import Stop
+from coop.common.settings.tables import first_difference, identity
 
 RETRY_PAUSE = 0.1  # seconds
 HANDOVER_TIMEOUT = 5.0  # seconds that a replay service waits for another one to end; a dead one is given up sooner

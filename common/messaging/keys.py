@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Protocol
 
-from common.errors import BadMessage
+from coop.common.errors import BadMessage
 
 _INCARNATION = re.compile("0|[1-9a-f][0-9a-f]{0,15}")  # hexadecimal, as `Node` writes it
 REPLAY_SHARD = "0"

@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 from msgspec import Meta
 
-from common.bounded import Name
+from coop.common.bounded import Name
 
 ROLES = ("learner", "replay", "actor", "evaluator")
 ROUTE = "route"  # in place of a role: an actor's own connection to the replay service

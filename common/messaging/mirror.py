@@ -2,7 +2,7 @@
 
 The table keeps each frame in a slot and gives it a number that no other frame of this table ever gets. An answer to a
 draw names slots and numbers of its batch's frames, and carries those frames that the mirror lacks as far as the replay
-service knows (`replay.mirrored`). The learner compares the numbers before it reads a slot, so it can't read a wrong
+service knows (`coop.replay.mirrored`). The learner compares the numbers before it reads a slot, so it can't read a wrong
 frame; where it lacks one, it asks again, and a draw that is answered again carries all its frames.
 
 Nothing here does I/O. A mirror on another device needs the same attributes and the same two methods.
@@ -15,9 +15,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from common.messaging.messages.sample import NamedBatch
-from common.process.memory import GrowingRows
-from common.types import Array, EnvSpec
+from coop.common.messaging.messages.sample import NamedBatch
+from coop.common.process.memory import GrowingRows
+from coop.common.types import Array, EnvSpec
 
 FIRST_SLOTS = 1024
 GROWTH = 1.5

@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 import zenoh
 
-from common.errors import BadMessage
-from common.messaging.faults import Faults
-from common.messaging.keys import incarnation_of
-from common.messaging.members import ROLES, ROUTE
+from coop.common.errors import BadMessage
+from coop.common.messaging.faults import Faults
+from coop.common.messaging.keys import incarnation_of
+from coop.common.messaging.members import ROLES, ROUTE
 
 LEASE = 1.5  # seconds of silence after which a link is given up and the learner's last answer expires
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from common.process.lifecycle import Stop
+from coop.common.process.lifecycle import Stop
 
 NO_ANSWER = "the replay service does not answer"
 BAD_ANSWER = "the replay service's answer is bad"

@@ -13,11 +13,11 @@ from typing import Self
 
 import zenoh
 
-from common.errors import JoinError
-from common.messaging.members import ROUTE
-from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Node, Pending
-from common.process.lifecycle import Stop
+from coop.common.errors import JoinError
+from coop.common.messaging.members import ROUTE
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, Pending
+from coop.common.process.lifecycle import Stop
 
 RETRY_PAUSE = 0.1  # seconds
 CLOSING = "closing a route"  # name of a thread

@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from common.bounds import MAX_AHEAD
-from common.errors import BadMessage
-from common.messaging.keys import replay_key
-from common.messaging.messages.answers import Retry
-from common.messaging.messages.sample import (
+from coop.common.bounds import MAX_AHEAD
+from coop.common.errors import BadMessage
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.answers import Retry
+from coop.common.messaging.messages.sample import (
     NAMED,
     BatchReader,
     Drawn,
@@ -25,14 +25,14 @@ from common.messaging.messages.sample import (
     NamedBatch,
     NamedBatchReader,
 )
-from common.messaging.mirror import FrameMirror
-from common.messaging.repeating import BAD_ANSWER, NO_ANSWER, Backoff
-from common.messaging.shared_frames import SharedFrames
-from common.messaging.transport import NoAnswer, Node, Pending
-from common.messaging.wire import Message
-from common.process.lifecycle import Stop
-from common.settings.capacity import frame_bytes
-from common.types import Batch, EnvSpec
+from coop.common.messaging.mirror import FrameMirror
+from coop.common.messaging.repeating import BAD_ANSWER, NO_ANSWER, Backoff
+from coop.common.messaging.shared_frames import SharedFrames
+from coop.common.messaging.transport import NoAnswer, Node, Pending
+from coop.common.messaging.wire import Message
+from coop.common.process.lifecycle import Stop
+from coop.common.settings.capacity import frame_bytes
+from coop.common.types import Batch, EnvSpec
 
 MANY = 4  # batches are asked for one by one if more than one of so many frames came with the last answer
 TOGETHER = 1 << 24  # bytes of batches that are asked for in one request, unless it is a single one

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import zenoh
 
-from common.bounds import MAX_PAYLOAD
-from common.errors import RunError, UsageError
-from common.messaging.endpoints import check_endpoints, explain_listen_error, explain_shared_memory, zenoh_reason
-from common.messaging.links import never_linger, permit_many, wait_for_words
-from common.messaging.presence import LEASE
-from common.messaging.transport import NoAnswer
+from coop.common.bounds import MAX_PAYLOAD
+from coop.common.errors import RunError, UsageError
+from coop.common.messaging.endpoints import check_endpoints, explain_listen_error, explain_shared_memory, zenoh_reason
+from coop.common.messaging.links import never_linger, permit_many, wait_for_words
+from coop.common.messaging.presence import LEASE
+from coop.common.messaging.transport import NoAnswer
 
 MAX_LINKS = 1 << 16  # of a session; Zenoh's own limit is 1,000
 LONG_QUEUE, SHORT_QUEUE = 16, 4  # parts of messages, of 64 KiB each, that a link keeps memory for once it has sent them

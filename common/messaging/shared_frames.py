@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from common.errors import BadMessage
-from common.process.shared_memory import SharedMemoryReader
-from common.types import Array, EnvSpec
+from coop.common.errors import BadMessage
+from coop.common.process.shared_memory import SharedMemoryReader
+from coop.common.types import Array, EnvSpec
 
 
 class SharedFrames:

@@ -15,18 +15,18 @@ from typing import Any, Self
 
 import zenoh
 
-from common.errors import BadMessage, CoopError, RunError
-from common.messaging import wire
-from common.messaging.faults import Faults
-from common.messaging.keys import run_key, stop_key
-from common.messaging.links import close
-from common.messaging.messages.answers import Error
-from common.messaging.messages.status import Status
-from common.messaging.messages.stop import EndOfRun
-from common.messaging.presence import Presence
-from common.messaging.wire import Message
-from common.process.console import say, stamped
-from common.process.lifecycle import Stop
+from coop.common.errors import BadMessage, CoopError, RunError
+from coop.common.messaging import wire
+from coop.common.messaging.faults import Faults
+from coop.common.messaging.keys import run_key, stop_key
+from coop.common.messaging.links import close
+from coop.common.messaging.messages.answers import Error
+from coop.common.messaging.messages.status import Status
+from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.presence import Presence
+from coop.common.messaging.wire import Message
+from coop.common.process.console import say, stamped
+from coop.common.process.lifecycle import Stop
 
 ASK_TIMEOUT = 5.0  # seconds
 MOST_REFUSALS = 8  # lines that say what is wrong with messages of one key

@@ -1,7 +1,7 @@
 """The wire format: `[u32 magic][u32 header length][msgpack header][raw little-endian arrays, 64-byte aligned]`.
 
 Decoding views the arrays in place and never allocates a size that the sender states: it checks every length against the
-bytes that arrived. `common.messaging.messages` gives the fields of each kind of message their meaning.
+bytes that arrived. `coop.common.messaging.messages` gives the fields of each kind of message their meaning.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 import numpy as np
 
-from common.bounds import MAX_PAYLOAD
-from common.errors import BadMessage
-from common.types import Array
+from coop.common.bounds import MAX_PAYLOAD
+from coop.common.errors import BadMessage
+from coop.common.types import Array
 
 PROTOCOL = 8
 ON_DISK = frozenset({1, 2, 3, 4, 5, 6, 7, 8})  # protocols whose segments and batches on disk can be read

@@ -8,12 +8,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from common.networks.forward import DenseForward
-from common.networks.inputs import preprocess
-from common.networks.layout import digest, mlp_layout, size_of, views
-from common.process.threads import use_threads
-from common.settings.config import NetworkSettings
-from common.types import EnvSpec
+from coop.common.networks.forward import DenseForward
+from coop.common.networks.inputs import preprocess
+from coop.common.networks.layout import digest, mlp_layout, size_of, views
+from coop.common.process.threads import use_threads
+from coop.common.settings.config import NetworkSettings
+from coop.common.types import EnvSpec
 
 
 class ActingNetwork(Protocol):
@@ -36,7 +36,7 @@ class ActingNetwork(Protocol):
         ...
 
     def layout_digest(self) -> str:
-        """See `common.networks.layout.digest`."""
+        """See `coop.common.networks.layout.digest`."""
         ...
 
 
@@ -49,7 +49,7 @@ def acting_network(settings: NetworkSettings, spec: EnvSpec) -> ActingNetwork:
         return Mlp(spec, settings.hidden)
     import torch  # noqa: PLC0415 (see above)
 
-    from common.networks.network import FlatNetwork, build_network  # noqa: PLC0415
+    from coop.common.networks.network import FlatNetwork, build_network  # noqa: PLC0415
 
     use_threads(1)
     module = build_network(settings.kind, spec, settings.hidden, seed=0)
@@ -88,5 +88,5 @@ class Mlp:
         return self._forward(inputs.reshape(len(inputs), -1))
 
     def layout_digest(self) -> str:
-        """See `common.networks.layout.digest`."""
+        """See `coop.common.networks.layout.digest`."""
         return digest(self._layout)

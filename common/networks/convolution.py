@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from common.networks.dense import DTYPES, Dense
-from common.types import Array
+from coop.common.networks.dense import DTYPES, Dense
+from coop.common.types import Array
 
 _CACHED = 2**14  # numbers that the windows of one picture may hold to stay in the cache with those of a batch
 _SMALL = 2**18  # multiplications below which numpy's product is the faster one, with its shorter call

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from common.bounds import MAX_PAYLOAD
-from common.errors import UsageError
-from common.imports import describe, import_object
-from common.types import EnvSpec
+from coop.common.bounds import MAX_PAYLOAD
+from coop.common.errors import UsageError
+from coop.common.imports import describe, import_object
+from coop.common.types import EnvSpec
 
 
 def custom_network(kind: str, spec: EnvSpec, inputs: Tensor) -> nn.Module:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from common.networks.forward import DenseForward
+from coop.common.networks.forward import DenseForward
 
 DTYPES = (torch.float32, torch.float64)
 

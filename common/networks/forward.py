@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from common.types import Array
+from coop.common.types import Array
 
 
 class DenseForward:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common.networks.layout import ArrayT
-from common.types import EnvSpec
+from coop.common.networks.layout import ArrayT
+from coop.common.types import EnvSpec
 
 if TYPE_CHECKING:
     import torch

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from numpy.typing import NDArray
 
-from common.types import EnvSpec
+from coop.common.types import EnvSpec
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -14,15 +14,15 @@ import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself use
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from common.bounds import MAX_PAYLOAD
-from common.errors import UsageError
-from common.networks.convolution import ConvolutionNetwork
-from common.networks.custom import custom_network
-from common.networks.dense import Dense
-from common.networks.inputs import preprocess
-from common.networks.layout import ArrayT, Layout, digest, mlp_layout, views
-from common.networks.normalised import NormalisedNetwork
-from common.types import EnvSpec
+from coop.common.bounds import MAX_PAYLOAD
+from coop.common.errors import UsageError
+from coop.common.networks.convolution import ConvolutionNetwork
+from coop.common.networks.custom import custom_network
+from coop.common.networks.dense import Dense
+from coop.common.networks.inputs import preprocess
+from coop.common.networks.layout import ArrayT, Layout, digest, mlp_layout, views
+from coop.common.networks.normalised import NormalisedNetwork
+from coop.common.types import EnvSpec
 
 # (out channels, kernel, stride) of each convolution, then the width of the hidden linear layer.
 _CONV_NETWORKS: dict[str, tuple[tuple[tuple[int, int, int], ...], int]] = {
@@ -231,7 +231,7 @@ class FlatNetwork:
         return array
 
     def layout_digest(self) -> str:
-        """See `common.networks.layout.digest`."""
+        """See `coop.common.networks.layout.digest`."""
         return digest(self.layout)
 
     def q_values(self, obs: NDArray[Any], spec: EnvSpec) -> NDArray[Any]:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from common.types import Array
+from coop.common.types import Array
 
 Floats = NDArray[np.float32]
 _UNSCALED = np.ones((1, 1), np.float32)
@@ -90,7 +90,7 @@ class NormalisedNetwork:
 
     @staticmethod
     def fits(module: nn.Module) -> bool:
-        """Whether a network is one of `common.networks.sparse.sparse_network`, in float32 on the CPU."""
+        """Whether a network is one of `coop.common.networks.sparse.sparse_network`, in float32 on the CPU."""
         first = next(module.children(), None)
         return isinstance(first, Standardize) and first.mean.device.type == "cpu" and first.mean.dtype == torch.float32
 

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from common.errors import UsageError
-from common.networks.network import build_network, sample_inputs
-from common.networks.normalised import Standardize
-from common.types import EnvSpec
+from coop.common.errors import UsageError
+from coop.common.networks.network import build_network, sample_inputs
+from coop.common.networks.normalised import Standardize
+from coop.common.types import EnvSpec
 
 KINDS = ("mlp", "minatar")
 SPARSITY = 0.9

@@ -14,12 +14,12 @@ import tyro
 from tyro import _errors as tyro_errors  # private; pyproject.toml pins the version
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from common.errors import UsageError
-from common.places import absolute, user_path
-from common.process.flags import SHELLS, completion, placeholder, sections
-from common.process.help import full_help, short_help
-from common.process.lifecycle import Leave
-from common.suggestions import closest, not_among, refusal
+from coop.common.errors import UsageError
+from coop.common.places import absolute, user_path
+from coop.common.process.flags import SHELLS, completion, placeholder, sections
+from coop.common.process.help import full_help, short_help
+from coop.common.process.lifecycle import Leave
+from coop.common.suggestions import closest, not_among, refusal
 
 PACKAGE = "coop-rl"
 ANSWERS = ("--help", "--help-all", "--version", "--completion")

@@ -8,9 +8,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from common.process.files import NO_SPACE
-from common.process.output import out
-from common.returns import RETURN_WINDOW
+from coop.common.numbers import RETURN_WINDOW
+from coop.common.process.files import NO_SPACE
+from coop.common.process.output import out
 
 PROGRESS_EVERY = 10.0  # seconds
 STALL_AFTER = 5.0  # seconds without progress after which a line is printed

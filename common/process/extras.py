@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from common.errors import UsageError
+from coop.common.errors import UsageError
 
 
 def check_extra(flag: str, extra: str, module: str) -> None:

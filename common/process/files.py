@@ -12,9 +12,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from common.errors import RunError
-from common.process.output import keep_standard_files
-from common.process.untrusted import no_links
+from coop.common.errors import RunError
+from coop.common.process.output import keep_standard_files
+from coop.common.process.untrusted import no_links
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)  # error numbers
 PIECE = 1 << 24  # bytes read at once

@@ -16,7 +16,7 @@ from tyro._backends import _tyro_backend as tyro_backend
 SHELLS = ("bash", "zsh", "fish")
 
 HttpAddress = Annotated[str, tyro.conf.arg(metavar="[HOST:]PORT")]
-"""Where to serve HTTP; see `common.process.ports.http_address`."""
+"""Where to serve HTTP; see `coop.common.process.ports.http_address`."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
-from common.process.flags import SHELLS, Flag, Section
+from coop.common.process.flags import SHELLS, Flag, Section
 
 EXIT_STATUSES = (
     ("0", "It has done what it was asked to do."),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from common.process.output import complain
+from coop.common.process.output import complain
 
 _told: set[tuple[str, str]] = set()
 

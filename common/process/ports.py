@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import socket
 
-from common.errors import RunError, UsageError
+from coop.common.errors import RunError, UsageError
 
 LOOPBACK = "127.0.0.1"
 CONNECTING = 5.0  # seconds

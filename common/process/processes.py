@@ -14,11 +14,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from common.places import working_directory
-from common.process.lifecycle import SIGNALS, SUPERVISED, status_after
-from common.process.limits import memory_kills, memory_limit
-from common.process.locks import INHERITED
-from common.process.output import keep_standard_files
+from coop.common.places import working_directory
+from coop.common.process.lifecycle import SIGNALS, SUPERVISED, status_after
+from coop.common.process.limits import memory_kills, memory_limit
+from coop.common.process.output import keep_standard_files
+from coop.records.locks import INHERITED
 
 SIGNAL_STATUSES = tuple(map(status_after, SIGNALS))
 LAST_WORDS = 400  # characters of a log's line
@@ -152,7 +152,7 @@ def command(name: str, *flags: str) -> list[str]:
     """
     path = Path(sysconfig.get_path("scripts")) / name
     found = str(path) if path.exists() else shutil.which(name)
-    return [*([found] if found else [sys.executable, "-m", "deploy.commands", name]), *flags]
+    return [*([found] if found else [sys.executable, "-m", "coop.deploy.commands", name]), *flags]
 
 
 def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:

@@ -18,8 +18,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from common.errors import RunError, UsageError
-from common.types import Array
+from coop.common.errors import RunError, UsageError
+from coop.common.types import Array
 
 MAX_NAME_BYTES = 100
 MAX_TEXT = 1 << 30  # bytes of a text file that is read at once

@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from common.bounds import MAX_PAYLOAD
-from common.errors import UsageError
-from common.process.limits import memory_limit
-from common.settings.config import RunConfig
-from common.settings.policies import EVICTIONS
-from common.types import EnvSpec
+from coop.common.bounds import MAX_PAYLOAD
+from coop.common.errors import UsageError
+from coop.common.process.limits import memory_limit
+from coop.common.settings.config import RunConfig
+from coop.common.settings.policies import EVICTIONS
+from coop.common.types import EnvSpec
 
 ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4  # actions, rewards, terminated, span, param_version, ids, reuse
 SLOT_BYTES = 3 * 4 + 8  # counters of a frame's slot, and its number

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from pydantic import ConfigDict, Field
 
-from common.bounds import (
+from coop.common.bounds import (
     MAX_AHEAD,
     MAX_BATCH,
     MAX_ENV_ID,
@@ -22,13 +22,13 @@ from common.bounds import (
     MAX_STREAMS,
     MAX_TOLERANCE,
 )
-from common.errors import UsageError
-from common.process.untrusted import RUN
-from common.settings.environment import EnvSettings
-from common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
-from common.settings.methods import METHODS
-from common.settings.names import EvictionName, MethodName, SamplingName
-from common.settings.policies import EVICTIONS, SAMPLERS
+from coop.common.errors import UsageError
+from coop.common.process.untrusted import RUN
+from coop.common.settings.environment import EnvSettings
+from coop.common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
+from coop.common.settings.methods import METHODS
+from coop.common.settings.names import EvictionName, MethodName, SamplingName
+from coop.common.settings.policies import EVICTIONS, SAMPLERS
 
 OUTSIDE = ("checkpoint_every", "eval_every", "eval_episodes", "video_every")  # training does not depend on these
 OF_MACHINE = ("device", "threads", "mirror")  # of `learner`: a run may move to another machine

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 
-from common.settings.conditions import Condition
-from common.settings.config import RunConfig
-from common.settings.methods import METHODS, table_of
-from common.settings.policies import SAMPLERS
+from coop.common.settings.conditions import Condition
+from coop.common.settings.config import RunConfig
+from coop.common.settings.methods import METHODS, table_of
+from coop.common.settings.policies import SAMPLERS
 
 _OPTIMIZER = "learner.optimizer = {c.learner.optimizer!r} has none"
 # The warning gives the first condition that does not hold.

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from common.bounds import MAX_ENV_ID, MAX_FRAME_SKIP, MAX_GAME_STEPS, MAX_NOOPS, MAX_SIDE, MAX_STACK
-from common.settings.fields import Table
+from coop.common.bounds import MAX_ENV_ID, MAX_FRAME_SKIP, MAX_GAME_STEPS, MAX_NOOPS, MAX_SIDE, MAX_STACK
+from coop.common.settings.fields import Table
 
 Side = Annotated[int, Field(gt=0, le=MAX_SIDE)]
 

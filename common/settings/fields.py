@@ -12,7 +12,7 @@ import tomli_w
 from pydantic import AfterValidator, Field
 from tyro.constructors import PrimitiveConstructorSpec
 
-from common.bounds import MAX_INTEGER, MAX_KWARGS, MAX_STEPS
+from coop.common.bounds import MAX_INTEGER, MAX_KWARGS, MAX_STEPS
 
 Positive = Annotated[int, Field(gt=0, le=MAX_INTEGER)]
 Count = Annotated[int, Field(ge=0, le=MAX_INTEGER)]

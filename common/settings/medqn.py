@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from common.settings.conditions import Condition
-from common.settings.fields import NonNegative, Positive
-from common.settings.methods import Method
+from coop.common.settings.conditions import Condition
+from coop.common.settings.fields import NonNegative, Positive
+from coop.common.settings.methods import Method
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class MedqnSettings:
 MEDQN = Method(
     "medqn",
     "one network and its copy, gradient, stays near the copy",
-    rule="learner.methods.medqn:Consolidation",
+    rule="coop.learner.methods.medqn:Consolidation",
     settings=MedqnSettings,
     conditions=(
         Condition(("medqn.states",), lambda c: c.own.lambda_start + c.own.lambda_end > 0, "lambda is 0 throughout"),

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from common.registry import Registry
-from common.settings.conditions import Condition
+from coop.common.registry import Registry
+from coop.common.settings.conditions import Condition
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class Method:
         two_networks: two independent networks, each of which gives the other's targets; their roles swap every C
             updates. If False, the second network is a copy of the first, made every C updates, and gives the targets.
         error_driven: error-driven learning feeds the error back; if False, the ordinary gradient does.
-        rule: of the targets and the extra cost: a `learner.methods.rule.Rule`, or "module:Class" to import it in the
+        rule: of the targets and the extra cost: a `coop.learner.methods.rule.Rule`, or "module:Class" to import it in the
             learner only.
-        network: makes the Q-network, with the arguments and result of `common.networks.network.build_network`;
+        network: makes the Q-network, with the arguments and result of `coop.common.networks.network.build_network`;
             "module:function" to import it where networks are made.
-        stream: for a method without a replay buffer, its agent, a class like `learner.methods.stream_q:StreamAgent`,
+        stream: for a method without a replay buffer, its agent, a class like `coop.learner.methods.stream_q:StreamAgent`,
             or "module:Class"; such a method runs in lockstep only. None: updates with batches from a replay table.
         settings: a frozen dataclass of the method's own settings, which a config holds in the table `Method.table`.
         conditions: on which these settings have an effect.
@@ -35,8 +35,8 @@ class Method:
     summary: str
     two_networks: bool = False
     error_driven: bool = False
-    rule: str | Callable[..., Any] = "learner.methods.rule:Rule"
-    network: str | Callable[..., Any] = "common.networks.network:build_network"
+    rule: str | Callable[..., Any] = "coop.learner.methods.rule:Rule"
+    network: str | Callable[..., Any] = "coop.common.networks.network:build_network"
     stream: str | Callable[..., Any] | None = None
     settings: type[Any] | None = None
     conditions: tuple[Condition, ...] = ()
@@ -64,7 +64,7 @@ METHODS = Registry(
         "edql": Method("edql", "one network and its copy, error-driven", error_driven=True, colour="#009E73"),
         "g-coop": Method("g-coop", "two networks, gradient", two_networks=True, colour="#56B4E9"),
         "coop": Method("coop", "two networks, error-driven", True, True, colour="#D55E00"),
-        "medqn": "common.settings.medqn:MEDQN",
-        "stream-q": "common.settings.stream_q:STREAM_Q",
+        "medqn": "coop.common.settings.medqn:MEDQN",
+        "stream-q": "coop.common.settings.stream_q:STREAM_Q",
     },
 )

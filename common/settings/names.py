@@ -8,9 +8,9 @@ import tyro
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
-from common.registry import Registry
-from common.settings.methods import METHODS
-from common.settings.policies import EVICTIONS, SAMPLERS
+from coop.common.registry import Registry
+from coop.common.settings.methods import METHODS
+from coop.common.settings.policies import EVICTIONS, SAMPLERS
 
 
 def _known(registry: Registry[Any]) -> AfterValidator:

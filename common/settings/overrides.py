@@ -7,9 +7,9 @@ from dataclasses import asdict, fields
 from functools import reduce
 from typing import Any
 
-from common.errors import UsageError
-from common.settings.config import RunConfig
-from common.settings.methods import METHODS, table_of
+from coop.common.errors import UsageError
+from coop.common.settings.config import RunConfig
+from coop.common.settings.methods import METHODS, table_of
 
 _FieldPath = tuple[str, ...]  # in nested tables: ("learner", "optimizer")
 _FIELDS = {field.name for field in fields(RunConfig)}

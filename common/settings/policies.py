@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from common.registry import Registry
+from coop.common.registry import Registry
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Policy:
 
     Attributes:
         name: as the setting has it.
-        make: its class, a function of a `replay.table.policies.TableView`, or "module:Class" to import it in the
+        make: its class, a function of a `coop.replay.table.policies.TableView`, or "module:Class" to import it in the
             replay service only.
         priorities: it uses the priorities of transitions, which the learner then sends.
     """
@@ -52,9 +52,9 @@ EVICTIONS = Registry(
     "coop.evictions",
     EvictionPolicy,
     {
-        "fifo": EvictionPolicy("fifo", "replay.table.selection:Fifo", in_order=True),
-        "reservoir": EvictionPolicy("reservoir", "replay.table.selection:Reservoir"),
-        "prioritized": EvictionPolicy("prioritized", "replay.table.selection:LowestPriority", priorities=True),
+        "fifo": EvictionPolicy("fifo", "coop.replay.table.selection:Fifo", in_order=True),
+        "reservoir": EvictionPolicy("reservoir", "coop.replay.table.selection:Reservoir"),
+        "prioritized": EvictionPolicy("prioritized", "coop.replay.table.selection:LowestPriority", priorities=True),
     },
 )
 SAMPLERS = Registry(
@@ -62,7 +62,7 @@ SAMPLERS = Registry(
     "coop.samplers",
     SamplingPolicy,
     {
-        "uniform": SamplingPolicy("uniform", "replay.table.selection:Uniform", without_replacement=True),
-        "prioritized": SamplingPolicy("prioritized", "replay.table.selection:Proportional", priorities=True),
+        "uniform": SamplingPolicy("uniform", "coop.replay.table.selection:Uniform", without_replacement=True),
+        "prioritized": SamplingPolicy("prioritized", "coop.replay.table.selection:Proportional", priorities=True),
     },
 )

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from common.errors import UsageError
-from common.process.notices import note_renamed
-from common.settings.config import LearnerSettings
-from common.settings.environment import EnvSettings
+from coop.common.errors import UsageError
+from coop.common.process.notices import note_renamed
+from coop.common.settings.config import LearnerSettings
+from coop.common.settings.environment import EnvSettings
 
 _RENAMED = {
     "replay": {"start": "learning_starts"},

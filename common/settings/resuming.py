@@ -6,10 +6,10 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from common.errors import RunError, UsageError
-from common.settings.config import OF_MACHINE, OUTSIDE, RunConfig
-from common.settings.overrides import leaves
-from common.settings.tables import to_tables
+from coop.common.errors import RunError, UsageError
+from coop.common.settings.config import OF_MACHINE, OUTSIDE, RunConfig
+from coop.common.settings.overrides import leaves
+from coop.common.settings.tables import to_tables
 
 _FREE = (*OUTSIDE, "target_return")
 _TELLS_APART = (("run",), ("method",), ("seed",), ("env", "id"))

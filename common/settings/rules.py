@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
-from common.errors import UsageError
-from common.settings.config import NETWORK_KINDS, RunConfig
-from common.settings.environment import EnvSettings
-from common.settings.policies import SAMPLERS
+from coop.common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
+from coop.common.errors import UsageError
+from coop.common.settings.config import NETWORK_KINDS, RunConfig
+from coop.common.settings.environment import EnvSettings
+from coop.common.settings.policies import SAMPLERS
 
 
 def check_rules(config: RunConfig) -> None:

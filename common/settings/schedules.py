@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # `experiments.stacked` runs where the settings' checks are not installed
-    from common.settings.config import ActorSettings, EdlSettings, LearnerSettings
+if TYPE_CHECKING:  # `coop.studies.stacked` runs where the settings' checks are not installed
+    from coop.common.settings.config import ActorSettings, EdlSettings, LearnerSettings
 
 
 def epsilon(settings: ActorSettings, env_step: int) -> float:

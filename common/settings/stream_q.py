@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common.settings.conditions import Condition
-from common.settings.fields import PositiveFloat, PositiveShare, Share
-from common.settings.methods import Method
+from coop.common.settings.conditions import Condition
+from coop.common.settings.fields import PositiveFloat, PositiveShare, Share
+from coop.common.settings.methods import Method
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ _UNUSED = (
 STREAM_Q = Method(
     "stream-q",
     "one network, gradient, no replay buffer and no target network; lockstep only",
-    network="common.networks.sparse:sparse_network",
-    stream="learner.methods.stream_q:StreamAgent",
+    network="coop.common.networks.sparse:sparse_network",
+    stream="coop.learner.methods.stream_q:StreamAgent",
     settings=StreamQSettings,
     conditions=(
         Condition(_UNUSED, lambda c: False, "{c.method} learns from each step once, with settings of its own"),

@@ -13,15 +13,15 @@ from typing import Any
 import pydantic
 import tomli_w
 
-from common.errors import RunError, UsageError
-from common.process.run_ids import has_run_id
-from common.process.untrusted import MAX_SETTINGS, read_text
-from common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
-from common.settings.methods import METHODS
-from common.settings.overrides import merged, of_method
-from common.settings.renamed import current, with_stack
-from common.settings.rules import check_rules
-from common.suggestions import not_among
+from coop.common.errors import RunError, UsageError
+from coop.common.process.untrusted import MAX_SETTINGS, read_text
+from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
+from coop.common.settings.methods import METHODS
+from coop.common.settings.overrides import merged, of_method
+from coop.common.settings.renamed import current, with_stack
+from coop.common.settings.rules import check_rules
+from coop.common.suggestions import not_among
+from coop.records.run_ids import has_run_id
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
 CONFIG = "config.toml"
@@ -31,7 +31,7 @@ _FIELDS = [field.name for field in fields(RunConfig) if field.name != "own"]
 
 def preset_names() -> list[str]:
     """The presets that come with the package."""
-    entries = files("common.settings").joinpath("presets").iterdir()
+    entries = files("coop.common.settings").joinpath("presets").iterdir()
     return sorted(entry.name.removesuffix(".toml") for entry in entries if entry.is_file())
 
 
@@ -55,7 +55,7 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
 
 def _preset(*place: str) -> dict[str, Any]:
     """Read a file under presets/, merged over the one in presets/bases/ that it extends."""
-    tables = tomllib.loads(files("common.settings").joinpath("presets", *place).read_text(encoding="utf-8"))
+    tables = tomllib.loads(files("coop.common.settings").joinpath("presets", *place).read_text(encoding="utf-8"))
     base = tables.pop("extends", None)
     return tables if base is None else merged(_preset("bases", f"{base}.toml"), tables)
 

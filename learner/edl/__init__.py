@@ -1,5 +1,5 @@
 """Error-driven learning: passes through a network, layer by layer, and the feedback B = U (S + sI) V^T."""
 
-from learner.edl.feedback import edl_gradients, feedback_matrices
+from coop.learner.edl.feedback import edl_gradients, feedback_matrices
 
 __all__ = ["edl_gradients", "feedback_matrices"]

@@ -8,9 +8,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself uses
 from torch import Tensor, nn
 
-from common.networks.network import layer_functions
-from learner.edl.arrays import in_dtype
-from learner.edl.passes import Passes, Tape, UnsupportedLayerError
+from coop.common.networks.network import layer_functions
+from coop.learner.edl.arrays import in_dtype
+from coop.learner.edl.passes import Passes, Tape, UnsupportedLayerError
 
 Parametrised = nn.Linear | nn.Conv2d
 

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from learner.edl import kernels
-from learner.edl.passes import Range
-from learner.edl.polar import inverse_root
+from coop.learner.edl import kernels
+from coop.learner.edl.passes import Range
+from coop.learner.edl.polar import inverse_root
 
 _EXACT = 2**18  # numbers in a layer's T up to which its Gram matrices are computed in float64
 _SHORT = 1e-3  # of the longest row: what a row's length counts as, at least

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import torch
 
-from common.networks.convolution import product
-from common.types import Array
-from learner.edl.dense import DenseChain
-from learner.edl.passes import Tape
+from coop.common.networks.convolution import product
+from coop.common.types import Array
+from coop.learner.edl.dense import DenseChain
+from coop.learner.edl.passes import Tape
 
 
 class ConvolutionChain(DenseChain):

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import torch
 
-from common.networks.dense import Dense
-from common.types import Array
-from learner.edl.passes import Passes, Tape
+from coop.common.networks.dense import Dense
+from coop.common.types import Array
+from coop.learner.edl.passes import Passes, Tape
 
 
 class DenseChain(Passes[Array]):

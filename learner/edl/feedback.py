@@ -27,13 +27,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from common.process.memory import keep_freed_memory
-from learner.edl.arrays import ArrayT, at_least_float32, convert_like
-from learner.edl.beside import Branches
-from learner.edl.layers import make_passes
-from learner.edl.passes import Passes, Tape
-from learner.edl.polar import polar, polar_of_product
-from learner.edl.transforms import Transforms
+from coop.common.process.memory import keep_freed_memory
+from coop.learner.edl.arrays import ArrayT, at_least_float32, convert_like
+from coop.learner.edl.beside import Branches
+from coop.learner.edl.layers import make_passes
+from coop.learner.edl.passes import Passes, Tape
+from coop.learner.edl.polar import polar, polar_of_product
+from coop.learner.edl.transforms import Transforms
 
 FEEDBACKS = ("none", "transform", "weight-gradient", "random")
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from learner.edl.backprop import Chain
-from learner.edl.passes import Passes, Range, Tape, UnsupportedLayerError
+from coop.learner.edl.backprop import Chain
+from coop.learner.edl.passes import Passes, Range, Tape, UnsupportedLayerError
 
 
 @dataclass(frozen=True, slots=True)

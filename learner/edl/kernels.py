@@ -18,9 +18,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from common.errors import first_line
-from common.process.notices import warn
-from learner.edl.polar import SCALES
+from coop.common.errors import first_line
+from coop.common.process.notices import warn
+from coop.learner.edl.polar import SCALES
 
 LAYERS = 8  # that one call of `feedback` takes
 MOST_ACTIONS = 18

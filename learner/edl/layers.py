@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from common.networks.custom import state_problems
-from learner.edl.backprop import Chain
-from learner.edl.graph import Call, Graph, Layer, record
-from learner.edl.passes import Passes, Range, UnsupportedLayerError
+from coop.common.networks.custom import state_problems
+from coop.learner.edl.backprop import Chain
+from coop.learner.edl.graph import Call, Graph, Layer, record
+from coop.learner.edl.passes import Passes, Range, UnsupportedLayerError
 
 _ROUNDING = 1e-5  # of singular values of T in float32, relative to the largest
 _TRIALS = 3

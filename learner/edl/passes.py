@@ -9,8 +9,8 @@ from typing import Generic
 
 import torch
 
-from common.errors import UsageError
-from learner.edl.arrays import ArrayT
+from coop.common.errors import UsageError
+from coop.learner.edl.arrays import ArrayT
 
 
 class UnsupportedLayerError(UsageError, ValueError):

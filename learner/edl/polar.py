@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import ArrayT, convert_like, namespace, widened
+from coop.learner.edl.arrays import ArrayT, convert_like, namespace, widened
 
 _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # the two other indices of three
 _NUDGE = 1e-13  # of the largest entry of a matrix whose SVD fails

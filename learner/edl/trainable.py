@@ -8,14 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from common.networks.convolution import ConvolutionNetwork
-from common.networks.dense import Dense
-from common.networks.network import FlatNetwork
-from learner.edl.arrays import AnyArray, convert_like
-from learner.edl.convolution import ConvolutionChain
-from learner.edl.dense import DenseChain
-from learner.edl.layers import make_passes
-from learner.edl.passes import Passes
+from coop.common.networks.convolution import ConvolutionNetwork
+from coop.common.networks.dense import Dense
+from coop.common.networks.network import FlatNetwork
+from coop.learner.edl.arrays import AnyArray, convert_like
+from coop.learner.edl.convolution import ConvolutionChain
+from coop.learner.edl.dense import DenseChain
+from coop.learner.edl.layers import make_passes
+from coop.learner.edl.passes import Passes
 
 
 class Trainable:

@@ -9,10 +9,10 @@ from typing import Any, Generic
 import torch
 from torch import Tensor
 
-from learner.edl.arrays import ArrayT, Namespace, at_least_float32, convert_like, in_dtype, namespace, widened
-from learner.edl.completed import Jacobians
-from learner.edl.passes import Passes, Tape
-from learner.edl.polar import polar_by_svd, whitened
+from coop.learner.edl.arrays import ArrayT, Namespace, at_least_float32, convert_like, in_dtype, namespace, widened
+from coop.learner.edl.completed import Jacobians
+from coop.learner.edl.passes import Passes, Tape
+from coop.learner.edl.polar import polar_by_svd, whitened
 
 _SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
 
@@ -28,7 +28,7 @@ class Transforms(Generic[ArrayT]):
     The polar factor of a T that lacks rank by construction (see `Range`) is the thin one, which stays in T's range.
 
     For arrays of numpy, samples without an accurate Gram matrix are found and get an SVD each. For tensors no value
-    decides what is computed (see `learner.edl.completed`).
+    decides what is computed (see `coop.learner.edl.completed`).
     """
 
     _chain: Passes[ArrayT]

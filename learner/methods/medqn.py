@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from common.settings.config import RunConfig
-from common.settings.medqn import MedqnSettings
-from learner.edl.arrays import AnyArray
-from learner.methods.rule import Rule
-from learner.qnetwork import QNetwork, as_float32, on_host
+from coop.common.settings.config import RunConfig
+from coop.common.settings.medqn import MedqnSettings
+from coop.learner.edl.arrays import AnyArray
+from coop.learner.methods.rule import Rule
+from coop.learner.qnetwork import QNetwork, as_float32, on_host
 
 Bounds = NDArray[np.float32]
 

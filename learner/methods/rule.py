@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from common.settings.config import RunConfig
-from learner.edl.arrays import AnyArray, ArrayT, chosen
-from learner.qnetwork import QNetwork
+from coop.common.settings.config import RunConfig
+from coop.learner.edl.arrays import AnyArray, ArrayT, chosen
+from coop.learner.qnetwork import QNetwork
 
 
 class Rule:

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from common.networks.inputs import preprocess
-from common.networks.network import FlatNetwork
-from common.networks.normalised import NormalisedNetwork
-from common.settings import schedules
-from common.settings.config import RunConfig
-from common.settings.stream_q import StreamQSettings
-from common.types import Array, Batch, EnvSpec
-from learner.agent import Update
-from learner.losses import LOSSES, Values
-from learner.methods.moments import RewardScale, RunningMoments
-from learner.methods.rule import Rule
-from learner.methods.traces import Traces, bounded_step
-from learner.qnetwork import make_network
+from coop.common.networks.inputs import preprocess
+from coop.common.networks.network import FlatNetwork
+from coop.common.networks.normalised import NormalisedNetwork
+from coop.common.settings import schedules
+from coop.common.settings.config import RunConfig
+from coop.common.settings.stream_q import StreamQSettings
+from coop.common.types import Array, Batch, EnvSpec
+from coop.learner.agent import Update
+from coop.learner.losses import LOSSES, Values
+from coop.learner.methods.moments import RewardScale, RunningMoments
+from coop.learner.methods.rule import Rule
+from coop.learner.methods.traces import Traces, bounded_step
+from coop.learner.qnetwork import make_network
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Transition(Batch):
 
 
 class StreamAgent:
-    """One network, learning from each transition once, in the order in which they happen; like `learner.agent.Agent`.
+    """One network, learning from each transition once, in the order in which they happen; like `coop.learner.agent.Agent`.
 
     Each observation is shown to it once, by `begin` or at the end of a transition, and is standardized by the moments
     of all up to itself.

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from common.networks.network import FlatNetwork
-from common.networks.normalised import Floats, NormalisedNetwork, Record
+from coop.common.networks.network import FlatNetwork
+from coop.common.networks.normalised import Floats, NormalisedNetwork, Record
 
 
 class Traces:

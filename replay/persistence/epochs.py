@@ -6,8 +6,9 @@ import contextlib
 import threading
 from pathlib import Path
 
-from common.errors import RunError
-from common.process.checkpoints import (
+from coop.common.errors import RunError
+from coop.common.process.files import aside_folder, move_aside
+from coop.records.checkpoints import (
     DONE,
     FOLDER,
     LEARNER,
@@ -19,10 +20,9 @@ from common.process.checkpoints import (
     read_manifest,
     remove,
 )
-from common.process.files import aside_folder, move_aside
-from replay.core import ReplayCore
-from replay.persistence.journal import Journal, journal_names
-from replay.persistence.storage import Mark, load_snapshot, save_snapshot
+from coop.replay.core import ReplayCore
+from coop.replay.persistence.journal import Journal, journal_names
+from coop.replay.persistence.storage import Mark, load_snapshot, save_snapshot
 
 
 class ReplayEpochs:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from common.errors import RunError, UsageError
-from common.process.checkpoints import Damaged, read_manifest
-from common.process.locks import RunLock
-from common.process.run_ids import check_owner, claim, has_run_id, read_run_id
-from replay.persistence.epochs import part_numbers, part_path
-from replay.persistence.journal import journal_files, read_owner
+from coop.common.errors import RunError, UsageError
+from coop.records.checkpoints import Damaged, read_manifest
+from coop.records.locks import RunLock
+from coop.records.run_ids import check_owner, claim, has_run_id, read_run_id
+from coop.replay.persistence.epochs import part_numbers, part_path
+from coop.replay.persistence.journal import journal_files, read_owner
 
 
 class ReplayFolder:

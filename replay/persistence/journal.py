@@ -28,11 +28,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import RunError, UsageError
-from common.messaging.messages.sample import DrawRequest
-from common.process.files import check_guards, make_folder, sync_file, sync_folder
-from common.process.run_ids import check_owner
-from replay.limiter import RateLimiter
+from coop.common.errors import RunError, UsageError
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.process.files import check_guards, make_folder, sync_file, sync_folder
+from coop.records.run_ids import check_owner
+from coop.replay.limiter import RateLimiter
 
 FORMAT = 2
 BEGIN, SEGMENT, DRAW, LIMITER, END = range(5)

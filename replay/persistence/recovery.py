@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from common.errors import RunError
-from common.messaging import wire
-from common.messaging.messages.insert import SegmentReader
-from common.messaging.messages.sample import DrawRequest
-from replay.core import ReplayCore
-from replay.persistence.journal import (
+from coop.common.errors import RunError
+from coop.common.messaging import wire
+from coop.common.messaging.messages.insert import SegmentReader
+from coop.common.messaging.messages.sample import DrawRequest
+from coop.replay.core import ReplayCore
+from coop.replay.persistence.journal import (
     DRAW,
     END,
     LIMITER,
@@ -26,7 +26,7 @@ from replay.persistence.journal import (
     read_file,
     read_limiter,
 )
-from replay.table.table import PinnedBatch
+from coop.replay.table.table import PinnedBatch
 
 
 def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[int, list[str]]:

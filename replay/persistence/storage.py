@@ -14,15 +14,15 @@ import msgpack
 import msgspec
 import numpy as np
 
-from common.errors import BadMessage, CoopError
-from common.messaging import wire
-from common.messaging.messages.sample import BatchReader, EpisodeRecord, encode_batch
-from common.process.checkpoints import Damaged, Manifest, check_part, read_manifest, remove, write_manifest
-from common.process.files import PIECE, Measured, SyncedFile, make_folder, sync_folder
-from common.process.run_ids import check_owner
-from common.process.untrusted import load_array
-from common.types import Array, EpisodeEnd
-from replay.core import CoreSnapshot, ReplayCore
+from coop.common.errors import BadMessage, CoopError
+from coop.common.messaging import wire
+from coop.common.messaging.messages.sample import BatchReader, EpisodeRecord, encode_batch
+from coop.common.process.files import PIECE, Measured, SyncedFile, make_folder, sync_folder
+from coop.common.process.untrusted import load_array
+from coop.common.types import Array, EpisodeEnd
+from coop.records.checkpoints import Damaged, Manifest, check_part, read_manifest, remove, write_manifest
+from coop.records.run_ids import check_owner
+from coop.replay.core import CoreSnapshot, ReplayCore
 
 FRAMES_AT_ONCE = 256
 STATE = "state.msgpack"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Array, Segment
-from replay.table.frames import Slots
+from coop.common.types import Array, Segment
+from coop.replay.table.frames import Slots
 
 _NAMES = ("actions", "rewards", "terminated", "span", "param_version", "ids", "reuse", "priorities")
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.process.memory import GrowingRows
-from common.process.shared_memory import SharedMemory
-from common.types import Array
+from coop.common.process.memory import GrowingRows
+from coop.common.process.shared_memory import SharedMemory
+from coop.common.types import Array
 
 Slots = NDArray[np.intp]
 

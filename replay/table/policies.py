@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import UsageError
-from common.registry import loaded
-from common.settings.policies import EVICTIONS, SAMPLERS, EvictionPolicy, SamplingPolicy
+from coop.common.errors import UsageError
+from coop.common.registry import loaded
+from coop.common.settings.policies import EVICTIONS, SAMPLERS, EvictionPolicy, SamplingPolicy
 
 Rows = NDArray[np.intp]
 Floats = NDArray[np.float64]

@@ -7,7 +7,7 @@ import heapq
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.table.policies import Eviction, Floats, Rows, Sampling, TableView
+from coop.replay.table.policies import Eviction, Floats, Rows, Sampling, TableView
 
 PRIORITY_FLOOR = 1e-6
 GROUP_BITS = 6

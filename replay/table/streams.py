@@ -7,8 +7,8 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from common.types import Segment
-from replay.table.frames import FrameStore, Slots, as_slice
+from coop.common.types import Segment
+from coop.replay.table.frames import FrameStore, Slots, as_slice
 
 MAX_STREAMS = 4096
 

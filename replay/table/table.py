@@ -7,15 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import UsageError
-from common.process.randomness import generator_state, set_generator_state
-from common.settings.policies import EVICTIONS, SAMPLERS
-from common.types import Array, Batch, EnvSpec, Segment
-from replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
-from replay.table.columns import Columns
-from replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
-from replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
-from replay.table.streams import StreamTails
+from coop.common.errors import UsageError
+from coop.common.process.randomness import generator_state, set_generator_state
+from coop.common.settings.policies import EVICTIONS, SAMPLERS
+from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
+from coop.replay.table.columns import Columns
+from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
+from coop.replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
+from coop.replay.table.streams import StreamTails
 
 __all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
 

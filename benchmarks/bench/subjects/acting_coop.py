@@ -16,17 +16,17 @@ from pathlib import Path
 from turns import attend
 from work import EMULATORS, EPSILON, acting_config
 
-from common.envs.make import env_spec
-from common.messaging.keys import replay_key
-from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Node, new_incarnation
-from common.process.processes import ChildProcess, command, free_endpoint
-from learner.agent import Agent
-from learner.broadcast import Broadcaster
-from learner.join_service import JoinService
-from learner.roster import Roster
-from learner.shared_epochs import SharedEpochs
+from coop.common.envs.make import env_spec
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
+from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.learner.agent import Agent
+from coop.learner.broadcast import Broadcaster
+from coop.learner.join_service import JoinService
+from coop.learner.roster import Roster
+from coop.learner.shared_epochs import SharedEpochs
 
 RUN = "bench"
 LOOK_EVERY = 0.02  # seconds; each request for the replay service's count costs the topology a little processor time

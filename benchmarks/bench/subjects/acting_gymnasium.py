@@ -8,7 +8,7 @@ from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 from turns import attend, processor_rate
 from work import ATARI, EMULATORS, EPSILON
 
-from common.networks.network import build_network
+from coop.common.networks.network import build_network
 
 gymnasium.register_envs(ale_py)
 torch.set_num_threads(1)

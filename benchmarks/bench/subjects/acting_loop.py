@@ -6,10 +6,10 @@ import numpy as np
 from turns import attend, processor_rate
 from work import EMULATORS, EPSILON, acting_config
 
-from actors.policy import Policy
-from common.envs.make import env_spec, make_vector_env
-from common.networks.network import FlatNetwork, build_network
-from common.process.threads import use_threads
+from coop.actors.policy import Policy
+from coop.common.envs.make import env_spec, make_vector_env
+from coop.common.networks.network import FlatNetwork, build_network
+from coop.common.process.threads import use_threads
 
 use_threads(1)
 config = acting_config("bench", EMULATORS, EPSILON)

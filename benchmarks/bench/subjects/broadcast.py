@@ -20,12 +20,12 @@ import zenoh
 from turns import attend, clocked
 from work import ATARI, update_config
 
-from common.messaging.messages.weights import Weights
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.memory import keep_freed_memory
-from common.process.processes import free_endpoint
-from learner.agent import Agent
+from coop.common.messaging.messages.weights import Weights
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.memory import keep_freed_memory
+from coop.common.process.processes import free_endpoint
+from coop.learner.agent import Agent
 
 RUN = "bench"
 BROADCASTS = f"{RUN}/broadcasts"  # the start of their keys

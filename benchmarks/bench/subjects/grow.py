@@ -28,12 +28,12 @@ from start import BIN, PACKED
 from turns import attend, rate, resident_bytes
 from work import ATARI, BATCH, KINDS, STEPS, update_config
 
-from actors.policy import Policy
-from common.envs.make import env_spec, make_vector_env
-from common.networks.network import FlatNetwork, build_network
-from common.process.threads import use_threads
-from learner.agent import Agent
-from replay.table.table import Table
+from coop.actors.policy import Policy
+from coop.common.envs.make import env_spec, make_vector_env
+from coop.common.networks.network import FlatNetwork, build_network
+from coop.common.process.threads import use_threads
+from coop.learner.agent import Agent
+from coop.replay.table.table import Table
 
 Turn = Callable[[float], tuple[float, float]]  # seconds of a unit, measured for about so many seconds; MiB of all of it
 ROLES = ("learner", "replay")

@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from work import KINDS
 
-from common.networks.network import build_network
+from coop.common.networks.network import build_network
 
 MINATAR = "minatar-breakout"
 # The settings of its zoo, which has none for MinAtar: there its updates a step of Atari games, the rest is as in ours.

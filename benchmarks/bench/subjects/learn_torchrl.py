@@ -24,7 +24,7 @@ from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate
 from work import KINDS
 
-from common.networks.network import build_network
+from coop.common.networks.network import build_network
 
 warnings.simplefilter("ignore")
 

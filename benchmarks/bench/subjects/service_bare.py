@@ -16,10 +16,10 @@ from service_batches import FRAME_BYTES, REQUEST, WORK, Read
 from service_coop import PREFETCH, RUN, WINDOW
 from service_work import CAPACITY, STEPS, Inserters, attend_service, insert_on_demand
 
-from common.messaging.messages.insert import encode_segment
-from common.messaging.session import open_session
-from common.process.memory import keep_freed_memory
-from common.process.processes import free_endpoint
+from coop.common.messaging.messages.insert import encode_segment
+from coop.common.messaging.session import open_session
+from coop.common.process.memory import keep_freed_memory
+from coop.common.process.processes import free_endpoint
 
 
 def server(endpoint: str, shared_memory: bool, work: str, end: Connection) -> None:

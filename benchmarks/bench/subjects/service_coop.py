@@ -15,20 +15,20 @@ import msgspec
 from made_up import ATARI, segments
 from service_work import BATCH, CAPACITY, STEPS, Inserters, attend_service, insert_on_demand
 
-from common.messaging.insert_client import InsertClient
-from common.messaging.mirror import FrameMirror
-from common.messaging.route import open_client
-from common.messaging.sample_client import SampleClient
-from common.messaging.session import open_session
-from common.messaging.transport import Node, new_incarnation
-from common.process.lifecycle import Stop
-from common.process.memory import keep_freed_memory
-from common.process.processes import ChildProcess, command, free_endpoint
-from common.settings.capacity import mirror_slots
-from common.settings.tables import validated
-from learner.join_service import JoinService
-from learner.roster import Roster
-from learner.shared_epochs import SharedEpochs
+from coop.common.messaging.insert_client import InsertClient
+from coop.common.messaging.mirror import FrameMirror
+from coop.common.messaging.route import open_client
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import Node, new_incarnation
+from coop.common.process.lifecycle import Stop
+from coop.common.process.memory import keep_freed_memory
+from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.common.settings.capacity import mirror_slots
+from coop.common.settings.tables import validated
+from coop.learner.join_service import JoinService
+from coop.learner.roster import Roster
+from coop.learner.shared_epochs import SharedEpochs
 
 RUN = "bench"
 PREFETCH = 8

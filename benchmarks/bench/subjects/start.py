@@ -1,6 +1,6 @@
 """What users wait for: start.py torch|edl|local|report. A turn is one process, from its start.
 
-torch, edl: the imports of PyTorch and of `learner.edl`. local: `coop-local` to its first update, which counts as made
+torch, edl: the imports of PyTorch and of `coop.learner.edl`. local: `coop-local` to its first update, which counts as made
 when the epoch saved after it is complete. report: `coop-report` of the 336 runs of a packed study.
 """
 
@@ -46,7 +46,7 @@ def main(what: str) -> None:
                 command = [BIN / "coop-report", PACKED, "--out", Path(folder) / "report"]
                 subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
             else:
-                imported({"torch": "torch", "edl": "learner.edl"}[what])
+                imported({"torch": "torch", "edl": "coop.learner.edl"}[what])
             return {"seconds": time.monotonic() - begun}
 
     attend(turn)

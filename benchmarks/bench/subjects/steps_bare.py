@@ -13,12 +13,12 @@ import numpy as np
 from turns import attend, rate
 from work import START, step_config
 
-from common.envs.make import make_vector_env
-from common.networks import convolution
-from common.process.threads import use_threads
-from experiments.lockstep import Lockstep
-from learner.edl import convolution as backward
-from learner.edl import transforms
+from coop.common.envs.make import make_vector_env
+from coop.common.networks import convolution
+from coop.common.process.threads import use_threads
+from coop.learner.edl import convolution as backward
+from coop.learner.edl import transforms
+from coop.lockstep.lockstep import Lockstep
 
 use_threads(1)
 preset, method, period = sys.argv[1], sys.argv[2], int(sys.argv[3])

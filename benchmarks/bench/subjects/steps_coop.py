@@ -7,9 +7,9 @@ from pathlib import Path
 from turns import attend, rate
 from work import START, step_config
 
-from common.process.threads import use_threads
-from experiments.lockstep import Lockstep
-from learner.records.run_directory import RunDirectory
+from coop.common.process.threads import use_threads
+from coop.lockstep.lockstep import Lockstep
+from coop.records.run_directory import RunDirectory
 
 use_threads(1)
 preset, method, period = sys.argv[1:]

@@ -7,7 +7,7 @@ from made_up import segments
 from turns import attend, rate, resident_bytes
 from work import BATCH, ITEMS, STEPS
 
-from replay.table.table import Table
+from coop.replay.table.table import Table
 
 item, eviction, sampling = sys.argv[1:]
 spec, capacity = ITEMS[item]

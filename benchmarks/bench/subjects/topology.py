@@ -17,16 +17,16 @@ from made_up import segments
 from turns import attend
 from work import ATARI, update_config
 
-from common.messaging.insert_client import InsertClient
-from common.messaging.joining import join
-from common.messaging.keys import replay_key
-from common.messaging.messages.join import Join
-from common.messaging.messages.stats import ReplayStats, StatsQuestion
-from common.messaging.session import open_session
-from common.messaging.transport import NoAnswer, Node, new_incarnation
-from common.process.lifecycle import Stop
-from common.process.processes import ChildProcess, command, free_endpoint
-from common.settings.tables import to_toml
+from coop.common.messaging.insert_client import InsertClient
+from coop.common.messaging.joining import join
+from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
+from coop.common.process.lifecycle import Stop
+from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.common.settings.tables import to_toml
 
 STEPS = 32
 FILLED = 4096  # transitions before the measurements

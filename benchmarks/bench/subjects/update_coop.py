@@ -6,9 +6,9 @@ from made_up import random_batch
 from turns import attend, rate
 from work import KINDS, update_config
 
-from common.process.memory import keep_freed_memory
-from common.process.threads import use_threads
-from learner.agent import Agent
+from coop.common.process.memory import keep_freed_memory
+from coop.common.process.threads import use_threads
+from coop.learner.agent import Agent
 
 kind, method, batch_size, dtype, device = sys.argv[1:]
 use_threads(1)

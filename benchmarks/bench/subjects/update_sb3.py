@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from turns import attend, rate
 from work import KINDS
 
-from common.networks.network import build_network
+from coop.common.networks.network import build_network
 
 FILLED = 1024  # transitions
 kind, batch_size, device = sys.argv[1], int(sys.argv[2]), sys.argv[3]

@@ -10,8 +10,8 @@ from torchrl.objectives import DQNLoss, HardUpdate
 from turns import attend, rate
 from work import KINDS
 
-from common.networks.inputs import preprocess
-from common.networks.network import build_network, sample_observations
+from coop.common.networks.inputs import preprocess
+from coop.common.networks.network import build_network, sample_observations
 
 kind, batch_size = sys.argv[1], int(sys.argv[2])
 torch.set_num_threads(1)

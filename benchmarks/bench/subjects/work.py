@@ -8,9 +8,9 @@ import numpy as np
 from made_up import segments
 from numpy.typing import NDArray
 
-from common.settings.config import RunConfig
-from common.settings.tables import load_tables, resolve
-from common.types import EnvSpec
+from coop.common.settings.config import RunConfig
+from coop.common.settings.tables import load_tables, resolve
+from coop.common.types import EnvSpec
 
 ATARI = EnvSpec("Atari", (84, 84), "uint8", 4, 6)
 # By network, the preset whose settings are used, and what it sees.

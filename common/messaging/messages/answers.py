@@ -6,9 +6,9 @@ from typing import Annotated, ClassVar, Self
 
 from msgspec import Meta
 
-from common.bounded import Counter, Text
-from common.errors import BadMessage, CoopError
-from common.messaging.messages.body import Body
+from coop.common.bounded import Counter, Text
+from coop.common.errors import BadMessage, CoopError
+from coop.common.messaging.messages.body import Body
 
 LONGEST_PROBLEM = 4096  # characters
 

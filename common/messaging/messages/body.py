@@ -10,9 +10,9 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import msgspec
 
-from common.errors import BadMessage
-from common.messaging import wire
-from common.messaging.wire import ArrayTable, Message
+from coop.common.errors import BadMessage
+from coop.common.messaging import wire
+from coop.common.messaging.wire import ArrayTable, Message
 
 T = TypeVar("T", bound=msgspec.Struct)
 _LENGTHS = 256  # kept for each layout, by table of arrays

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from common.bounded import Updates
-from common.messaging.messages.body import Body
-from common.messaging.messages.join import Epochs
+from coop.common.bounded import Updates
+from coop.common.messaging.messages.body import Body
+from coop.common.messaging.messages.join import Epochs
 
 
 class Snapshot(Body, frozen=True):

@@ -6,14 +6,14 @@ from typing import Annotated, ClassVar, Self
 
 from msgspec import Meta, Struct
 
-from common.bounded import Count, Counter, Incarnation, Share, Updates
-from common.bounds import MAX_EVALUATED, MAX_RETURN, MAX_VIDEO
-from common.errors import BadMessage
-from common.messaging import wire
-from common.messaging.messages.body import Body, Layout, check_kind, to_struct
-from common.messaging.messages.weights import Network
-from common.messaging.wire import Message
-from common.types import Array
+from coop.common.bounded import Count, Counter, Incarnation, Share, Updates
+from coop.common.bounds import MAX_EVALUATED, MAX_RETURN, MAX_VIDEO
+from coop.common.errors import BadMessage
+from coop.common.messaging import wire
+from coop.common.messaging.messages.body import Body, Layout, check_kind, to_struct
+from coop.common.messaging.messages.weights import Network
+from coop.common.messaging.wire import Message
+from coop.common.types import Array
 
 GIF = b"GIF8"  # the first bytes of every one
 _GIF = Layout({"gif": ("uint8", ("bytes",))})

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from common.bounds import MAX_MAGNITUDE, MAX_N_STEP, MAX_SEGMENT_STEPS, MAX_UPDATES
-from common.errors import BadMessage
-from common.messaging import wire
-from common.messaging.messages.body import Layout, check_kind, to_struct
-from common.messaging.wire import Message
-from common.types import Array, EnvSpec, Segment
+from coop.common.bounds import MAX_MAGNITUDE, MAX_N_STEP, MAX_SEGMENT_STEPS, MAX_UPDATES
+from coop.common.errors import BadMessage
+from coop.common.messaging import wire
+from coop.common.messaging.messages.body import Layout, check_kind, to_struct
+from coop.common.messaging.wire import Message
+from coop.common.types import Array, EnvSpec, Segment
 
 KIND = "insert"
 _ARRAYS = ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version", "span")

@@ -8,16 +8,16 @@ from typing import Annotated, Any, ClassVar, Self
 import msgspec
 from msgspec import Meta
 
-from common.bounded import Count, Incarnation, Name, Updates
-from common.bounds import MAX_COUNT
-from common.errors import BadMessage, UsageError
-from common.messaging import wire
-from common.messaging.members import JOINING, Origin
-from common.messaging.messages.body import Body
-from common.messaging.wire import Message
-from common.settings.config import RunConfig
-from common.settings.tables import to_tables, validated
-from common.types import EnvSpec
+from coop.common.bounded import Count, Incarnation, Name, Updates
+from coop.common.bounds import MAX_COUNT
+from coop.common.errors import BadMessage, UsageError
+from coop.common.messaging import wire
+from coop.common.messaging.members import JOINING, Origin
+from coop.common.messaging.messages.body import Body
+from coop.common.messaging.wire import Message
+from coop.common.settings.config import RunConfig
+from coop.common.settings.tables import to_tables, validated
+from coop.common.types import EnvSpec
 
 Endpoints = Annotated[list[Name], Meta(max_length=16)]
 MOST_EPOCHS = 16  # epochs in one request

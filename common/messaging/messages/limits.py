@@ -6,9 +6,9 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from common.bounded import Counter, Real, Text
-from common.bounds import MAX_RATIO, MAX_TOLERANCE
-from common.messaging.messages.body import Body
+from coop.common.bounded import Counter, Real, Text
+from coop.common.bounds import MAX_RATIO, MAX_TOLERANCE
+from coop.common.messaging.messages.body import Body
 
 
 class LimitsQuestion(Body, frozen=True):

@@ -10,15 +10,15 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from common.bounded import Count, Counter, Incarnation, Updates
-from common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_INTEGER, MAX_PRIORITIES, MAX_STREAMS, MAX_UPDATES
-from common.errors import BadMessage
-from common.messaging import wire
-from common.messaging.messages.body import Body, Layout, check_kind, to_struct
-from common.messaging.messages.insert import OPTIONAL, check_indices, check_range, check_values, transitions
-from common.messaging.wire import Message, Source
-from common.process.shared_memory import ADDRESS
-from common.types import Array, Batch, EnvSpec, EpisodeEnd
+from coop.common.bounded import Count, Counter, Incarnation, Updates
+from coop.common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_INTEGER, MAX_PRIORITIES, MAX_STREAMS, MAX_UPDATES
+from coop.common.errors import BadMessage
+from coop.common.messaging import wire
+from coop.common.messaging.messages.body import Body, Layout, check_kind, to_struct
+from coop.common.messaging.messages.insert import OPTIONAL, check_indices, check_range, check_values, transitions
+from coop.common.messaging.wire import Message, Source
+from coop.common.process.shared_memory import ADDRESS
+from coop.common.types import Array, Batch, EnvSpec, EpisodeEnd
 
 MAX_EPISODES = 1000  # in one answer; the next answer carries the rest
 KIND = "batch"

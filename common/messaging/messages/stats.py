@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from common.bounded import Counter, Text
-from common.messaging.messages.body import Body
+from coop.common.bounded import Counter, Text
+from coop.common.messaging.messages.body import Body
 
 
 class StatsQuestion(Body, frozen=True):

@@ -7,13 +7,13 @@ from typing import Annotated, Self
 import msgspec
 from msgspec import Meta
 
-from common.bounded import Counter, Name, Real, Share, Text
-from common.bounds import MAX_POINTS
-from common.messaging import wire
-from common.messaging.members import ROLES
-from common.messaging.messages.body import bad_field, check_kind
-from common.messaging.messages.weights import Network
-from common.messaging.wire import Message
+from coop.common.bounded import Counter, Name, Real, Share, Text
+from coop.common.bounds import MAX_POINTS
+from coop.common.messaging import wire
+from coop.common.messaging.members import ROLES
+from coop.common.messaging.messages.body import bad_field, check_kind
+from coop.common.messaging.messages.weights import Network
+from coop.common.messaging.wire import Message
 
 KIND = "status"
 MAX_MEMBERS = 256  # listed in one status

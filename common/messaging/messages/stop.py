@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar, Self
 
-from common.bounded import Text
-from common.messaging.messages.body import Body
+from coop.common.bounded import Text
+from coop.common.messaging.messages.body import Body
 
 MAX_REASON = 1024  # characters
 

@@ -7,11 +7,11 @@ from typing import Annotated, ClassVar, Self
 
 from msgspec import Meta, Struct
 
-from common.bounded import Counter, Updates
-from common.messaging import wire
-from common.messaging.messages.body import Body, Layout, check_kind, to_struct
-from common.messaging.wire import Message
-from common.types import Array
+from coop.common.bounded import Counter, Updates
+from coop.common.messaging import wire
+from coop.common.messaging.messages.body import Body, Layout, check_kind, to_struct
+from coop.common.messaging.wire import Message
+from coop.common.types import Array
 
 Network = Annotated[int, Meta(ge=1, le=2)]
 

@@ -1,0 +1,1 @@
+"""Playing a policy: evaluations, saved policies, films, exports."""

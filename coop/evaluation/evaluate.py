@@ -1,0 +1,176 @@
+"""Evaluation of what has been saved: full episodes by the networks of checkpoints, and by any policy."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coop.common.bounds import MAX_EVALUATED, MAX_INTEGER, MAX_STREAMS
+from coop.common.envs.make import make_vector_env
+from coop.common.errors import RunError, UsageError
+from coop.common.numbers import exact
+from coop.common.settings.environment import EnvSettings
+from coop.common.settings.tables import resolve
+from coop.evaluation.episodes import AT_ONCE, Acting, exploring, play
+from coop.evaluation.film import Film, check_video, write_video
+from coop.evaluation.saved import NetworkChoice, SavedPolicy, SavedRun
+
+RESAMPLES = 2000  # of the returns, for an interval
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Unclipped returns of full episodes."""
+
+    returns: list[float]
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return statistics.fmean(self.returns)
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation of the returns."""
+        return statistics.pstdev(self.returns)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the mean, by the bootstrap."""
+        drawn = np.random.default_rng(0).choice(self.returns, (RESAMPLES, len(self.returns)))
+        low, high = np.percentile(drawn.mean(1), (2.5, 97.5)).tolist()
+        return low, high
+
+
+@dataclass(frozen=True)
+class CheckpointEvaluation(Evaluation):
+    """Returns of a run's checkpoint `epoch`.
+
+    network: 1, 2, or "mean", which plays by the mean of both networks' Q-values. epsilon: probability of a random
+    action. acts: the network acted and was trained last.
+    """
+
+    run: str
+    epoch: int
+    network: NetworkChoice
+    epsilon: float
+    acts: bool
+
+
+def evaluate(
+    policy: Acting,
+    episodes: int = 20,
+    env: str | Mapping[str, Any] | None = None,
+    seed: int = 0,
+    *,
+    epsilon: float = 0.0,
+    at_once: int = 1,
+) -> Evaluation:
+    """Play full episodes by a policy in its own environment, or in another one.
+
+    Args:
+        policy: of `SavedRun.policy`, or any function of a batch of stacked observations that gives an action for each.
+        env: an environment's id; or settings that replace those of the policy's environment, as a table
+            ({"kwargs": {"side": 12}}).
+        seed: of the emulators and the random actions.
+        epsilon: probability of a random action.
+        at_once: emulators that play at once, each its share of the episodes.
+
+    Raises:
+        UsageError: an argument is invalid, or lacks; or the policy gives something else than actions.
+        RunError: the environment's own code raises an exception.
+    """
+    if not callable(policy):
+        raise UsageError(f"policy: {type(policy).__name__} is no function of observations")
+    _check_whole("episodes", episodes, 1, MAX_EVALUATED)
+    _check_whole("seed", seed, 0, MAX_INTEGER)
+    _check_whole("at_once", at_once, 1, MAX_STREAMS)
+    if isinstance(epsilon, bool) or not isinstance(epsilon, int | float | np.number) or not 0 <= epsilon <= 1:
+        raise UsageError(f"epsilon = {epsilon!r}: must be from 0 to 1")
+    if not isinstance(env, str | Mapping | None):
+        raise UsageError(f"env = {env!r}: must be an id, or a table of settings")
+    own = policy.env if isinstance(policy, SavedPolicy) else None
+    if env is None and own is None:
+        raise UsageError("env: a policy that no run has trained needs one")
+    changes = {"id": env} if isinstance(env, str) else dict(env or {})
+    settings = resolve({"env": {**(asdict(own) if own else {}), **changes}}).env
+    return Evaluation(_returns(policy, settings, episodes, seed, epsilon, at_once))
+
+
+def _check_whole(name: str, value: object, least: int, most: int) -> None:
+    """Raise UsageError unless an argument is a whole number within bounds."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (whole and least <= value <= most):  # type: ignore[operator]
+        raise UsageError(f"{name} = {value!r}: must be a whole number from {least} to {most:,}")
+
+
+def evaluate_checkpoint(
+    run_dir: Path,
+    episodes: int,
+    seed: int,
+    networks: Sequence[NetworkChoice] = (1, 2, "mean"),
+    epsilons: Sequence[float] = (0.0,),
+    at_once: int = AT_ONCE,
+) -> Iterator[CheckpointEvaluation]:
+    """Play the networks of a run's newest checkpoint, each with each epsilon, all from the same starts.
+
+    Of a method with one network, of which the second is an older copy, only the first plays.
+
+    seed: of the emulators; the derived seed differs from those of the run's emulators.
+
+    Raises:
+        UsageError: the folder holds no run, or no checkpoint; raised at once, before anything is played.
+    """
+    run = SavedRun(run_dir)
+    checkpoint = run.checkpoint()
+    derived = _derived(run, seed)
+    chosen: Sequence[NetworkChoice] = networks if run.config.two_networks else (1,)
+
+    def one(network: NetworkChoice, epsilon: float) -> CheckpointEvaluation:
+        played = checkpoint.networks if network == "mean" else (checkpoint.networks[network - 1],)
+        policy = SavedPolicy(run.config.env, checkpoint.spec, played)
+        returns = _returns(policy, run.config.env, episodes, derived, epsilon, at_once)
+        acts = network == checkpoint.acting + 1
+        return CheckpointEvaluation(returns, str(run_dir), checkpoint.epoch, network, epsilon, acts)
+
+    return (one(network, epsilon) for network in chosen for epsilon in epsilons)
+
+
+def film_checkpoint(run_dir: Path, video: Path, seed: int, networks: Sequence[NetworkChoice]) -> str:
+    """Film an episode of greedy play by a run's newest checkpoint; return a line that describes it.
+
+    seed: as of `evaluate_checkpoint`. networks: the one to play; if there are several, the acting network plays.
+
+    Raises:
+        UsageError: the folder holds no run, or no checkpoint; or its environment can't be filmed, or not so.
+        RunError: the video can't be written.
+    """
+    check_video(video)
+    run = SavedRun(run_dir)
+    checkpoint = run.checkpoint()
+    network: NetworkChoice = networks[0] if len(networks) == 1 else checkpoint.acting + 1  # type: ignore[assignment]
+    film = Film(run.policy(network), run.config.env, _derived(run, seed))
+    try:
+        write_video(film, video)
+    except OSError as error:
+        raise RunError(f"{video}: {error.strerror or error}") from error
+    return f"{video}: network {network}, return {exact(film.episode_return)} in {film.steps:,} steps"
+
+
+def _derived(run: SavedRun, seed: int) -> int:
+    (derived,) = np.random.SeedSequence([run.config.seed, 4, seed]).generate_state(1).tolist()
+    return int(derived)
+
+
+def _returns(
+    policy: Acting, settings: EnvSettings, episodes: int, seed: int, epsilon: float, at_once: int
+) -> list[float]:
+    with closing(make_vector_env(settings, min(episodes, at_once), seed, bounded=True)) as env:
+        act = exploring(policy, epsilon, env.spec.num_actions, np.random.default_rng(seed))
+        return play(env, act, episodes)

@@ -1,0 +1,191 @@
+"""The process of an evaluator: joins a run, plays the networks that the learner broadcasts, and reports the returns."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from coop.actors.joined import make_policy
+from coop.actors.weights import WeightsFollower
+from coop.common.envs.make import check_filmed
+from coop.common.errors import UsageError
+from coop.common.messaging.joining import Membership, join, leave_run
+from coop.common.messaging.keys import evaluations_key
+from coop.common.messaging.messages.evaluate import Evaluated, Video
+from coop.common.messaging.messages.join import Join, Joined
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
+from coop.common.process.console import Console, counted
+from coop.common.process.lifecycle import Stop
+from coop.common.process.threads import use_threads
+from coop.evaluation.episodes import AT_ONCE, Evaluator
+from coop.records.run_options import RoleOptions
+
+LOOK_EVERY = 0.05  # seconds between looks at what the learner has broadcast
+ANSWER_TIMEOUT = 2.0  # seconds to wait for each receipt
+PAUSE = 0.1  # seconds before a result is sent, or networks are asked for, again
+LAST_RECEIPT = 5.0  # seconds to wait for the final networks, and for a receipt, at the run's end
+
+
+Progress = tuple[int, int]
+"""Updates and environment steps of a run."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to evaluate, and when.
+
+    seconds: between the beginnings of two evaluations; None: `steps` counts. steps: environment steps of the run
+    between two evaluations; None: the run's `eval_every`. episodes: None: the run's `eval_episodes`.
+    """
+
+    seconds: float | None = None
+    steps: int | None = None
+    episodes: int | None = None
+    epsilon: float = 0.0
+    at_once: int = AT_ONCE
+
+
+class Schedule:
+    """When to evaluate or to film; time is an argument.
+
+    seconds: between two beginnings, the first one at once; None: `steps` environment steps, 0: never.
+    """
+
+    def __init__(self, seconds: float | None, steps: int) -> None:
+        self._seconds, self._steps = seconds, steps
+        self._next_time = 0.0
+        self._next_step: float = steps or math.inf
+        self._last: int | None = None  # updates of the networks whose time came last
+
+    def due(self, progress: Progress, now: float) -> bool:
+        """Whether it is time for the networks of `progress`; those of equally many updates are the same.
+
+        A run may go on for a few steps after its last update: none have two times.
+        """
+        if progress[0] == self._last:
+            return False
+        return now >= self._next_time if self._seconds is not None else progress[1] >= self._next_step
+
+    def rush(self) -> None:
+        """Make new networks due at once, if any ever are."""
+        self._next_time = 0.0
+        self._next_step = min(self._next_step, 0) if self._steps else self._next_step
+
+    def begun(self, progress: Progress, now: float) -> None:
+        """Note that the time of the networks of `progress` has come."""
+        self._last = progress[0]
+        if self._seconds is not None:
+            self._next_time = now + self._seconds
+        else:
+            self._next_step = (progress[1] // self._steps + 1) * self._steps
+
+
+def evaluate_run(options: RoleOptions, allow_import: tuple[str, ...], plan: Plan) -> None:
+    """Join a run and evaluate its acting network until the stop; after a complete run, its final one too."""
+    use_threads(1)
+    stop = Stop()
+    stop.on_signals()
+    stop.on_thread_failures()
+    incarnation, console = new_incarnation(), Console()
+    session = open_session((), options.connect, options.zenoh_config, options.shared_memory)
+    with Node(session, options.run, "evaluator", incarnation) as node:
+        node.follow_stop(stop)
+        request = Join("evaluator", incarnation, [])
+        try:
+            joined = join(node, stop, request, options.connect, options.join_timeout, event=console.event)
+            if joined is not None:
+                service = EvaluatorService(node, stop, joined, allow_import, plan, incarnation, console)
+                console.event(f"joined run {options.run!r} on {joined.learner}")
+                with Membership(node, stop, request, joined, options.patience, lambda answer, now: None, console.event):
+                    service.run()
+        finally:
+            leave_run(node, request)
+    stop.leave()
+
+
+class EvaluatorService:
+    """Evaluates the acting network of a run again and again, and sends the results to the learner."""
+
+    def __init__(
+        self,
+        node: Node,
+        stop: Stop,
+        joined: Joined,
+        allow_import: tuple[str, ...],
+        plan: Plan,
+        incarnation: int,
+        console: Console,
+    ) -> None:
+        """Raise UsageError if nothing says how often, or the run can't be filmed; JoinError as `make_policy`."""
+        steps, config = plan.steps or joined.config.eval_every, joined.config
+        if plan.seconds is None and not (steps or config.video_every):
+            raise UsageError("--every: needed, as the run has no eval_every")
+        if config.video_every:
+            check_filmed(config.env)
+        self._policy = make_policy(joined, allow_import, np.random.default_rng(0))
+        self._node, self._stop, self._console, self._incarnation = node, stop, console, incarnation
+        self._weights = WeightsFollower(node, self._policy)
+        self._evaluations, self._films = Schedule(plan.seconds, steps), Schedule(None, config.video_every)
+        self._evaluator = Evaluator(config, self._abandons, plan.episodes, plan.epsilon, plan.at_once, console.event)
+        self._number = 0
+        self._last = False
+
+    def run(self) -> None:
+        """Evaluate until the stop."""
+        while not self._stop.is_set():
+            self._weights.refresh()
+            if self._weights.settled:
+                self._turn()
+            self._stop.wait(LOOK_EVERY)
+        if self._stop.reason.startswith("complete"):
+            self._last = True
+            self._evaluations.rush()
+            ends = time.monotonic() + LAST_RECEIPT
+            while not self._weights.fetch() and time.monotonic() < ends:
+                time.sleep(PAUSE)
+            if self._weights.ready:
+                self._turn()
+
+    def _turn(self) -> None:
+        """Evaluate and film if it is time."""
+        progress, now, acting = self._weights.progress, time.monotonic(), self._policy.acting
+        network, (update, env_step) = self._policy.networks[acting], progress
+        if self._evaluations.due(progress, now):
+            self._evaluations.begun(progress, now)
+            result = self._evaluator.evaluate(network, acting + 1, update, env_step)
+            if result is not None:
+                mean, sd = f"{result.return_mean:.2f}", f"{result.return_sd:.2f}"
+                said = f"return {mean} (sd {sd}) of {counted(result.episodes, 'episode')} after {env_step:,} steps"
+                self._send(Evaluated(self._incarnation, self._number, result), said)
+        if self._films.due(progress, now) and not self._abandons():
+            self._films.begun(progress, now)
+            if (gif := self._evaluator.film(network, env_step)) is not None:
+                video = Video(self._incarnation, self._number, env_step, np.frombuffer(gif, np.uint8))
+                self._send(video, f"a video after {env_step:,} steps")
+
+    def _send(self, message: Evaluated | Video, said: str) -> None:
+        """Send a result until it is acknowledged, or for `LAST_RECEIPT` seconds at the run's end."""
+        payload, ends = message.encode(self._node.run), math.inf
+        self._number += 1
+        while True:
+            try:
+                self._node.ask(evaluations_key(self._node), payload, timeout=ANSWER_TIMEOUT)
+            except Refused as error:
+                said = f"{said}; the learner refused it: {error}"
+            except NoAnswer:
+                now = time.monotonic()
+                ends = min(ends, now + LAST_RECEIPT) if self._stop.is_set() else ends
+                if now < ends:
+                    time.sleep(PAUSE)
+                    continue
+                said = f"{said}; the learner is gone"
+            self._console.event(said)
+            return
+
+    def _abandons(self) -> bool:
+        """Whether an evaluation has become useless."""
+        return not self._node.presence.members("learner") if self._last else self._stop.is_set()

@@ -1,0 +1,123 @@
+"""Films an episode, and writes it as a video."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator
+from itertools import chain, islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coop.common.bounds import MAX_VIDEO
+from coop.common.envs.make import make_filmed_env
+from coop.common.errors import UsageError
+from coop.common.settings.environment import EnvSettings
+from coop.evaluation.episodes import Acting, chosen
+
+Picture = NDArray[np.uint8]
+"""uint8 [height, width, 3]."""
+
+SMALLEST = 240  # pixels: smaller pictures are enlarged
+LONGEST = 900  # pictures of a film that goes to TensorBoard; a minute of an Atari game
+LONGEST_GIF = 3000  # pictures of a GIF, which is made in memory
+LONGEST_STILL = 600_000  # milliseconds of one picture; a GIF has 16 bits for hundredths of a second
+FORMATS = (".mp4", ".gif")
+
+
+class Film:
+    """The pictures of an episode in which `act` chooses the actions, as they are played.
+
+    pictures_per_s: at the game's usual speed. steps, episode_return: of what has been played so far. over: the episode
+    has ended.
+    """
+
+    def __init__(self, act: Acting, settings: EnvSettings, seed: int) -> None:
+        """Raise UsageError as `make_filmed_env`."""
+        self._act = act
+        self._env = make_filmed_env(settings, seed)
+        self.pictures_per_s = self._env.pictures_per_s
+        self.steps, self.episode_return, self.over = 0, 0.0, False
+
+    def __iter__(self) -> Iterator[Picture]:
+        """Yield a picture of each state in which the policy acts."""
+        try:
+            obs = self._env.reset()
+            while not self.over:
+                yield _enlarged(self._env.picture())
+                steps = self._env.step(chosen(self._act, obs, self._env.spec))
+                obs, self.over = steps.obs, bool(steps.episode_over[0])
+                self.steps += 1
+                self.episode_return += float(steps.raw_rewards[0])
+        finally:
+            self._env.close()
+
+
+def check_video(path: Path) -> None:
+    """Raise UsageError for a video that can't be written here."""
+    if path.suffix not in FORMATS:
+        raise UsageError(f"--video {path}: must end in {' or '.join(FORMATS)}")
+    if not path.parent.is_dir():
+        raise UsageError(f"--video {path}: there is no folder {path.parent}")
+    if path.suffix == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401, PLC0415
+        except ImportError:
+            raise UsageError(f"--video {path}: needs imageio-ffmpeg (the extra `video`); a .gif does not") from None
+
+
+def write_video(film: Film, path: Path) -> None:
+    """Write an episode to a file of one of `FORMATS`; a GIF holds at most `LONGEST_GIF` pictures of it."""
+    if path.suffix == ".gif":
+        path.write_bytes(_gif(islice(film, LONGEST_GIF), film.pictures_per_s))
+        return
+    import imageio_ffmpeg  # noqa: PLC0415
+
+    pictures = iter(film)
+    first = next(pictures)
+    height, width, _ = first.shape
+    writer = imageio_ffmpeg.write_frames(path, (width, height), fps=film.pictures_per_s, macro_block_size=2, quality=8)
+    writer.send(None)
+    try:
+        for picture in chain([first], pictures):
+            writer.send(np.ascontiguousarray(picture))
+    except BaseException:
+        writer.close()
+        path.unlink(missing_ok=True)
+        raise
+    writer.close()
+
+
+def short_gif(film: Film) -> bytes:
+    """The first `LONGEST` pictures of an episode as an animated GIF of at most `MAX_VIDEO` bytes."""
+    pictures = list(islice(film, LONGEST))
+    while len(content := _gif(pictures, film.pictures_per_s)) > MAX_VIDEO:
+        pictures = pictures[: len(pictures) // 2]
+    return content
+
+
+def _gif(pictures: Iterable[Picture], per_s: float) -> bytes:
+    from PIL import Image  # noqa: PLC0415 (needed seldom)
+
+    content, duration = io.BytesIO(), round(1000 / per_s)
+    images = map(Image.fromarray, _moving(pictures, duration))
+    next(images).save(content, "gif", save_all=True, append_images=images, duration=duration, loop=0)
+    return content.getvalue()
+
+
+def _moving(pictures: Iterable[Picture], duration: int) -> Iterator[Picture]:
+    """Leave out pictures, of so many milliseconds each, with which one that stays the same would last too long."""
+    before, still = None, 0
+    for picture in pictures:
+        still = still + duration if before is not None and np.array_equal(picture, before) else duration
+        before = picture
+        if still <= LONGEST_STILL:
+            yield picture
+
+
+def _enlarged(picture: Picture) -> Picture:
+    """The picture, or a whole multiple of a small one; height and width become even, as videos need them."""
+    times = max(1, -(-SMALLEST // min(picture.shape[:2])))
+    large = picture.repeat(times, axis=0).repeat(times, axis=1)
+    return np.pad(large, ((0, large.shape[0] % 2), (0, large.shape[1] % 2), (0, 0)))

@@ -1,0 +1,187 @@
+"""A run that has been saved: its files, and the policy of its newest checkpoint."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from coop.common.envs.make import env_spec
+from coop.common.errors import UsageError
+from coop.common.imports import hand_over, permit
+from coop.common.networks.network import FlatNetwork
+from coop.common.process.untrusted import check_links
+from coop.common.settings.config import RunConfig
+from coop.common.settings.environment import EnvSettings
+from coop.common.settings.resuming import settings_digest
+from coop.common.settings.tables import read_run_config
+from coop.common.types import Array, EnvSpec
+from coop.learner.qnetwork import make_network
+from coop.records.evaluations import EVALUATIONS
+from coop.records.kept import fitting, newest_epoch
+from coop.records.reading import check_records, read_csv, read_jsonl, read_lines
+from coop.records.summaries import read_summary
+
+CPU = torch.device("cpu")
+NetworkChoice = Literal["mean", 1, 2]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Both networks of an epoch.
+
+    epoch: its number, in updates. spec: what the networks know of the environment. acting: 0 or 1, index of the network
+    that acted and was trained last. env_steps: how many the run had done. returns: of its last episodes, at most 100.
+    """
+
+    epoch: int
+    spec: EnvSpec
+    networks: tuple[FlatNetwork, FlatNetwork]
+    acting: int
+    env_steps: int
+    returns: list[float]
+
+
+@dataclass(frozen=True)
+class SavedPolicy:
+    """A greedy policy: the mean of the Q-values of one or two networks, and the action at which it is largest.
+
+    Attributes:
+        env: settings of the environment that the networks were trained in.
+        spec: what the networks need to know of it.
+        networks: one or two.
+    """
+
+    env: EnvSettings
+    spec: EnvSpec
+    networks: tuple[FlatNetwork, ...]
+
+    def __call__(self, obs: ArrayLike) -> Any:  # noqa: ANN401 (depends on the observation's shape)
+        """The best action, int, for one observation; int64 [batch] for a batch. Takes what `q_values` takes."""
+        best = self.q_values(obs).argmax(-1)
+        return int(best) if best.ndim == 0 else best
+
+    def q_values(self, obs: ArrayLike) -> NDArray[np.float32]:
+        """Q-values, float32 [actions], of one stacked observation, [*obs_shape]; [batch, actions] of a batch.
+
+        Raises:
+            UsageError: the observation has another shape or dtype than those of the environment, or values that are not
+                finite.
+        """
+        given = self._as_stored(obs)
+        batch = given if given.ndim > len(self.spec.obs_shape) else given[None]
+        if batch.shape[1:] != self.spec.obs_shape:
+            shape = "x".join(map(str, self.spec.obs_shape))
+            raise UsageError(f"observation of shape {given.shape}: {self.spec.env_id} has {shape}, or a batch of these")
+        each = [network.q_values(batch, self.spec) for network in self.networks]
+        values: NDArray[np.float32] = np.mean(each, axis=0)
+        return values if batch is given else values[0]
+
+    def _as_stored(self, obs: ArrayLike) -> Array:
+        """An observation in the dtype of the environment's; numbers in lists may stand for it if they fit exactly."""
+        dtype = np.dtype(self.spec.frame_dtype)
+        try:
+            given = np.asarray(obs)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"observation: not an array: {error}") from error
+        if given.dtype.kind not in "biuf" or not (
+            np.can_cast(given.dtype, dtype, "same_kind")
+            or (given.dtype.kind != "f" and np.array_equal(given.astype(dtype), given))
+        ):
+            raise UsageError(f"observation of dtype {given.dtype}: {self.spec.env_id} has {dtype}, or ints that fit it")
+        if given.dtype.kind == "f" and not np.isfinite(given).all():
+            raise UsageError(f"observation with values that are not finite: {self.spec.env_id} has finite ones")
+        return given.astype(dtype, copy=False)
+
+
+class SavedRun:
+    """The files of one run. Raises UsageError if the folder holds none, RunError if a link leads out of it."""
+
+    def __init__(self, path: Path, allow_import: Collection[str] = ()) -> None:
+        """allow_import: modules that may be imported even if they lie in the run's folder or beside it."""
+        self.path = path
+        hand_over(path)
+        permit(allow_import)
+        if not (path / "config.toml").is_file():
+            raise UsageError(f"{path}: holds no run")
+        check_links(path)
+
+    def __repr__(self) -> str:
+        return f"<run {str(self.path)!r}: {self.config.env.id}, {self.config.method}, seed {self.config.seed}>"
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """The config of the run."""
+        return read_run_config(self.path)
+
+    @property
+    def episodes(self) -> pd.DataFrame:
+        """A row for each finished episode, with the columns of episodes.csv."""
+        return self._table("episodes.csv")
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """A row for each line of metrics.jsonl."""
+        check_records(self.path)
+        return pd.DataFrame(read_jsonl(self.path / "metrics.jsonl"))
+
+    @property
+    def evaluations(self) -> pd.DataFrame:
+        """A row for each evaluation during the run, with the columns of evaluations.csv."""
+        return self._table(EVALUATIONS)
+
+    def _table(self, name: str) -> pd.DataFrame:
+        """A CSV record, after its checks; raises RunError."""
+        check_records(self.path)
+        read_csv(self.path / name)  # names a line that pandas would fill up
+        return pd.read_csv(io.StringIO("\n".join(read_lines(self.path / name))))
+
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """The contents of summary.json; None if the run has not ended."""
+        return read_summary(self.path) or None
+
+    def checkpoint(self) -> Checkpoint:
+        """The networks of the newest whole checkpoint; a warning names younger ones that are not.
+
+        Raises UsageError if there is none.
+        """
+        epoch = newest_epoch(self.path, settings_digest(self.config))
+        if epoch is None:
+            raise UsageError(f"{self.path}: has no complete checkpoint")
+        state, spec = epoch.state, env_spec(self.config.env)
+        first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
+        with fitting(epoch.path):
+            for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
+                network.load(flat)
+            steps, returns = state["drawn"]["inserted"], state["telemetry"]["returns"]
+            return Checkpoint(epoch.number, spec, (first, second), state["agent"]["acting"], steps, returns)
+
+    def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
+        """The greedy policy of the newest epoch.
+
+        network: 1 or 2 plays by that network's Q-values, "mean" by the mean of both. The second network of a method
+        with one network is an older copy of the first, so "mean" is the first one there.
+
+        Raises:
+            UsageError: the run has no checkpoint, or there is no such network.
+        """
+        if network not in ("mean", 1, 2):
+            raise UsageError(f"network = {network!r}: allowed: 'mean', 1, 2")
+        checkpoint = self.checkpoint()
+        first, second = checkpoint.networks
+        both = (first, second) if self.config.two_networks else (first,)
+        chosen = both if network == "mean" else ((first, second)[network - 1],)
+        return SavedPolicy(self.config.env, checkpoint.spec, chosen)
+
+    def q_values(self, obs: ArrayLike, network: NetworkChoice = "mean") -> NDArray[np.float32]:
+        """Q-values of `policy(network)`, float32 [actions] or [batch, actions]; for many calls, keep the policy."""
+        return self.policy(network).q_values(obs)

@@ -1,0 +1,1 @@
+"""Algorithm 1 in one process, with the roles' own objects."""

@@ -1,0 +1,183 @@
+"""What becomes of the steps of a lockstep run: a replay table keeps them, or they are learned from at once and gone."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coop.actors.player import Turn
+from coop.actors.segments import SegmentAssembler
+from coop.common.errors import UsageError
+from coop.common.registry import loaded
+from coop.common.settings.config import RunConfig
+from coop.common.settings.methods import METHODS
+from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.learner.agent import Agent
+from coop.learner.methods.stream_q import StreamAgent, Transition
+from coop.learner.protocol import Agent as AnyAgent
+from coop.records.checkpoints import Damaged
+from coop.replay.core import ReplayCore
+from coop.replay.persistence.storage import Mark, load_snapshot, save_snapshot
+
+
+class Memory(Protocol):
+    """The way from steps to batches."""
+
+    def begin(self, obs: Array) -> None:
+        """Store the run's first observation, <frame_dtype>[1, *obs_shape]."""
+
+    def add(self, turn: Turn, step: int) -> None:
+        """Store a step; step: its number, from 1."""
+
+    def follow(self, turn: Turn, step: int) -> None:
+        """Follow a step that is played again before `load`."""
+
+    def batches(self, step: int) -> Iterator[Batch]:
+        """Yield the batches to learn from after the first `step` steps of the run, the newest of which `add` stored."""
+
+    def counters(self) -> dict[str, int]:
+        """The fields of `Drawn` that say what is stored."""
+
+    def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
+        """Store new priorities, float32 [batch], of the transitions with the numbers `ids`, int64 [batch]."""
+
+    def save(self, folder: Path, mark: Mark) -> None:
+        """Save what is stored for the checkpoint that `mark` names; raises OSError."""
+
+    def load(self, folder: Path, mark: Mark) -> None:
+        """Restore what `save` stored; raises UsageError if that is no longer whole."""
+
+
+def make_memory(config: RunConfig, spec: EnvSpec) -> tuple[AnyAgent, Memory]:
+    """The agent of a run's method, and the memory that it learns from."""
+    stream = METHODS.get(config.method).stream
+    if stream is None:
+        return Agent(config, spec), TableMemory(config, spec)
+    agent = loaded(stream, f"method {config.method!r}")(config, spec)
+    return agent, NoMemory(agent)
+
+
+class TableMemory:
+    """A replay table, of which batches are drawn as the replay ratio says.
+
+    Steps are stored some at a time, which costs less: a segment ends where a batch is due, so every batch may hold
+    every step before it.
+    """
+
+    def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
+        self._config = config
+        self._segments = SegmentAssembler(
+            spec, 1, 0, config.actor.segment_steps, n_step=config.replay.n_step, gamma=config.learner.gamma
+        )
+        self._core = ReplayCore(config, spec)
+        self.table = self._core.table
+        self.update_priorities = self.table.update_priorities
+        self.begin = self._segments.begin
+
+    def add(self, turn: Turn, step: int) -> None:
+        """See `Memory`."""
+        for segment in self._cut(turn, turn.version, step):
+            self.table.insert(segment)
+
+    def follow(self, turn: Turn, step: int) -> None:
+        """See `Memory`: the table is restored from its snapshot."""
+        self._cut(turn, self._updates_by(step - 1), step)
+
+    def _cut(self, turn: Turn, version: int, step: int) -> list[Segment]:
+        """Add a step; return the segments that it completes."""
+        segments = self._segments.add(turn.actions, turn.steps, version, turn.ended)
+        if self._due(step):
+            segments += self._segments.flush()
+        return segments
+
+    def batches(self, step: int) -> Iterator[Batch]:
+        """See `Memory`."""
+        for _ in range(self._due(step)):
+            yield self.table.sample(self._config.learner.batch_size)
+
+    def _due(self, step: int) -> int:
+        """Number of updates between the first `step` steps and the next one."""
+        return self._updates_by(step) - self._updates_by(step - 1)
+
+    def _updates_by(self, step: int) -> int:
+        """Number of updates after the first `step` steps."""
+        settings = self._config.replay
+        return math.floor(settings.ratio * max(0, step - settings.learning_starts))
+
+    def counters(self) -> dict[str, int]:
+        """See `Memory`."""
+        table = self.table
+        return {
+            "size": len(table),
+            "evicted": table.evicted,
+            "evicted_unsampled": table.evicted_unsampled,
+            "terminal": table.terminal,
+        }
+
+    def save(self, folder: Path, mark: Mark) -> None:
+        """See `Memory`."""
+        save_snapshot(self._core.snapshot(mark.number), threading.Condition(), folder, mark)
+
+    def load(self, folder: Path, mark: Mark) -> None:
+        """See `Memory`."""
+        try:
+            load_snapshot(self._core, folder, mark.run_id, mark.number)
+        except Damaged as damaged:
+            raise UsageError(f"{folder}: {damaged}") from damaged
+
+
+class NoMemory:
+    """The newest transition alone, of which the agent learns once."""
+
+    def __init__(self, agent: StreamAgent) -> None:
+        self._agent = agent
+        self._spec = agent.spec
+        self._obs: Array
+        self._turn: Turn
+        stack = np.arange(self._spec.stack, dtype=np.int32)[None]
+        self._index = stack, stack + self._spec.stack
+        self._ones = np.ones(1, np.float32), np.ones(1, np.int32)
+
+    def begin(self, obs: Array) -> None:
+        """See `Memory`."""
+        self._obs = obs
+        self._agent.begin(obs[0])
+
+    def add(self, turn: Turn, step: int) -> None:
+        """See `Memory`."""
+        self._turn = turn
+
+    def follow(self, turn: Turn, step: int) -> None:
+        """See `Memory`."""
+        self._obs = turn.steps.obs
+
+    def batches(self, step: int) -> Iterator[Batch]:
+        """See `Memory`."""
+        turn, steps = self._turn, self._turn.steps
+        frames = np.concatenate((self._obs, steps.next_obs)).reshape(-1, *self._spec.frame_shape)
+        self._obs = steps.obs
+        weights, reuse = self._ones
+        yield Transition(
+            frames, *self._index, turn.actions, steps.rewards, steps.terminated, weights,
+            ids=np.array([step - 1]), param_version=np.array([turn.version]), age=np.zeros(1, np.int64), reuse=reuse,
+            restart=steps.obs[0] if steps.restarted[0] else None,
+        )  # fmt: skip
+
+    def counters(self) -> dict[str, int]:
+        """See `Memory`."""
+        return {}
+
+    def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
+        """See `Memory`."""
+
+    def save(self, folder: Path, mark: Mark) -> None:
+        """See `Memory`."""
+
+    def load(self, folder: Path, mark: Mark) -> None:
+        """See `Memory`."""

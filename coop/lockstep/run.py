@@ -1,0 +1,164 @@
+"""A lockstep run with its files: starts or goes on in a run directory, plays to the end, and completes the files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from coop.common.envs.make import check_filmed
+from coop.common.errors import CoopError, RunError, first_line
+from coop.common.process.console import say
+from coop.common.process.lifecycle import Stop
+from coop.common.process.threads import use_threads
+from coop.common.settings.config import RunConfig
+from coop.common.settings.resuming import settings_digest
+from coop.evaluation.episodes import Evaluator
+from coop.learner.initial_networks import load_initial_networks
+from coop.lockstep.lockstep import Lockstep, Replaying
+from coop.records.kept import load_learner
+from coop.records.locks import RunLock
+from coop.records.resumption import Start
+from coop.records.run_directory import RunDirectory
+from coop.records.summary import Summary, summarise
+
+PROGRESS_EVERY = 5.0  # seconds
+
+
+class LockstepRun:
+    """A run that holds its directory's locks until `close`.
+
+    told: lines that say what it goes on from, and what was passed over or moved aside.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        path: Path,
+        program: str,
+        start: Start,
+        *,
+        wandb: bool = False,
+        replaying: Replaying = lambda played, actions: None,
+    ) -> None:
+        """Prepare the run; program: named to other processes that want the directory. wandb: see `RunDirectory`.
+
+        start: how it begins there. replaying: see `Lockstep.restore`; what it raises leaves the run as it was.
+
+        Raises:
+            UsageError: the config does not fit the environment, or the directory's epoch a lockstep run.
+            RunError: another process uses the directory, or it cannot be read.
+        """
+        use_threads(config.learner.threads)
+        self.path = path
+        self._wandb = wandb
+        if config.video_every:
+            check_filmed(config.env)
+        self._run = Lockstep(config)
+        try:
+            self._lock = RunLock(path, program, ("learner", "replay"))
+        except RunError:
+            self._run.env.close()
+            raise
+        try:
+            settings = settings_digest(config)
+            self._found, self.told = start.prepare(
+                path, replay=not config.streaming, settings=settings, load=load_learner
+            )
+            self._lock.sign()
+            if self._found.newest is None:
+                load_initial_networks(self._run.agent)
+            else:
+                self._run.restore(self._found.newest, replaying)
+                self._found.newest.state.clear()  # only its memory
+        except BaseException:
+            self.close()
+            raise
+
+    def play(self, stop: Stop, progress: Callable[[str], None] = lambda line: None) -> Summary:
+        """Play until the run is over or stopped; progress: called with a line every few seconds.
+
+        Raises:
+            RunError: there is no space for the closing epoch or the summary.
+            UsageError: Weights & Biases refuses.
+        """
+        run, newest = self._run, self._found.newest
+        number = None if newest is None else newest.number
+        with RunDirectory(self.path, run.config, self._found, number, run.step, wandb=self._wandb) as directory:
+            if directory.aside:
+                progress(directory.aside)
+            return play_lockstep(self._run, directory, stop, progress)
+
+    @property
+    def diverged(self) -> str:
+        """How the run has diverged; empty if it has not."""
+        return self._run.trainer.diverged
+
+    def close(self) -> None:
+        """Free the emulator and the locks."""
+        self._run.env.close()
+        self._lock.release()
+
+
+def play_lockstep(
+    run: Lockstep, directory: RunDirectory, stop: Stop, progress: Callable[[str], None] = lambda line: None
+) -> Summary:
+    """Play until the run is over or stopped, and complete its files.
+
+    Raises:
+        RunError: there is no space for the closing epoch or the summary.
+    """
+    trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
+    evaluator = Evaluator(run.config, stop.is_set)
+    _evaluate(run, directory, evaluator)  # what a stop has abandoned
+    outcome = ""
+    try:
+        while not (outcome := stop.reason if stop.is_set() else trainer.outcome()):
+            for effects in run.play():
+                directory.record(effects.episodes, effects.metrics)
+            _evaluate(run, directory, evaluator)
+            if trainer.epoch_due() and not trainer.outcome():
+                trainer.epoch_begun()
+                try:
+                    run.save(directory)
+                except RunError as error:
+                    say(f"{error}; the run goes on without it")
+            if time.monotonic() >= due:
+                due = time.monotonic() + PROGRESS_EVERY
+                progress(_progress(run))
+        outcome = trainer.diverged or outcome
+        if trainer.saveable():
+            run.save(directory)
+    except CoopError as error:
+        outcome = f"failed: {error}"
+        raise
+    except (Exception, SystemExit) as error:  # users' code may raise anything
+        outcome = f"failed: {first_line(error)}"
+        raise
+    finally:
+        summary = summarise(trainer, outcome or "interrupted", time.monotonic(), run.step)
+        directory.conclude(summary, f"{summary.title}, lockstep")
+    return summary
+
+
+def _evaluate(run: Lockstep, directory: RunDirectory, evaluator: Evaluator) -> None:
+    """Evaluate and film the acting network if it is time."""
+    config, agent, step = run.config, run.agent, run.step
+    network = agent.networks[agent.acting]
+    if run.trainer.diverged or not step:
+        return
+    if config.eval_every and step % config.eval_every == 0 and step > directory.evaluated:
+        result = evaluator.evaluate(network, agent.acting + 1, agent.updates, step)
+        if result is not None:
+            directory.evaluation(result)
+    if config.video_every and step % config.video_every == 0:
+        gif = evaluator.film(network, step)
+        if gif is not None:
+            directory.video(gif, step)
+
+
+def _progress(run: Lockstep) -> str:
+    telemetry = run.trainer.telemetry
+    returns = f"return {telemetry.return_mean:.1f}" if telemetry.episodes else "no episode has ended yet"
+    warning = telemetry.warning(run.agent)
+    return f"step {run.step:,}/{run.config.total_steps:,}  {returns}" + (f"  [{warning}]" if warning else "")

@@ -1,0 +1,97 @@
+"""A run's screen as a web page, with curves that grow while it is served."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Sequence
+from importlib.resources import files
+from typing import Any
+
+from coop.common.messaging.messages.status import LearnerStatus
+from coop.common.process.console import connected
+from coop.monitor.curves import COLUMNS, Curves
+from coop.monitor.display import printable
+from coop.monitor.facts import SILENT_AFTER, detail, facts, place, progress, settings, silence, times
+from coop.monitor.web import Document, WebServer
+from coop.records.summaries import strict_json
+
+FOLLOWS = 3.0  # seconds within which a browser that follows the run asks again
+
+
+class LivePage:
+    """Serves the page, which asks for /page.json once a second.
+
+    Args:
+        run: its name.
+        address: PORT or HOST:PORT, as `--web` gave it.
+
+    Attributes:
+        url: of the page.
+
+    Raises:
+        UsageError: it can't listen there.
+    """
+
+    def __init__(self, run: str, address: str) -> None:
+        self._run = run
+        self._lock = threading.Lock()
+        self._curves = Curves()
+        self._status: LearnerStatus | None = None
+        self._events: list[str] = []
+        self._notice, self._ended = "waiting for the learner", False
+        self._asked_at = -math.inf
+        self._told_end = threading.Event()
+        html = files("deploy").joinpath("page.html").read_bytes()
+        self._server = WebServer(
+            "--web",
+            address,
+            {
+                "/": lambda: Document("text/html; charset=utf-8", html),
+                "/page.json": lambda: Document("application/json", strict_json(self.told()).encode()),
+            },
+        )
+        self.url = self._server.url
+
+    def show(self, status: LearnerStatus | None, events: Sequence[str], silent: float, ended: str) -> None:
+        """See `coop.monitor.status.Page`."""
+        with self._lock:
+            if status is not None and status is not self._status:
+                self._curves.add(status)
+            self._status, self._events = status, list(events)
+            if ended:
+                self._notice, self._ended = f"the run has ended: {ended}", True
+            elif status is not None:
+                self._notice = silence(silent) if silent > SILENT_AFTER else ""
+
+    def told(self) -> dict[str, Any]:
+        """What /page.json holds: words as they are shown, and the numbers of the curves."""
+        with self._lock:
+            self._asked_at = time.monotonic()
+            if self._ended:
+                self._told_end.set()
+            status, points = self._status, list(self._curves.points)
+            told = {"run": printable(self._run), "notice": printable(self._notice), "ended": self._ended}
+            told |= {"events": list(map(printable, self._events))}
+        if status is None:
+            return told
+        members = [[printable(each.name), place(each), each.state, detail(each, status)] for each in status.members]
+        return told | {
+            "settings": settings(status),
+            "times": times(status),
+            "progress": progress(status),
+            "facts": list(facts(status).items()),
+            "connected": connected(status.connected),
+            "members": members,
+            "episodes": status.episodes,
+            "returns": status.return_history,
+            "columns": COLUMNS,
+            "points": points,
+        }
+
+    def close(self) -> None:
+        """Stop serving, once a browser that follows the run has heard that it has ended."""
+        if self._ended and time.monotonic() - self._asked_at < FOLLOWS:
+            self._told_end.wait(FOLLOWS)
+        self._server.close()

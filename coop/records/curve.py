@@ -1,0 +1,53 @@
+"""The learning curve of a run, from its episodes.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coop.common.numbers import RETURN_WINDOW, running_mean
+from coop.common.process.files import write_atomic
+from coop.records.evaluations import EVALUATIONS, Floats, returns_by_step
+
+NONE: Floats = np.empty((2, 0))
+
+
+def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
+    """Draw the curve of a run directory to `learning_curve.png` there; None if no episode has ended. Raises OSError."""
+    with (run_dir / "episodes.csv").open(encoding="utf-8") as file:
+        rows = [(int(row["env_step"]), float(row["return"])) for row in csv.DictReader(file)]
+    if not rows:
+        return None
+    steps, returns = np.array(rows).T
+    evaluated = returns_by_step((run_dir / EVALUATIONS).read_text(encoding="utf-8"))
+    return draw_curve(steps, returns, title, run_dir / "learning_curve.png", evaluated)
+
+
+def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path, evaluated: Floats = NONE) -> Path:
+    """Draw returns [episodes] against the environment steps [episodes] at which the episodes ended, as a PNG.
+
+    evaluated: of `returns_by_step`.
+
+    Raises:
+        OSError: it can't be written; an older one is untouched then.
+    """
+    # A figure without pyplot leaves the caller's backend, a notebook's for example, as it is.
+    from matplotlib.figure import Figure  # noqa: PLC0415 (half a second, needed once at the end)
+
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(steps, returns, ".", markersize=2, alpha=0.35, label="episode")
+    axes.plot(steps, running_mean(returns), linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
+    if evaluated.size:
+        axes.plot(*evaluated, "o-", markersize=4, label="evaluation")
+    axes.set(xlabel="environment steps", ylabel="return", title=title)
+    axes.legend(loc="lower right")
+    axes.grid(alpha=0.3)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=120)
+    write_atomic(path, content.getvalue())
+    return path

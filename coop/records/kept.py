@@ -1,0 +1,99 @@
+"""The learner's part of the checkpoints: `learner.pt`, written before the replay service's part and `DONE`."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from coop.common.errors import CoopError, UsageError
+from coop.common.process.files import Measured, write_atomic
+from coop.common.process.notices import warn
+from coop.common.process.untrusted import check_torch_file
+from coop.records.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
+from coop.records.resumption import Whole, survey
+
+
+def save_epoch(
+    run_dir: Path,
+    run_id: int,
+    number: int,
+    learner_state: dict[str, Any],
+    snapshot: Callable[[str], None],
+    *,
+    records: Mapping[str, Measured],
+    fallbacks: Sequence[str] = (),
+    settings: str = "",
+) -> Path:
+    """Save one checkpoint, and delete those that are too old.
+
+    snapshot: makes the replay service save its state under the given folder, relative to the run directory.
+    records, fallbacks, settings: see `Manifest`.
+
+    Raises:
+        OSError: the run directory cannot be written; nothing is left of this checkpoint.
+    """
+    path = checkpoint_path(run_dir, number)
+    try:
+        begin(path)
+        content = io.BytesIO()
+        torch.save(learner_state, content)
+        files = {LEARNER: write_atomic(path / LEARNER, content.getvalue())}
+        snapshot(str(path.relative_to(run_dir)))
+        manifest = Manifest(run_id, number, files, dict(records), list(fallbacks), settings=settings)
+        finish(run_dir, path, manifest)
+    except BaseException:
+        remove(path)
+        raise
+    remove_old(run_dir, number)
+    return path
+
+
+def newest_epoch(run_dir: Path, settings: str = "") -> Whole | None:
+    """The newest whole checkpoint of a run, with the learner's state, for readers; None if there is none.
+
+    A warning names those that were passed over. settings: see `survey`.
+
+    Raises:
+        UsageError: there are checkpoints, but none is whole.
+    """
+    found = survey(run_dir, settings=settings, load=load_learner)
+    if found.newest is None and found.problems:
+        raise UsageError(f"{run_dir}: has no complete checkpoint: {found.passed_over}")
+    if found.fallback:
+        warn(f"{run_dir}: takes checkpoint {found.whole[0].number}; passes over {found.fallback}")
+    return found.newest
+
+
+def load_learner(path: Path) -> dict[str, Any]:
+    """Read learner.pt from a checkpoint's folder, without executing any code in it.
+
+    Raises:
+        OSError: it cannot be read.
+        RunError: it is no whole checkpoint, or declares more than it holds.
+    """
+    check_torch_file(path / LEARNER)
+    try:
+        state: dict[str, Any] = torch.load(path / LEARNER, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError) as error:  # whose advice is to execute it all the same
+        raise pickle.UnpicklingError(f"PyTorch {torch.__version__} can't read it") from error
+    if not isinstance(state, dict):
+        raise TypeError("not a learner's state")
+    return state
+
+
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Raise UsageError in place of what fails because a checkpoint, though whole, is not one of this run's agent."""
+    try:
+        yield
+    except CoopError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RuntimeError) as error:
+        text = str(error).splitlines()[0] if str(error) else ""
+        raise UsageError(f"{path}: not a state of this run: {type(error).__name__}: {text}") from error

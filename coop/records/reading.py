@@ -1,0 +1,111 @@
+"""Reads the text records of a run: whole lines only, after the checksums that a summary or a checkpoint seals.
+
+A half line at the end is said, and a line that can't be read is named.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from coop.common.errors import RunError
+from coop.common.process.notices import warn
+from coop.records.checkpoints import (
+    Damaged,
+    check_record,
+    checked_summary,
+    checkpoint_numbers,
+    checkpoint_path,
+    read_manifest,
+)
+from coop.records.summaries import SUMMARY
+
+
+def check_records(run_dir: Path) -> None:
+    """Check the records of a run against its summary; of one that has not ended, against its newest checkpoint.
+
+    Raises RunError if they hold something else.
+    """
+    if (run_dir / SUMMARY).exists():
+        checked_summary(run_dir)
+        return
+    for number in reversed(checkpoint_numbers(run_dir)):
+        try:
+            manifest = read_manifest(checkpoint_path(run_dir, number))
+        except Damaged:
+            continue
+        try:
+            for name, written in manifest.records.items():
+                check_record(run_dir / name, written)
+        except Damaged as damaged:
+            raise RunError(f"{run_dir}: can't be read as it was written: {damaged}") from damaged
+        return
+
+
+def read_lines(path: Path) -> list[str]:
+    """The whole lines of a record. A warning names a half one at the end, as a kill or a live run leaves it.
+
+    Raises:
+        RunError: it can't be read, or holds other bytes than text; names the line.
+        FileNotFoundError: there is none.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise RunError(f"{path}: can't be read: {error.strerror or error}") from error
+    whole, newline, half = data.rpartition(b"\n")
+    if half:
+        last = whole.count(b"\n") + 2 if newline else 1
+        warn(f"{path}: line {last}, the last one, is incomplete, and left out")
+    try:
+        return (whole + newline).decode().split("\n")[:-1]
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise RunError(f"{path}, line {line}: not text") from error
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV record; raises as `read_lines`, and for a row with another number of values than the header."""
+    header, *rows = csv.reader(read_lines(path)) if path.stat().st_size else [[]]
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise RunError(f"{path}, line {number}: {len(row)} values instead of {len(header)}")
+    return [dict(zip(header, row, strict=True)) for row in rows]
+
+
+def read_jsonl(path: Path) -> list[dict[str, Any]]:
+    """The rows of a record with a JSON object on each line; raises as `read_lines`, and for another line."""
+    return [parse_row(line, f"{path}, line {number}") for number, line in enumerate(read_lines(path), 1)]
+
+
+def parse_row(line: str | bytes, place: str) -> dict[str, Any]:
+    """A line of JSON; place: for the error. Raises RunError."""
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise RunError(f"{place}: not JSON: {error}") from error
+    if not isinstance(row, dict):
+        raise RunError(f"{place}: no JSON object")
+    return row
+
+
+def column(rows: Sequence[dict[str, Any]], name: str, path: Path, first: int, *, optional: bool = False) -> list[Any]:
+    """A column of numbers, None where an optional one is missing; first: number of the first row's line.
+
+    Raises RunError for a value that is no number; names the line.
+    """
+    values: list[Any] = []
+    for number, row in enumerate(rows, first):
+        try:
+            value = row.get(name) if optional else row[name]
+            values.append(float(value) if isinstance(value, str) else value)
+        except (KeyError, ValueError) as error:
+            raise RunError(f"{path}, line {number}: {name}: {error}") from error
+        if not isinstance(values[-1], int | float | None):
+            raise RunError(f"{path}, line {number}: {name} = {values[-1]!r}: no number")
+    return values

@@ -1,0 +1,200 @@
+"""The flags that the commands share."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field, fields, make_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+from coop.common.errors import RunError, UsageError
+from coop.common.imports import permit
+from coop.common.places import absolute
+from coop.common.process import cli
+from coop.common.process.extras import check_extra
+from coop.common.process.flags import HttpAddress
+from coop.common.process.notices import note_renamed, warn
+from coop.common.process.untrusted import check_run
+from coop.common.settings.config import RunConfig
+from coop.common.settings.effects import without_effect
+from coop.common.settings.methods import METHODS, table_of
+from coop.common.settings.renamed import current_flags
+from coop.common.settings.resuming import check_resumed
+from coop.common.settings.tables import preset_names, read_run_config, validated
+from coop.records.checkpoints import LEARNER, RECORDS, checkpoint_numbers
+from coop.records.resumption import Start, holds_run
+from coop.records.run_ids import has_run_id, read_run_id
+from coop.records.sources import base_config
+
+# What --help shows of a run's flags, in this order.
+COMMON = (
+    *("--preset", "--config", "--method", "--seed", "--total-steps", "--run-dir", "--resume"),
+    *("--run", "--actors", "--listen", "--env.id", "--replay.capacity", "--replay.ratio", "--replay.eviction"),
+    *("--learner.batch-size", "--learner.swap-every", "--learner.target-update-every", "--learner.learning-rate"),
+    *("--edl.rate", "--actor.envs"),
+)
+
+
+@dataclass(frozen=True)
+class HealthOptions:
+    """The flag of processes that container engines watch."""
+
+    health: HttpAddress = ""
+    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
+
+
+@dataclass(frozen=True)
+class RoleOptions:
+    """Where and how a process finds its run."""
+
+    run: str = "coop"
+    """Name of the run."""
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints of the learner, for example tcp/head:7447."""
+    join_timeout: float = 30.0
+    """Seconds to search for the learner before giving up."""
+    patience: float = 60.0
+    """Seconds to wait for a lost learner before giving up."""
+    zenoh_config: Path | None = None
+    """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
+    shared_memory: bool = False
+    """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for a name that no run has."""
+        check_run(self.run)
+
+
+@dataclass(frozen=True)
+class RunOptions(RunConfig):
+    """The fields of a run's config, their source, and the run directory."""
+
+    preset: Annotated[str | None, tyro.conf.arg(metavar=f"{{{','.join(preset_names())}}}")] = None
+    """Settings that come with the package; cartpole if neither --config nor a resumed run gives any."""
+    config: Path | None = None
+    """A TOML file with the fields of a run, for example the config.toml of another run."""
+    run_dir: Path | None = None
+    """Folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given."""
+    resume: bool = False
+    """Continue the run in --run-dir, with its config, from its newest whole checkpoint, which survives
+    the death of process and machine; start it if none has begun."""
+    resume_from: int | None = None
+    """As --resume, but go back to the checkpoint with this number (folder checkpoints/NUMBER), even if records are
+    damaged; what is younger is moved to aside/."""
+    overwrite: bool = False
+    """Begin anew in a folder that holds a run, which is moved to aside/ in that folder."""
+    zenoh_config: Path | None = None
+    """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
+    shared_memory: bool = False
+    """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
+    allow_import: tuple[str, ...] = ()
+    """Modules, such as my_envs, that may be imported even if they lie in the folder of a resumed run or beside it."""
+    wandb: bool = False
+    """Mirror TensorBoard's scalars to Weights & Biases, whose own variables (WANDB_MODE, WANDB_PROJECT) apply."""
+
+    def run_config(self) -> RunConfig:
+        """The checked config of the run; raises UsageError."""
+        return validated(RunConfig(**{each.name: getattr(self, each.name) for each in fields(RunConfig)}))
+
+    @property
+    def start(self) -> Start:
+        """How the run begins in its directory."""
+        return Start(self.resume, self.resume_from, self.overwrite)
+
+    def directory(self) -> Path:
+        """The run directory.
+
+        Raises:
+            UsageError: it already holds a run; or, with --resume, flags contradict the run's config.
+            RunError: it belongs to another run.
+        """
+        if self.start.goes_on and self.overwrite:
+            raise UsageError("--overwrite: begins anew; --resume and --resume-from go on: give one of them")
+        if self.start.goes_on:
+            return self._resumed()
+        game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
+        named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+        path = self.run_dir or absolute(Path("runs") / named)
+        if holds_run(path) and not self.overwrite:
+            how = "give another folder, go on with --resume (resume=True in Python), or move it aside with --overwrite"
+            raise UsageError(f"run directory {path}: holds a run already; {how}")
+        return path
+
+    def _resumed(self) -> Path:
+        path = self.run_dir
+        if path is None:
+            raise UsageError("--resume: give the run's folder too, --run-dir")
+        file = path / "config.toml"
+        if file.exists():
+            check_resumed(self.run_config(), read_run_config(path), file)
+        elif checkpoint_numbers(path, LEARNER) or any((path / name).exists() for name in RECORDS):
+            raise UsageError(f"run directory {path}: holds a run, but its config.toml is missing; nothing was changed")
+        elif has_run_id(path):
+            raise RunError(f"run directory {path}: a replay service's, of the run with id {read_run_id(path)}")
+        return path
+
+
+@dataclass(frozen=True)
+class LearnerRunOptions(RunOptions):
+    """The flags of commands that start a learner's process."""
+
+    restart: bool = False
+    """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
+    prometheus: HttpAddress = ""
+    """Serve the learner's status to Prometheus at PORT, on loopback, or at HOST:PORT."""
+
+
+OptionsT = TypeVar("OptionsT", bound=RunOptions)
+
+
+def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep: bool = False) -> OptionsT:
+    """Parse flags over the config that `--preset`, `--config` or `--resume` names; warn of flags without effect.
+
+    lockstep: the run will be a single process.
+
+    Raises:
+        UsageError: the flags are invalid; the text, one line, says how.
+    """
+    args = sys.argv[1:]
+    base = base_config(args)
+    args = current_flags(args, base.learner.optimizer)
+    extended = with_methods(kind)
+    given_own = {} if base.own is None else {table_of(base.method): base.own}
+    default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **given_own)
+    parsed = cli.parse(extended, program, description, default, args, COMMON)
+    options: OptionsT = replace(parsed, own=getattr(parsed, table_of(parsed.method), None))
+    given = cli.given_flags(args)
+    named = {"env.id": options.env.id, "network.kind": options.network.kind}
+    permit([*options.allow_import, *(value for name, value in named.items() if name in given)])
+    if "learner.swap_every" in given and not options.two_networks and options.learner.target_update_every is None:
+        note_renamed({"--learner.swap-every": f"--learner.target-update-every for {options.method}"})
+    for line in without_effect(options, given, lockstep=lockstep):
+        warn(line)
+    if options.wandb:
+        check_extra("--wandb", "wandb", "wandb")
+    if isinstance(options, LearnerRunOptions) and options.prometheus:
+        check_extra("--prometheus", "prometheus", "prometheus_client")
+    return options
+
+
+def with_methods(kind: type[OptionsT]) -> type[OptionsT]:
+    """The options with a field for each method's own settings, and with every method in the help.
+
+    A method that can't be imported is refused if it is chosen, and otherwise left out.
+    """
+    added: list[tuple[str, Any, Any]] = []
+    summaries = []
+    for name in METHODS.names():
+        with suppress(UsageError):
+            method = METHODS.get(name)
+            summaries.append(f"{name}: {method.summary}")
+            if method.settings is not None and not hasattr(kind, method.table):
+                added.append((method.table, method.settings, field(default_factory=method.settings)))
+    shown = tyro.conf.arg(metavar=f"{{{','.join(METHODS.names())}}}", help=f"Training method; {'; '.join(summaries)}.")
+    added.append(("method", Annotated[str, shown], RunConfig.method))
+    return make_dataclass(kind.__name__, added, bases=(kind,), frozen=True)

@@ -1,0 +1,96 @@
+"""Sources of a report's runs: a folder of run directories, or a packed study."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from coop.common.errors import RunError
+from coop.common.process.notices import warn
+from coop.common.process.untrusted import check_links, read_text
+from coop.common.settings.tables import check_toml
+from coop.records.reading import check_records, column, read_csv, read_jsonl
+from coop.records.run_ids import RUN_ID
+from coop.studies.report.packed import CONFIG, EPISODES, SUMMARY, SWEEP, PackedStudy, run_names
+
+
+class Source(Protocol):
+    """The files of runs.
+
+    names: of the runs. sweep: the text of sweep.toml; None if there is none.
+    """
+
+    names: list[str]
+    sweep: str | None
+
+    def text(self, run: str, file: str) -> str | None:
+        """The content of a run's file; None if there is none."""
+        ...
+
+    def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
+        """Some columns of a run's episodes or metrics; an optional one has None if a line lacks it.
+
+        Raises RunError, KeyError or ValueError if a wanted one is missing or can't be read.
+        """
+        ...
+
+
+class FolderSource:
+    """A folder of run directories, or a single one."""
+
+    def __init__(self, folder: Path) -> None:
+        self._checked: set[str] = set()  # runs whose records are those that they seal
+        single = (folder / CONFIG).is_file()
+        self._folder = folder.resolve().parent if single else folder
+        check_links(folder)
+        self.sweep = None if single else self._sweep()
+        self.names = [folder.resolve().name] if single else self._distinct(run_names(folder))
+        for run in self.names:
+            check_links(self._folder / run)
+
+    def _distinct(self, names: list[str]) -> list[str]:
+        """The runs without a user's copies of them, which are no further runs; a warning names these."""
+        first: dict[tuple[str, str | None], str] = {}
+        for name in names:
+            # A packed run has no id; one that went on by itself has another summary.
+            run = self.text(name, RUN_ID) or name, self.text(name, SUMMARY)
+            if first.setdefault(run, name) != name and self.sweep is None:
+                warn(f"{self._folder / name}: a copy of {first[run]}, left out")
+        return [name for name in names if name in first.values()]
+
+    def _sweep(self) -> str | None:
+        text = self.text("", SWEEP)
+        if text is not None:  # one that the user wrote has no checksum
+            check_toml(text, self._folder / SWEEP, needed=any(self._folder.glob(f"*/{RUN_ID}")))
+        return text
+
+    def text(self, run: str, file: str) -> str | None:
+        """See `Source`."""
+        path = self._folder / run / file
+        try:
+            return read_text(path)
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError) as error:
+            raise RunError(f"{path}: can't be read: {getattr(error, 'strerror', None) or error}") from error
+
+    def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
+        """See `Source`."""
+        path = self._folder / run / file
+        if run not in self._checked:
+            check_records(self._folder / run)
+            self._checked.add(run)
+        rows, first = (read_csv(path), 2) if file == EPISODES else (read_jsonl(path), 1)
+        found = {name: column(rows, name, path, first) for name in wanted}
+        return found | {name: column(rows, name, path, first, optional=True) for name in optional}
+
+
+def open_source(path: Path) -> Source:
+    """Open a folder of runs or a packed study.
+
+    Raises:
+        UsageError: the file is none, or a run has a name that is none.
+        RunError: a link leads out of a run.
+    """
+    return FolderSource(path) if path.is_dir() else PackedStudy(path)

@@ -1,0 +1,126 @@
+"""`coop-sweep`: runs a grid here, as job arrays or on a Dask cluster; the same command continues a sweep."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from coop.common.errors import Interrupted, RunError, UsageError
+from coop.common.places import absolute, shown
+from coop.common.process.cli import parse
+from coop.common.process.console import say
+from coop.common.process.extras import check_extra
+from coop.common.process.lifecycle import Stop, run_main
+from coop.common.suggestions import closest, refusal
+from coop.studies.sweep import slurm
+from coop.studies.sweep.display import SweepDisplay
+from coop.studies.sweep.executor import Executor
+from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
+from coop.studies.sweep.grid import Grid, GridFile, load_grid
+from coop.studies.sweep.local import LocalProcesses
+from coop.studies.sweep.runner import Runner
+
+TICK = 0.2  # seconds
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Flags of `coop-sweep`."""
+
+    grid: Annotated[Positional[str], tyro.conf.arg(metavar="GRID")]
+    """A grid that comes with the package, or a TOML file."""
+    quick: bool = False
+    """Use the grid's small version, for two cores."""
+    jobs: int | None = None
+    """Number of cells to run concurrently; the number of cores, or of the workers' threads, if not given."""
+    dir: Path | None = None
+    """Folder of the sweep; runs/sweeps/GRID if not given."""
+    cell: str | None = None
+    """Run only this cell: its name, or its number in the grid, from 0."""
+    slurm: bool = False
+    """Submit the cells as Slurm job arrays instead of running them on this machine."""
+    dask: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Run the cells on the workers of this Dask scheduler, such as tcp://head:8786 (extra `dask`)."""
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop-sweep", _run)
+
+
+def _run() -> None:
+    options = parse(SweepOptions, "coop-sweep", "Run every cell of a grid once.")
+    if options.jobs is not None and options.jobs < 1:
+        raise UsageError(f"--jobs {options.jobs}: must be at least 1")
+    if options.dask is not None:
+        if options.slurm:
+            raise UsageError("--dask and --slurm: give one of them")
+        check_extra("--dask", "dask", "distributed")
+    grid = load_grid(options.grid, options.quick)
+    folder = options.dir or absolute(default_folder(options.grid, options.quick))
+    cells = chosen(options, grid, folder)
+    claim_folder(grid, cells, folder)
+    if options.slurm:
+        left = [cell.cell.name for cell in cells if cell.ending() is None]
+        print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
+        return
+    with _executor(options, grid.file) as executor:
+        _work(Runner(cells, executor), folder)
+
+
+def _executor(options: SweepOptions, grid: GridFile) -> AbstractContextManager[Executor]:
+    if options.dask is None:
+        return nullcontext(LocalProcesses(grid, options.jobs))
+    from coop.studies.sweep.dask import workers_at  # noqa: PLC0415 - takes a second, and may not be installed
+
+    return workers_at(options.dask, grid, options.jobs)
+
+
+def chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
+    """The cells that the options ask for; raises UsageError if there is none of that name or number."""
+    asked = options.cell
+    cells = [CellFolder(folder, cell) for n, cell in enumerate(grid.cells) if asked in (None, cell.name, str(n))]
+    if not cells:
+        names = [cell.name for cell in grid.cells]
+        near = closest(str(options.cell), names)
+        raise UsageError(f"--cell {options.cell}: {refusal('not in the grid', near, f'its first cell is {names[0]}')}")
+    return cells
+
+
+def _work(runner: Runner, folder: Path) -> None:
+    """Run until no cell is left or a stop is requested.
+
+    Raises:
+        Interrupted: a signal came before the end.
+        RunError: cells have failed.
+    """
+    stop = Stop()
+    stop.on_signals()
+    with SweepDisplay(runner) as display:
+        display.say(f"{len(runner.folders)} cells in {shown(folder)}, {runner.skipped} of them finished before")
+        for name, how in runner.diverged.items():
+            display.say(f"{name}: {how}")
+        try:
+            while not runner.done and not stop.wait(TICK):
+                for text in runner.tick():
+                    display.say(text)
+                display.update()
+            if not runner.done:
+                display.say(f"{stop.reason}: the running cells save their state")
+        finally:
+            runner.abort()
+        line = display.line()
+    for name, why in runner.failed.items():
+        say(f"failed: {name}: {why}")
+    if not runner.done:
+        raise Interrupted(f"{stop.reason} with {line}; the same command goes on from here", stop.exit_status or 1)
+    if runner.failed:
+        count = len(runner.failed)
+        raise RunError(f"{count} of {len(runner.folders)} cells failed; the same command tries them again")
+    diverged = f", {len(runner.diverged)} of them diverged" if runner.diverged else ""
+    say(f"all {len(runner.folders)} cells are finished{diverged}; coop-report {shown(folder)}")

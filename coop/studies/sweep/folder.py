@@ -1,0 +1,116 @@
+"""A cell's folder: the state of its run, the config that it must hold, and the lock of the process that runs it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from coop.common.errors import RunError, UsageError
+from coop.common.numbers import RETURN_WINDOW
+from coop.common.process.files import make_folder, write_atomic
+from coop.common.process.untrusted import check_links
+from coop.common.settings.tables import identity, read_run_config, run_config_text, sealed_toml
+from coop.records.checkpoints import checked_summary
+from coop.records.locks import Held, RunLock
+from coop.studies.sweep.grid import Cell, Grid
+
+TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A run's progress: environment steps at its last episode's end, mean return of the last 100 episodes."""
+
+    step: int
+    mean_return: float
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a cell's run ended; why: the reason, unless it is finished.
+
+    A diverged run would diverge again; a lost one, whose worker is gone, can go on elsewhere.
+    """
+
+    kind: Literal["finished", "diverged", "failed", "lost"]
+    why: str = ""
+
+
+class CellFolder:
+    """One cell's folder within the sweep's."""
+
+    def __init__(self, sweep: Path, cell: Cell) -> None:
+        self.cell = cell
+        self.path = sweep / cell.name
+
+    def check(self) -> None:
+        """Raise UsageError if the folder holds a run of another config."""
+        check_links(self.path)
+        held = self.path / "config.toml"
+        if held.exists() and identity(read_run_config(self.path)) != identity(self.cell.config):
+            raise UsageError(f"{held}: not the config of this grid's cell; give another --dir")
+
+    def ending(self) -> Ending | None:
+        """How its run ended for good; None if it has to be run or continued."""
+        outcome = self.outcome()
+        if outcome.startswith("complete"):
+            return Ending("finished")
+        return Ending("diverged", outcome) if outcome.startswith("diverged") else None
+
+    def outcome(self) -> str:
+        """How its run ended, from summary.json; empty if that can't be read, or the records are not those it seals."""
+        try:
+            return str(checked_summary(self.path).get("exit", ""))
+        except RunError:
+            return ""  # resuming the run names what is wrong, or writes them again
+
+    def lock(self) -> RunLock | None:
+        """The locks of the cell's run; None if another process has them. A child that inherits them keeps them."""
+        try:
+            return RunLock(self.path, "coop-sweep", ("learner", "replay")).sign()
+        except Held:
+            return None
+
+    def prepare(self) -> None:
+        """Write the config from which the run starts or continues."""
+        write_atomic(self.path / "config.toml", run_config_text(self.cell.config).encode())
+
+    def progress(self) -> Progress:
+        """Read the progress from the end of episodes.csv; zeros before the first episode's end, or if it is damaged."""
+        try:
+            with (self.path / "episodes.csv").open("rb") as file:
+                header = file.readline().decode()
+                file.seek(max(len(header), os.fstat(file.fileno()).st_size - TAIL))
+                # The first and the last line of the tail may be incomplete.
+                lines = file.read().decode().rpartition("\n")[0].splitlines()[-RETURN_WINDOW:]
+            rows = list(csv.DictReader(io.StringIO("\n".join([header.strip(), *lines]))))
+            if not rows:
+                return Progress(0, 0.0)
+            return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
+        except (OSError, ValueError, KeyError, TypeError, csv.Error):
+            return Progress(0, 0.0)  # only for the display: who continues or reports the run names what is damaged
+
+
+def default_folder(grid: str | Path, quick: bool) -> Path:
+    """The folder of a sweep that names none."""
+    return Path("runs") / "sweeps" / (Path(grid).stem + ("-quick" if quick else ""))
+
+
+def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
+    """Assign a folder to a sweep, or refuse it before anything runs.
+
+    Raises:
+        UsageError: it holds runs of other configs, or cannot be written.
+    """
+    try:
+        make_folder(folder)
+        for cell in cells:
+            cell.check()
+        write_atomic(folder / "sweep.toml", sealed_toml(grid.to_toml()).encode())
+    except OSError as error:
+        raise UsageError(f"--dir {folder}: {error.strerror}") from error

@@ -1,0 +1,83 @@
+"""Sweeps from Python: the cells of a grid, run to the end on this machine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import tomli_w
+
+from coop.common.errors import UsageError
+from coop.common.places import absolute
+from coop.common.settings.config import value_of
+from coop.records.summaries import read_summary
+from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
+from coop.studies.sweep.grid import load_grid, parse_grid
+from coop.studies.sweep.local import LocalProcesses
+from coop.studies.sweep.runner import Runner
+
+TICK = 0.2  # seconds
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """The outcome of a sweep.
+
+    Attributes:
+        folder: of its runs, which `coop-report` reads.
+        runs: a row for each cell that has ended, by the cell's name: the fields that the grid varies, then those of
+            summary.json.
+        failed: why a cell could not be run, by its name.
+    """
+
+    folder: Path
+    runs: pd.DataFrame
+    failed: dict[str, str]
+
+
+def sweep(
+    grid: str | Path | Mapping[str, Any],
+    folder: str | Path | None = None,
+    *,
+    jobs: int | None = None,
+    quick: bool = False,
+) -> SweepResult:
+    """Run every cell of a grid once, and wait; cells that were finished before are not repeated.
+
+    Args:
+        grid: name of a grid that comes with the package, path of a TOML file, or the contents of one.
+        folder: of the sweep; runs/sweeps/GRID if not given.
+        jobs: cells to run concurrently; the number of cores if None.
+        quick: use the grid's small version.
+
+    Raises:
+        UsageError: the grid or a setting is invalid, or the folder holds other runs.
+    """
+    if jobs is not None and jobs < 1:
+        raise UsageError(f"jobs = {jobs}: must be at least 1")
+    if isinstance(grid, Mapping):
+        if folder is None:
+            raise UsageError("folder: a grid without a name needs one")
+        checked, path = parse_grid(tomli_w.dumps(grid), str(folder), quick), absolute(folder, "folder")
+    else:
+        checked = load_grid(str(grid), quick)
+        path = absolute(default_folder(grid, quick) if folder is None else folder, "folder")
+    cells = [CellFolder(path, cell) for cell in checked.cells]
+    claim_folder(checked, cells, path)
+    runner = Runner(cells, LocalProcesses(checked.file, jobs))
+    try:
+        while not runner.done:
+            runner.tick()
+            time.sleep(TICK)
+    finally:
+        runner.abort()
+    rows = {cell.cell.name: _row(cell, checked.varied) for cell in cells if cell.outcome()}
+    return SweepResult(path, pd.DataFrame.from_dict(rows, orient="index"), runner.failed)
+
+
+def _row(cell: CellFolder, varied: tuple[str, ...]) -> dict[str, Any]:
+    return {**{name: value_of(cell.cell.config, name) for name in varied}, **read_summary(cell.path)}

@@ -1,1 +1,0 @@
-"""The records of a run: its directory, metrics, summary, learning curve and checkpoints."""
