@@ -8,7 +8,7 @@ from typing import Literal
 from coop.common.process import cli
 from coop.common.process.importing import importing
 from coop.common.process.lifecycle import run_main
-from coop.records.run_options import HealthOptions, RoleOptions
+from coop.common.settings.options import HealthOptions, RoleOptions
 
 
 @dataclass(frozen=True)

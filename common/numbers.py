@@ -1,6 +1,10 @@
-"""Returns: their running mean over the last 100 episodes, the paper's measure, and their exact text."""
+"""Numbers: the running mean of returns over the last 100 episodes, the paper's measure, exact text, strict JSON."""
 
 from __future__ import annotations
+
+import json
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,3 +24,23 @@ def running_mean(values: ArrayLike, window: int = RETURN_WINDOW) -> NDArray[np.f
     ends = np.arange(1, len(total))
     starts = np.maximum(0, ends - window)
     return np.asarray((total[ends] - total[starts]) / (ends - starts))
+
+
+def strict_json(value: Any, indent: int | None = None) -> str:  # noqa: ANN401 (plain values, tables and lists)
+    """A value as JSON, in which numbers that are not finite, which JSON lacks, are null."""
+    try:
+        return json.dumps(value, indent=indent, allow_nan=False)
+    except ValueError:
+        return json.dumps(finite(value), indent=indent)
+
+
+def finite(value: Any) -> Any:  # noqa: ANN401 (as `strict_json`)
+    """Numbers that are not finite become None, in nested lists and tables."""
+    match value:
+        case float():
+            return value if math.isfinite(value) else None
+        case dict():
+            return {name: finite(each) for name, each in value.items()}
+        case list() | tuple():
+            return [finite(each) for each in value]
+    return value

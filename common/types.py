@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from coop.common.bounded import Count, Float32, Incarnation, Name, Share
+from coop.common.bounded import Count, Counter, Float32, Incarnation, Name, Share
 from coop.common.bounds import (
     MAX_ACTIONS,
     MAX_COUNT,
@@ -73,6 +73,27 @@ class EpisodeEnd(Struct, frozen=True, array_like=True, forbid_unknown_fields=Tru
     q1_mean: Float32
     q2_mean: Float32
     param_version: Annotated[int, Meta(ge=-1, le=MAX_UPDATES)]
+
+
+class EpisodeRecord(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A finished episode as the replay service records it, in order of acceptance.
+
+    env_step: transitions accepted up to the episode's last step.
+    """
+
+    env_step: Counter
+    actor: Incarnation
+    stream: Annotated[int, Meta(ge=0, lt=MAX_STREAMS)]
+    end: EpisodeEnd
+
+
+class EpisodeRow(NamedTuple):
+    """One finished episode for episodes.csv: its number, the actor's record, updates done, and the scale of s."""
+
+    number: int
+    record: EpisodeRecord
+    update: int
+    s: float
 
 
 class Segment(Struct, frozen=True, forbid_unknown_fields=True):

@@ -6,59 +6,59 @@
     policy = coop.load("runs/a").policy()
     print(coop.evaluate(policy, episodes=20).mean)
 
-docs/python.md has more examples.
+docs/python.md has more examples. `import coop` imports nothing else: each name is imported when it is first used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from pathlib import Path
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from coop.common.errors import CoopError, RunError, UsageError
-from coop.common.places import absolute
-from coop.common.settings.config import RunConfig
-from coop.common.settings.methods import METHODS, Method
-from coop.evaluation.evaluate import Evaluation, evaluate
-from coop.evaluation.saved import SavedPolicy, SavedRun
-from coop.studies.sweep.run import SweepResult, sweep
-from coop.training import TrainingRun, train
+if TYPE_CHECKING:
+    from coop.common.errors import CoopError as CoopError
+    from coop.common.errors import RunError as RunError
+    from coop.common.errors import UsageError as UsageError
+    from coop.common.settings.config import RunConfig as RunConfig
+    from coop.common.settings.methods import Method as Method
+    from coop.common.settings.methods import register_method as register_method
+    from coop.evaluation.evaluate import Evaluation as Evaluation
+    from coop.evaluation.evaluate import evaluate as evaluate
+    from coop.evaluation.saved import SavedPolicy as SavedPolicy
+    from coop.evaluation.saved import SavedRun as SavedRun
+    from coop.evaluation.saved import load as load
+    from coop.studies.sweep.run import SweepResult as SweepResult
+    from coop.studies.sweep.run import sweep as sweep
+    from coop.training import TrainingRun as TrainingRun
+    from coop.training import train as train
 
-__all__ = [
-    "CoopError",
-    "Evaluation",
-    "Method",
-    "RunConfig",
-    "RunError",
-    "SavedPolicy",
-    "SavedRun",
-    "SweepResult",
-    "TrainingRun",
-    "UsageError",
-    "evaluate",
-    "load",
-    "register_method",
-    "sweep",
-    "train",
-]
+_MODULES = {
+    "CoopError": "coop.common.errors",
+    "Evaluation": "coop.evaluation.evaluate",
+    "Method": "coop.common.settings.methods",
+    "RunConfig": "coop.common.settings.config",
+    "RunError": "coop.common.errors",
+    "SavedPolicy": "coop.evaluation.saved",
+    "SavedRun": "coop.evaluation.saved",
+    "SweepResult": "coop.studies.sweep.run",
+    "TrainingRun": "coop.training",
+    "UsageError": "coop.common.errors",
+    "evaluate": "coop.evaluation.evaluate",
+    "load": "coop.evaluation.saved",
+    "register_method": "coop.common.settings.methods",
+    "sweep": "coop.studies.sweep.run",
+    "train": "coop.training",
+}
 
-
-def load(run_dir: str | Path, *, allow_import: Collection[str] = ()) -> SavedRun:
-    """The run in a folder, whether it has ended or not.
-
-    allow_import: modules of its environment or network that may be imported even if they lie in the run's folder or
-    beside it. Others come from the installed packages, `sys.path` or the working directory.
-
-    Raises:
-        UsageError: there is no run.
-        RunError: a link leads out of the folder.
-    """
-    return SavedRun(absolute(run_dir, "run_dir"), allow_import)
+__all__ = sorted(_MODULES)  # noqa: PLE0605
 
 
-def register_method(method: Method) -> None:
-    """Add a training method in this process; raises UsageError for a name in use.
+def __getattr__(name: str) -> Any:  # noqa: ANN401 (whatever has that name)
+    if name not in _MODULES:
+        raise AttributeError(f"module 'coop' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
 
-    The processes of distributed runs and of sweeps know only the methods of installed packages, which add them by an
-    entry point of the group `coop.methods`.
-    """
-    METHODS.register(method)
+
+def __dir__() -> list[str]:
+    return [*globals(), *_MODULES]

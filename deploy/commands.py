@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
+from types import TracebackType
 
 from coop.common.places import remember_working_directory
 from coop.common.process.importing import importing
@@ -32,8 +33,17 @@ MODULES = {
 }
 
 
+def _in_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Print one line for a Ctrl-C that arrives during a command's imports, as for every later one."""
+    if issubclass(kind, KeyboardInterrupt):
+        print("interrupted", file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
 def main() -> None:
     """The command after which the script is named."""
+    sys.excepthook = _in_one_line
     program = Path(sys.argv[0]).name
     if program not in MODULES:
         sys.exit(f"{program}: give one of {', '.join(MODULES)}")

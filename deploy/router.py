@@ -12,8 +12,8 @@ from coop.common.messaging.session import open_session
 from coop.common.process import cli
 from coop.common.process.console import Console, counted
 from coop.common.process.lifecycle import Stop, run_main
+from coop.common.settings.options import HealthOptions
 from coop.monitor.health import answering
-from coop.records.run_options import HealthOptions
 
 TICK = 0.5  # seconds
 

@@ -11,7 +11,8 @@ from coop.common.process.lifecycle import run_main
 from coop.common.process.ports import check_can_listen
 from coop.common.settings.capacity import check_messages
 from coop.common.settings.config import check_distributed
-from coop.records.run_options import HealthOptions, LearnerRunOptions, parse_run
+from coop.common.settings.options import HealthOptions
+from coop.records.run_options import LearnerRunOptions, parse_run
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ from coop.learner.checkpoints import Checkpoints
 from coop.learner.evaluations import EvaluationInbox
 from coop.learner.join_service import JoinService
 from coop.learner.status import StatusReporter
+from coop.learner.summary import summarise
 from coop.learner.trainer import Effects, Trainer
 from coop.records.run_directory import RunDirectory
-from coop.records.summary import Summary, summarise
+from coop.records.summaries import Summary
 
 STATUS_EVERY = 0.5  # seconds
 REPLAY_BACK = 30.0  # seconds to wait for an absent replay service when the run is complete

@@ -10,29 +10,20 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.messaging.messages.sample import Drawn, EpisodeRecord
+from coop.common.messaging.messages.sample import Drawn
 from coop.common.numbers import METRICS_EVERY
-from coop.common.types import Batch
+from coop.common.types import Batch, EpisodeRow
 from coop.learner.agent import Update
 from coop.learner.protocol import Agent
 from coop.learner.telemetry import Telemetry
 
 NOTHING_DRAWN = Drawn(0, 0, 0, 0, 0, 0, ())
-
-
-class EpisodeRow(NamedTuple):
-    """One finished episode for episodes.csv: its number, the actor's record, updates done, and the scale of s."""
-
-    number: int
-    record: EpisodeRecord
-    update: int
-    s: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,8 @@ from coop.common.process import cli
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.memory import keep_freed_memory
+from coop.common.settings.options import HealthOptions, RoleOptions
 from coop.monitor.health import answering
-from coop.records.run_options import HealthOptions, RoleOptions
 from coop.replay.core import ReplayCore
 from coop.replay.persistence.epochs import ReplayEpochs
 from coop.replay.persistence.folder import ReplayFolder

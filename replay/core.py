@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 
 from coop.common.errors import RunError
-from coop.common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest, EpisodeRecord
+from coop.common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest
 from coop.common.settings.capacity import check_memory
 from coop.common.settings.config import RunConfig
-from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.common.types import Array, Batch, EnvSpec, EpisodeRecord, Segment
 from coop.replay.dedup import DuplicateFilter
 from coop.replay.episodes import EpisodeLog
 from coop.replay.limiter import RateLimiter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from coop.common.messaging.messages.sample import EpisodeRecord
+from coop.common.types import EpisodeRecord
 
 MOST = 131_072  # episodes kept; if a run saves no epoch, the oldest are dropped
 

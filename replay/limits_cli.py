@@ -14,7 +14,7 @@ from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarna
 from coop.common.process import cli
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.untrusted import check_run
-from coop.records.run_options import RoleOptions
+from coop.common.settings.options import RoleOptions
 
 
 @dataclass(frozen=True)

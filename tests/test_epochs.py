@@ -12,9 +12,9 @@ from samples import make_segment
 from table_reference import check_references
 
 from coop.common.errors import RunError
-from coop.common.messaging.messages.sample import DrawRequest, EpisodeRecord
+from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
-from coop.common.types import EnvSpec
+from coop.common.types import EnvSpec, EpisodeRecord
 from coop.records.checkpoints import DONE, checkpoint_numbers
 from coop.records.kept import load_learner, newest_epoch, save_epoch
 from coop.records.resumption import go_back, survey

@@ -15,12 +15,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from coop.common.errors import RunError
 from coop.common.process.files import LineFile
 from coop.common.process.lifecycle import Stop
+from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.run import play_lockstep
 from coop.records.checkpoints import checkpoint_numbers
 from coop.records.run_directory import RunDirectory
 from coop.records.sources import base_config
-from coop.records.summary import summarise
 
 
 def _fill(disk: Path) -> Path:

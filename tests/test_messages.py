@@ -40,7 +40,6 @@ from coop.common.messaging.messages.sample import (
     Drawn,
     DrawRequest,
     Draws,
-    EpisodeRecord,
     NamedBatchReader,
     encode_batch,
     encode_named,
@@ -51,7 +50,7 @@ from coop.common.messaging.messages.weights import Current, Role, Weights
 from coop.common.messaging.wire import Message
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import to_tables
-from coop.common.types import EnvSpec, EpisodeEnd
+from coop.common.types import EnvSpec, EpisodeEnd, EpisodeRecord
 from coop.replay.table.table import PinnedBatch, Table
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)

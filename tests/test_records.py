@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from coop.common.numbers import exact
+from coop.common.numbers import exact, strict_json
 from coop.common.process.lifecycle import Stop
+from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
 from coop.records.sources import base_config
-from coop.records.summaries import SUMMARY, read_summary, strict_json
-from coop.records.summary import summarise
+from coop.records.summaries import SUMMARY, read_summary
 from coop.studies.report.packed import pack, unpack
 
 EXACT = [1234567.89, -0.1, 9.0, 1e300, 0.1 + 0.2, 16777217.0, 123456789.0]

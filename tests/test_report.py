@@ -17,9 +17,9 @@ import pytest
 from coop.common.errors import RunError, UsageError
 from coop.common.numbers import running_mean
 from coop.common.settings.tables import sealed_toml
+from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_directory import RunDirectory
-from coop.records.summary import summarise
 from coop.studies.report import cli
 from coop.studies.report.figures import NETWORKS, figures
 from coop.studies.report.intervals import (

@@ -7,7 +7,7 @@ import pytest
 from coop.common.settings.config import RunConfig
 from coop.common.settings.environment import EnvSettings
 from coop.records.run_directory import RunDirectory
-from coop.records.summary import Summary
+from coop.records.summaries import Summary
 
 
 @pytest.mark.parametrize(

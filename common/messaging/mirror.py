@@ -2,8 +2,8 @@
 
 The table keeps each frame in a slot and gives it a number that no other frame of this table ever gets. An answer to a
 draw names slots and numbers of its batch's frames, and carries those frames that the mirror lacks as far as the replay
-service knows (`coop.replay.mirrored`). The learner compares the numbers before it reads a slot, so it can't read a wrong
-frame; where it lacks one, it asks again, and a draw that is answered again carries all its frames.
+service knows (`coop.replay.mirrored`). The learner compares the numbers before it reads a slot, so it can't read a
+wrong frame; where it lacks one, it asks again, and a draw that is answered again carries all its frames.
 
 Nothing here does I/O. A mirror on another device needs the same attributes and the same two methods.
 """

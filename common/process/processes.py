@@ -18,9 +18,9 @@ from coop.common.places import working_directory
 from coop.common.process.lifecycle import SIGNALS, SUPERVISED, status_after
 from coop.common.process.limits import memory_kills, memory_limit
 from coop.common.process.output import keep_standard_files
-from coop.records.locks import INHERITED
 
 SIGNAL_STATUSES = tuple(map(status_after, SIGNALS))
+INHERITED = "COOP_LOCKS"  # comma-separated descriptors of locks that a process inherits from its supervisor
 LAST_WORDS = 400  # characters of a log's line
 SAYS_WHY = ": error: "  # in the line in which a command says why it fails
 _NUMBERS = re.compile(r"0x[0-9a-f]+|[0-9][0-9,.:]*")  # steps, times, ports: not the same at each start

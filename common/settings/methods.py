@@ -20,12 +20,13 @@ class Method:
         two_networks: two independent networks, each of which gives the other's targets; their roles swap every C
             updates. If False, the second network is a copy of the first, made every C updates, and gives the targets.
         error_driven: error-driven learning feeds the error back; if False, the ordinary gradient does.
-        rule: of the targets and the extra cost: a `coop.learner.methods.rule.Rule`, or "module:Class" to import it in the
-            learner only.
+        rule: of the targets and the extra cost: a `coop.learner.methods.rule.Rule`, or "module:Class" to import it in
+            the learner only.
         network: makes the Q-network, with the arguments and result of `coop.common.networks.network.build_network`;
             "module:function" to import it where networks are made.
-        stream: for a method without a replay buffer, its agent, a class like `coop.learner.methods.stream_q:StreamAgent`,
-            or "module:Class"; such a method runs in lockstep only. None: updates with batches from a replay table.
+        stream: for a method without a replay buffer, its agent, a class like
+            `coop.learner.methods.stream_q:StreamAgent`, or "module:Class"; such a method runs in lockstep only. None:
+            updates with batches from a replay table.
         settings: a frozen dataclass of the method's own settings, which a config holds in the table `Method.table`.
         conditions: on which these settings have an effect.
         colour: in figures; None: the next one that is free.
@@ -68,3 +69,12 @@ METHODS = Registry(
         "stream-q": "coop.common.settings.stream_q:STREAM_Q",
     },
 )
+
+
+def register_method(method: Method) -> None:
+    """Add a training method in this process; raises UsageError for a name in use.
+
+    The processes of distributed runs and of sweeps know only the methods of installed packages, which add them by an
+    entry point of the group `coop.methods`.
+    """
+    METHODS.register(method)

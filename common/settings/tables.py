@@ -21,7 +21,6 @@ from coop.common.settings.overrides import merged, of_method
 from coop.common.settings.renamed import current, with_stack
 from coop.common.settings.rules import check_rules
 from coop.common.suggestions import not_among
-from coop.records.run_ids import has_run_id
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
 CONFIG = "config.toml"
@@ -144,17 +143,6 @@ def check_toml(text: str, place: object, *, needed: bool = False) -> None:
     content, seal, _ = text.rpartition(_SEAL)
     if (seal or needed) and text != sealed_toml(content):
         raise UsageError(f"{place}: not what was written (wrong checksum)")
-
-
-def read_run_config(run_dir: Path) -> RunConfig:
-    """Read a run's config.toml, after a check of its checksum; raises UsageError."""
-    path = run_dir / CONFIG
-    try:
-        text = read_text(path, MAX_SETTINGS)
-    except (OSError, UnicodeDecodeError, RunError) as error:
-        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
-    # Runs of a packed study have no id, and may come from versions that wrote no checksum.
-    return parse_run_config(text, path, needed=has_run_id(run_dir))
 
 
 def parse_run_config(text: str, place: object, *, needed: bool = False) -> RunConfig:

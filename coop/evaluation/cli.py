@@ -16,7 +16,7 @@ from coop.common.numbers import exact
 from coop.common.places import shown
 from coop.common.process import cli
 from coop.common.process.lifecycle import raise_on_signals, run_main
-from coop.records.run_options import RoleOptions
+from coop.common.settings.options import RoleOptions
 
 if TYPE_CHECKING:
     from coop.evaluation.evaluate import CheckpointEvaluation

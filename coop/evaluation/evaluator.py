@@ -21,8 +21,8 @@ from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarna
 from coop.common.process.console import Console, counted
 from coop.common.process.lifecycle import Stop
 from coop.common.process.threads import use_threads
+from coop.common.settings.options import RoleOptions
 from coop.evaluation.episodes import AT_ONCE, Evaluator
-from coop.records.run_options import RoleOptions
 
 LOOK_EVERY = 0.05  # seconds between looks at what the learner has broadcast
 ANSWER_TIMEOUT = 2.0  # seconds to wait for each receipt

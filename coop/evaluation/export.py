@@ -14,11 +14,11 @@ from safetensors.numpy import save
 from torch import nn
 
 from coop.common.errors import RunError, UsageError
+from coop.common.numbers import strict_json
 from coop.common.process.files import SyncedFile, make_folder, sync_folder
 from coop.common.settings.config import RunConfig
 from coop.evaluation.export_onnx import NotExportedError, onnx_model, preparation
 from coop.evaluation.saved import Checkpoint, SavedRun
-from coop.records.summaries import strict_json
 
 CARD = "card.json"
 # The arguments that make a layer again, besides its bias.

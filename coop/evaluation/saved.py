@@ -18,16 +18,16 @@ from coop.common.envs.make import env_spec
 from coop.common.errors import UsageError
 from coop.common.imports import hand_over, permit
 from coop.common.networks.network import FlatNetwork
+from coop.common.places import absolute
 from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.resuming import settings_digest
-from coop.common.settings.tables import read_run_config
 from coop.common.types import Array, EnvSpec
 from coop.learner.qnetwork import make_network
 from coop.records.evaluations import EVALUATIONS
 from coop.records.kept import fitting, newest_epoch
-from coop.records.reading import check_records, read_csv, read_jsonl, read_lines
+from coop.records.reading import check_records, read_csv, read_jsonl, read_lines, read_run_config
 from coop.records.summaries import read_summary
 
 CPU = torch.device("cpu")
@@ -185,3 +185,16 @@ class SavedRun:
     def q_values(self, obs: ArrayLike, network: NetworkChoice = "mean") -> NDArray[np.float32]:
         """Q-values of `policy(network)`, float32 [actions] or [batch, actions]; for many calls, keep the policy."""
         return self.policy(network).q_values(obs)
+
+
+def load(run_dir: str | Path, *, allow_import: Collection[str] = ()) -> SavedRun:
+    """The run in a folder, whether it has ended or not.
+
+    allow_import: modules of its environment or network that may be imported even if they lie in the run's folder or
+    beside it. Others come from the installed packages, `sys.path` or the working directory.
+
+    Raises:
+        UsageError: there is no run.
+        RunError: a link leads out of the folder.
+    """
+    return SavedRun(absolute(run_dir, "run_dir"), allow_import)

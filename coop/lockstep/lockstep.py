@@ -14,9 +14,9 @@ from coop.actors.player import Player, Turn
 from coop.actors.policy import Policy
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import RunError, UsageError
-from coop.common.messaging.messages.sample import EpisodeRecord
 from coop.common.process.randomness import generator_state, set_generator_state
 from coop.common.settings.config import RunConfig
+from coop.common.types import EpisodeRecord
 from coop.learner.trainer import Effects, Trainer
 from coop.lockstep.memory import make_memory
 from coop.records.checkpoints import REPLAY

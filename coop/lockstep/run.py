@@ -15,12 +15,13 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest
 from coop.evaluation.episodes import Evaluator
 from coop.learner.initial_networks import load_initial_networks
+from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep, Replaying
 from coop.records.kept import load_learner
 from coop.records.locks import RunLock
 from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
-from coop.records.summary import Summary, summarise
+from coop.records.summaries import Summary
 
 PROGRESS_EVERY = 5.0  # seconds
 

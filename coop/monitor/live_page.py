@@ -10,12 +10,12 @@ from importlib.resources import files
 from typing import Any
 
 from coop.common.messaging.messages.status import LearnerStatus
+from coop.common.numbers import strict_json
 from coop.common.process.console import connected
 from coop.monitor.curves import COLUMNS, Curves
 from coop.monitor.display import printable
 from coop.monitor.facts import SILENT_AFTER, detail, facts, place, progress, settings, silence, times
 from coop.monitor.web import Document, WebServer
-from coop.records.summaries import strict_json
 
 FOLLOWS = 3.0  # seconds within which a browser that follows the run asks again
 

@@ -12,13 +12,13 @@ from rich.console import Console
 from coop.common.errors import JoinError, PeerLost, UsageError
 from coop.common.messaging.messages.status import LearnerStatus
 from coop.common.messaging.transport import new_incarnation
+from coop.common.numbers import strict_json
 from coop.common.process.cli import parse
 from coop.common.process.flags import HttpAddress
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.untrusted import check_run
 from coop.monitor.screen import RunScreen
 from coop.monitor.status import Display, RunStatus, live_page
-from coop.records.summaries import strict_json
 
 TICK = 0.1  # seconds
 

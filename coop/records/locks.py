@@ -26,9 +26,9 @@ from typing import Self
 from coop.common.errors import RunError
 from coop.common.process.files import guard_writes, make_folder
 from coop.common.process.output import keep_standard_files
+from coop.common.process.processes import INHERITED
 from coop.common.process.untrusted import check_links
 
-INHERITED = "COOP_LOCKS"  # comma-separated descriptors of locks that a process inherits from its supervisor
 HOLDER_BYTES = 512  # more than any holder's line
 BEAT = 2.0  # seconds between an owner's touches
 LEASE = 15.0  # seconds without a touch after which an owner is dead; more than a network file system's caches hold

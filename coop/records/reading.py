@@ -11,8 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from coop.common.errors import RunError
+from coop.common.errors import RunError, UsageError
 from coop.common.process.notices import warn
+from coop.common.process.untrusted import MAX_SETTINGS, read_text
+from coop.common.settings.config import RunConfig
+from coop.common.settings.tables import CONFIG, parse_run_config
 from coop.records.checkpoints import (
     Damaged,
     check_record,
@@ -21,6 +24,7 @@ from coop.records.checkpoints import (
     checkpoint_path,
     read_manifest,
 )
+from coop.records.run_ids import has_run_id
 from coop.records.summaries import SUMMARY
 
 
@@ -109,3 +113,14 @@ def column(rows: Sequence[dict[str, Any]], name: str, path: Path, first: int, *,
         if not isinstance(values[-1], int | float | None):
             raise RunError(f"{path}, line {number}: {name} = {values[-1]!r}: no number")
     return values
+
+
+def read_run_config(run_dir: Path) -> RunConfig:
+    """Read a run's config.toml, after a check of its checksum; raises UsageError."""
+    path = run_dir / CONFIG
+    try:
+        text = read_text(path, MAX_SETTINGS)
+    except (OSError, UnicodeDecodeError, RunError) as error:
+        raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    # Runs of a packed study have no id, and may come from versions that wrote no checksum.
+    return parse_run_config(text, path, needed=has_run_id(run_dir))

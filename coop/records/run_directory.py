@@ -14,21 +14,20 @@ from typing import Any, Self
 from coop.common.errors import RunError
 from coop.common.imports import describe, remember
 from coop.common.messaging.messages.evaluate import EvaluationRow
-from coop.common.numbers import exact
+from coop.common.numbers import exact, strict_json
 from coop.common.process.console import say
 from coop.common.process.files import LineFile, Measured, make_folder, measure, truncate, write_atomic
 from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import leaves
 from coop.common.settings.resuming import settings_digest
 from coop.common.settings.tables import CONFIG, run_config_text, to_tables
-from coop.learner.trainer import EpisodeRow
+from coop.common.types import EpisodeRow
 from coop.records.checkpoints import RECORDS
 from coop.records.curve import draw_learning_curve
 from coop.records.evaluations import EVALUATIONS, EvaluationsFile
 from coop.records.resumption import Survey, go_back
 from coop.records.run_ids import claim, has_run_id, read_run_id
-from coop.records.summaries import SUMMARY, strict_json, summary_text
-from coop.records.summary import Summary
+from coop.records.summaries import SUMMARY, Summary, summary_text
 from coop.records.tensorboard import Kept, TensorBoardWriter
 from coop.records.wandb_mirror import WandbMirror
 

@@ -1,4 +1,4 @@
-"""The flags that the commands share."""
+"""The flags of a run, the config that they start from, and the run directory that they choose."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from coop.common.process import cli
 from coop.common.process.extras import check_extra
 from coop.common.process.flags import HttpAddress
 from coop.common.process.notices import note_renamed, warn
-from coop.common.process.untrusted import check_run
 from coop.common.settings.config import RunConfig
 from coop.common.settings.effects import without_effect
 from coop.common.settings.methods import METHODS, table_of
 from coop.common.settings.renamed import current_flags
 from coop.common.settings.resuming import check_resumed
-from coop.common.settings.tables import preset_names, read_run_config, validated
+from coop.common.settings.tables import preset_names, validated
 from coop.records.checkpoints import LEARNER, RECORDS, checkpoint_numbers
+from coop.records.reading import read_run_config
 from coop.records.resumption import Start, holds_run
 from coop.records.run_ids import has_run_id, read_run_id
 from coop.records.sources import base_config
@@ -38,36 +38,6 @@ COMMON = (
     *("--learner.batch-size", "--learner.swap-every", "--learner.target-update-every", "--learner.learning-rate"),
     *("--edl.rate", "--actor.envs"),
 )
-
-
-@dataclass(frozen=True)
-class HealthOptions:
-    """The flag of processes that container engines watch."""
-
-    health: HttpAddress = ""
-    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
-
-
-@dataclass(frozen=True)
-class RoleOptions:
-    """Where and how a process finds its run."""
-
-    run: str = "coop"
-    """Name of the run."""
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Endpoints of the learner, for example tcp/head:7447."""
-    join_timeout: float = 30.0
-    """Seconds to search for the learner before giving up."""
-    patience: float = 60.0
-    """Seconds to wait for a lost learner before giving up."""
-    zenoh_config: Path | None = None
-    """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
-    shared_memory: bool = False
-    """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
-
-    def __post_init__(self) -> None:
-        """Raise UsageError for a name that no run has."""
-        check_run(self.run)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from coop.common.imports import hand_over
 from coop.common.process.notices import warn
 from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig
-from coop.common.settings.tables import load_tables, read_run_config, resolve, shortened
+from coop.common.settings.tables import load_tables, resolve, shortened
+from coop.records.reading import read_run_config
 
 _OF_RUNS = ("run-id", "checkpoints", "episodes.csv")  # beside a config.toml
 

@@ -1,24 +1,61 @@
-"""The summary that a run leaves behind, as a file."""
+"""The summary at a run's end: summary.json, and one line."""
 
 from __future__ import annotations
 
 import json
-import math
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from coop.common.errors import RunError
+from coop.common.numbers import finite, strict_json
+from coop.common.process.console import averaged_over
 
 SUMMARY = "summary.json"
 _SEAL = "crc32"  # the last field
 
 
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """The fields of summary.json.
+
+    return_mean_100, return_sd_100: over the last 100 episodes; 0 if none has ended. transitions_lost,
+    duplicates_refused: None if the replay service did not answer. exit: why the run ended.
+    """
+
+    method: str
+    env: str
+    seed: int
+    env_steps: int
+    updates: int
+    episodes: int
+    return_mean_100: float
+    return_sd_100: float
+    wall_seconds: float
+    transitions_accepted: int
+    transitions_lost: int | None
+    duplicates_refused: int | None
+    exit: str
+
+    @property
+    def title(self) -> str:
+        """A short title of the run."""
+        return f"{self.env}, {self.method}, seed {self.seed}"
+
+    def __str__(self) -> str:
+        returns = f"return of {averaged_over(self.episodes)} {self.return_mean_100:.1f} ({self.return_sd_100:.1f})"
+        return (
+            f"{self.exit}: {self.env_steps:,} steps, {self.updates:,} updates, "
+            f"{returns if self.episodes else 'no episode ended'}, {self.wall_seconds:.0f} s"
+        )
+
+
 def summary_text(fields: Mapping[str, Any]) -> str:
     """The text of summary.json: the fields, and their checksum."""
-    finite = _finite(dict(fields))
-    return strict_json({**finite, _SEAL: _checksum(finite)}, indent=2) + "\n"
+    plain = finite(dict(fields))
+    return strict_json({**plain, _SEAL: _checksum(plain)}, indent=2) + "\n"
 
 
 def parse_summary(text: str, place: object) -> dict[str, Any]:
@@ -36,25 +73,6 @@ def parse_summary(text: str, place: object) -> dict[str, Any]:
     if fields.pop(_SEAL, None) not in (None, _checksum(fields)):  # packed ones of earlier versions have none
         raise RunError(f"{place}: wrong checksum")
     return fields
-
-
-def strict_json(value: Any, indent: int | None = None) -> str:  # noqa: ANN401 (plain values, tables and lists)
-    """A value as JSON, in which numbers that are not finite, which JSON lacks, are null."""
-    try:
-        return json.dumps(value, indent=indent, allow_nan=False)
-    except ValueError:
-        return json.dumps(_finite(value), indent=indent)
-
-
-def _finite(value: Any) -> Any:  # noqa: ANN401 (as `strict_json`)
-    match value:
-        case float():
-            return value if math.isfinite(value) else None
-        case dict():
-            return {name: _finite(each) for name, each in value.items()}
-        case list() | tuple():
-            return [_finite(each) for each in value]
-    return value
 
 
 def read_summary(run_dir: Path) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The rules of the registered MinAtar study (results/minatar/plan.md), applied to packed studies.
 
-`python -m coop.studies.registered pilot|rates|scores|outcome|games FILE` prints a table of the plan and what it decides,
+`python -m coop.studies.registered pilot|rates|scores|outcome|games FILE` prints a table of the plan and what it says
 if study and plan are what SHA256SUMS beside them lists; `figure FILE` draws the outcome by game.
 """
 

@@ -34,7 +34,9 @@ class Transition(Batch):
 
 
 class StreamAgent:
-    """One network, learning from each transition once, in the order in which they happen; like `coop.learner.agent.Agent`.
+    """One network, learning from each transition once, in the order in which they happen.
+
+    It stands where `coop.learner.agent.Agent` does.
 
     Each observation is shown to it once, by `begin` or at the end of a transition, and is standardized by the moments
     of all up to itself.

@@ -16,10 +16,10 @@ import numpy as np
 
 from coop.common.errors import BadMessage, CoopError
 from coop.common.messaging import wire
-from coop.common.messaging.messages.sample import BatchReader, EpisodeRecord, encode_batch
+from coop.common.messaging.messages.sample import BatchReader, encode_batch
 from coop.common.process.files import PIECE, Measured, SyncedFile, make_folder, sync_folder
 from coop.common.process.untrusted import load_array
-from coop.common.types import Array, EpisodeEnd
+from coop.common.types import Array, EpisodeEnd, EpisodeRecord
 from coop.records.checkpoints import Damaged, Manifest, check_part, read_manifest, remove, write_manifest
 from coop.records.run_ids import check_owner
 from coop.replay.core import CoreSnapshot, ReplayCore

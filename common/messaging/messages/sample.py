@@ -11,32 +11,20 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from coop.common.bounded import Count, Counter, Incarnation, Updates
-from coop.common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_INTEGER, MAX_PRIORITIES, MAX_STREAMS, MAX_UPDATES
+from coop.common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_INTEGER, MAX_PRIORITIES, MAX_UPDATES
 from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.messages.body import Body, Layout, check_kind, to_struct
 from coop.common.messaging.messages.insert import OPTIONAL, check_indices, check_range, check_values, transitions
 from coop.common.messaging.wire import Message, Source
 from coop.common.process.shared_memory import ADDRESS
-from coop.common.types import Array, Batch, EnvSpec, EpisodeEnd
+from coop.common.types import Array, Batch, EnvSpec, EpisodeRecord
 
 MAX_EPISODES = 1000  # in one answer; the next answer carries the rest
 KIND = "batch"
 NAMED = "batches"  # whose frames are named
 
 Priority = Annotated[float, Meta(ge=0, le=MAX_FLOAT32)]
-
-
-class EpisodeRecord(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A finished episode as the replay service records it, in order of acceptance.
-
-    env_step: transitions accepted up to the episode's last step.
-    """
-
-    env_step: Counter
-    actor: Incarnation
-    stream: Annotated[int, Meta(ge=0, lt=MAX_STREAMS)]
-    end: EpisodeEnd
 
 
 class Drawn(Struct, frozen=True):

@@ -1,7 +1,7 @@
 """The rules of the dissection of error-driven learning (results/cartpole/edl/plan.md), applied to its packed runs.
 
-`python -m coop.studies.stacked.verdict` prints the tables of the page as Markdown, `figures` draws its figures; the plan
-must be the one whose SHA-256 the packed file holds.
+`python -m coop.studies.stacked.verdict` prints the tables of the page as Markdown, `figures` draws its figures; the
+plan must be the one whose SHA-256 the packed file holds.
 """
 
 from __future__ import annotations

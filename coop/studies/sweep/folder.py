@@ -14,9 +14,10 @@ from coop.common.errors import RunError, UsageError
 from coop.common.numbers import RETURN_WINDOW
 from coop.common.process.files import make_folder, write_atomic
 from coop.common.process.untrusted import check_links
-from coop.common.settings.tables import identity, read_run_config, run_config_text, sealed_toml
+from coop.common.settings.tables import identity, run_config_text, sealed_toml
 from coop.records.checkpoints import checked_summary
 from coop.records.locks import Held, RunLock
+from coop.records.reading import read_run_config
 from coop.studies.sweep.grid import Cell, Grid
 
 TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines

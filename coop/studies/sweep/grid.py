@@ -99,7 +99,7 @@ class Grid:
 
 def shipped_grids() -> list[str]:
     """The grids that come with the package."""
-    return sorted(entry.name.removesuffix(".toml") for entry in files("experiments").joinpath("grids").iterdir())
+    return sorted(entry.name.removesuffix(".toml") for entry in files("coop.studies").joinpath("grids").iterdir())
 
 
 def load_grid(name: str, quick: bool = False) -> Grid:
@@ -144,7 +144,7 @@ def parse_grid(text: str, name: str, quick: bool = False, check: bool = True) ->
 
 def _text(name: str) -> str:
     if name in shipped_grids():
-        return files("experiments").joinpath("grids", f"{name}.toml").read_text(encoding="utf-8")
+        return files("coop.studies").joinpath("grids", f"{name}.toml").read_text(encoding="utf-8")
     if not name.endswith(".toml"):
         hint = f"give a .toml file or one of {', '.join(shipped_grids())}"
         raise UsageError(refusal("unknown", closest(name, shipped_grids()), hint))

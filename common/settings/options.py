@@ -1,0 +1,39 @@
+"""The flags that processes of a run share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from coop.common.process.flags import HttpAddress
+from coop.common.process.untrusted import check_run
+
+
+@dataclass(frozen=True)
+class HealthOptions:
+    """The flag of processes that container engines watch."""
+
+    health: HttpAddress = ""
+    """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
+
+
+@dataclass(frozen=True)
+class RoleOptions:
+    """Where and how a process finds its run."""
+
+    run: str = "coop"
+    """Name of the run."""
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints of the learner, for example tcp/head:7447."""
+    join_timeout: float = 30.0
+    """Seconds to search for the learner before giving up."""
+    patience: float = 60.0
+    """Seconds to wait for a lost learner before giving up."""
+    zenoh_config: Path | None = None
+    """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
+    shared_memory: bool = False
+    """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for a name that no run has."""
+        check_run(self.run)
