@@ -1,4 +1,4 @@
-"""Mutation testing of the algorithm: `make mutants`, or `python benchmarks/mutants.py 'coop.learner.trainer*'` for a part.
+"""Mutation testing of the algorithm: `make mutants`; `mutants.py 'coop.learner.trainer*'` tests a part of it.
 
 mutmut (extra `mutants`) changes one place at a time of the files named in pyproject.toml and runs the tests that reach
 it; texts of errors stay. For each file the table gives the mutants made, killed, and killed by their time limit. A
