@@ -1,5 +1,6 @@
 """What is installed and what goes with the source: packages, their data, license, citation and links of pages."""
 
+import os
 import re
 import tomllib
 from fnmatch import fnmatch
@@ -8,17 +9,17 @@ from typing import Any
 
 import pytest
 import yaml
+from setuptools import find_packages
 
 ROOT = Path(__file__).parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-PACKAGES: list[str] = PROJECT["tool"]["setuptools"]["packages"]
 IN_CHECKOUTS_ONLY = (
-    "deploy/Dockerfile",
-    "deploy/*.yaml",
-    "deploy/*.sh",
-    "deploy/k8s/*",
-    "deploy/slurm/*",
-    "deploy/zenoh/*",
+    "coop/deploy/Dockerfile",
+    "coop/deploy/*.yaml",
+    "coop/deploy/*.sh",
+    "coop/deploy/k8s/*",
+    "coop/deploy/slurm/*",
+    "coop/deploy/zenoh/*",
 )
 PAGES = sorted(
     ["README.md", "CONTRIBUTING.md", "SECURITY.md"]
@@ -26,18 +27,21 @@ PAGES = sorted(
 )
 
 
-def test_every_package_is_installed() -> None:
-    tops = {package.partition(".")[0] for package in PACKAGES}
-    folders = {init.parent.relative_to(ROOT) for top in tops for init in (ROOT / top).rglob("__init__.py")}
-    assert {".".join(folder.parts) for folder in folders} == set(PACKAGES)
-    assert tops == set(PROJECT["tool"]["importlinter"]["root_packages"])
+def test_every_folder_of_the_package_is_installed_and_no_other_name() -> None:
+    found = PROJECT["tool"]["setuptools"]["packages"]["find"]
+    packages = find_packages(str(ROOT / found["where"][0]), include=found["include"])
+    assert {package.partition(".")[0] for package in packages} == {"coop"}
+    folders = {"/".join(package.split(".")) for package in packages}
+    modules = [Path(folder, name) for folder, _, names in os.walk(ROOT / "coop", followlinks=True) for name in names]
+    here = {path.parent.relative_to(ROOT).as_posix() for path in modules if path.suffix == ".py"}
+    assert folders == here
 
 
 def test_every_data_file_is_installed() -> None:
     data = PROJECT["tool"]["setuptools"]["package-data"]
     allowed = [f"{package.replace('.', '/')}/{pattern}" for package, patterns in data.items() for pattern in patterns]
-    tops = {package.partition(".")[0] for package in PACKAGES}
-    files = [path.relative_to(ROOT).as_posix() for top in tops for path in (ROOT / top).rglob("*") if path.is_file()]
+    walked = os.walk(ROOT / "coop", followlinks=True)
+    files = [Path(folder, name).relative_to(ROOT).as_posix() for folder, _, names in walked for name in names]
     others = [path for path in files if not path.endswith(".py") and "__pycache__" not in path]
     assert others
     assert not [path for path in others if not any(fnmatch(path, rule) for rule in (*allowed, *IN_CHECKOUTS_ONLY))]
