@@ -18,7 +18,6 @@ from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.settings.overrides import merged, of_method
-from coop.common.settings.renamed import current, with_stack
 from coop.common.settings.rules import check_rules
 from coop.common.suggestions import not_among
 from coop.records.run_ids import has_run_id
@@ -81,12 +80,10 @@ def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
 def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     """Turn tables into a checked config; a `[methods.NAME]` table overrides the rest for that method.
 
-    It also reads configs of earlier versions.
-
     Raises:
         UsageError: an unknown field or a value out of range; names the field, the value and what is allowed.
     """
-    return validated(of_method(with_stack(current(tables)), method))
+    return validated(of_method(tables, method))
 
 
 def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
@@ -153,7 +150,7 @@ def read_run_config(run_dir: Path) -> RunConfig:
         text = read_text(path, MAX_SETTINGS)
     except (OSError, UnicodeDecodeError, RunError) as error:
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
-    # Runs of a packed study have no id, and may come from versions that wrote no checksum.
+    # A config without a run, as a user writes it or takes it from a packed study, has neither.
     return parse_run_config(text, path, needed=has_run_id(run_dir))
 
 
