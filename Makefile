@@ -30,7 +30,8 @@ check: $(READY)
 # Every figure and table of results/, from the packed studies there.
 results: $(READY)
 	@for study in results/cartpole/*.parquet results/minatar/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
-	@$(BIN)/python -m coop.studies.registered figure results/minatar/study.parquet
+	@cd results/minatar && sha256sum --check --quiet SHA256SUMS
+	@$(BIN)/python results/minatar/registered.py figure results/minatar/study.parquet
 	@$(BIN)/coop-report results/pong.parquet --curves results/pong
 
 # Checks that take longer; docs/robustness.md says what each shows.

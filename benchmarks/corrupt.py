@@ -89,7 +89,7 @@ STUDY = (
 )
 PACKED = (
     Reader("coop-report", ("{}/study.parquet", "--out", "{out}"), REPORTED),
-    Reader("coop-report --unpack", ("{}/study.parquet", "--unpack", "{out}"), ("out/**/*",)),
+    Reader("coop-report --curves", ("{}/study.parquet", "--curves", "{out}"), ("out/*/*.png",)),
 )
 
 

@@ -30,6 +30,7 @@ def segments(spec: EnvSpec, steps: int, streams: int = 8) -> Iterator[Segment]:
         rewards=rng.random(steps, np.float32),
         terminated=np.zeros(steps, np.bool_),
         param_version=np.zeros(steps, np.int64),
+        span=np.ones(steps, np.uint8),
     )
     for sequence in count():
         carried = spec.stack if sequence else 0
@@ -58,4 +59,5 @@ def random_batch(spec: EnvSpec, size: int) -> Batch:
         param_version=np.zeros(size, np.int64),
         age=np.arange(size),
         reuse=np.ones(size, np.int32),
+        span=np.ones(size, np.uint8),
     )

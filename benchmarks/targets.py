@@ -168,5 +168,6 @@ def _segment(spec: EnvSpec, steps: int = 4, episodes: tuple[EpisodeEnd, ...] | N
         rewards=np.zeros(steps, np.float32),
         terminated=np.zeros(steps, np.bool_),
         param_version=np.zeros(steps, np.int64),
+        span=np.ones(steps, np.uint8),
         episodes=(EpisodeEnd(steps - 1, 1.0, steps, 0.1, 0.2, 0.3, 5),) if episodes is None else episodes,
     )

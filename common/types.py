@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, NamedTuple
 
-import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
@@ -24,8 +23,6 @@ from coop.common.bounds import (
 )
 
 Array = NDArray[Any]
-
-_NOT_GIVEN: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
 class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,7 +100,7 @@ class Segment(Struct, frozen=True, forbid_unknown_fields=True):
     obs_index, next_index: int32 [steps, stack], rows of `frames` that make obs and next_obs (oldest first).
     actions: int32 [steps]. rewards: float32 [steps], n-step returns. terminated: bool [steps].
     param_version: int64 [steps], the version of the parameters that chose each action.
-    span: uint8 [steps], environment steps from obs to next_obs (default: 1 each).
+    span: uint8 [steps], environment steps from obs to next_obs.
     carried: how many leading frames repeat, bit for bit, the last frames of this stream's previous segment
         (sequence numbers count per stream, so that is `sequence - 1`); a table that still holds those
         frames keeps one copy. 0 at the start of a stream.
@@ -120,15 +117,10 @@ class Segment(Struct, frozen=True, forbid_unknown_fields=True):
     rewards: NDArray[np.float32]
     terminated: NDArray[np.bool_]
     param_version: NDArray[np.int64]
-    span: NDArray[np.uint8] = msgspec.field(default_factory=lambda: _NOT_GIVEN)
+    span: NDArray[np.uint8]
     carried: Annotated[int, Meta(ge=0, le=1024)] = 0
     acked: Count = 0
     episodes: Annotated[tuple[EpisodeEnd, ...], Meta(max_length=MAX_SEGMENT_STEPS)] = ()
-
-    def __post_init__(self) -> None:
-        """Let each transition span one step by default."""
-        if self.span is _NOT_GIVEN:
-            msgspec.structs.force_setattr(self, "span", _one_each(self.steps))
 
     @property
     def steps(self) -> int:
@@ -148,7 +140,7 @@ class Batch:
     param_version: int64 [batch], version of the parameters that acted.
     age: int64 [batch], transitions inserted since this one.
     reuse: int32 [batch], how often each has been drawn, including this draw.
-    span: uint8 [batch], environment steps from obs to next_obs (default: 1 each).
+    span: uint8 [batch], environment steps from obs to next_obs.
     """
 
     frames: Array
@@ -162,12 +154,7 @@ class Batch:
     param_version: NDArray[np.int64]
     age: NDArray[np.int64]
     reuse: NDArray[np.int32]
-    span: NDArray[np.uint8] = field(default_factory=lambda: _NOT_GIVEN)
-
-    def __post_init__(self) -> None:
-        """Let each transition span one step by default."""
-        if self.span is _NOT_GIVEN:
-            object.__setattr__(self, "span", _one_each(len(self)))
+    span: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -175,8 +162,3 @@ class Batch:
     def columns(self) -> dict[str, Array]:
         """All arrays except the frames, by name."""
         return {column.name: getattr(self, column.name) for column in fields(Batch) if column.name != "frames"}
-
-
-def _one_each(count: int) -> NDArray[np.uint8]:
-    """uint8 [count] of ones: the span of transitions recorded before n-step returns existed."""
-    return np.ones(count, np.uint8)

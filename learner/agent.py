@@ -233,7 +233,7 @@ class Agent:
             optimizer.load_state(saved)
         self.acting, self.updates, self.versions = state["acting"], state["updates"], list(state["versions"])
         set_generator_state(self._noise, state["noise"])
-        self.rule.load_state(state.get("rule", {}))  # older states lack it
+        self.rule.load_state(state["rule"])
 
     def _draw_s(self) -> float:
         s = self.exploration_rate()

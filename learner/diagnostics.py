@@ -85,8 +85,8 @@ class Diagnostics:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state`; an empty one, of an earlier version, begins a new archive."""
-        arrays, before = state.get("archive", {}), state.get("before")
+        """Restore a state from `state`."""
+        arrays, before = state["archive"], state["before"]
         self.archive = Batch(**{name: tensor.numpy() for name, tensor in arrays.items()}) if arrays else None
         self._before = None if before is None else before.numpy()
 

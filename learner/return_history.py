@@ -33,6 +33,5 @@ class ReturnHistory:
         return {"values": list(self.values), "every": self._every}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state`; an empty one, of an earlier version, begins a new history."""
-        if state:
-            self.values, self._every = list(state["values"]), state["every"]
+        """Restore a state from `state`."""
+        self.values, self._every = list(state["values"]), state["every"]

@@ -113,9 +113,9 @@ class Telemetry:
         """Restore a state from `state`."""
         self.returns.extend(state["returns"])
         self.episodes = state["episodes"]
-        self.history.load_state(state.get("history", {}))  # earlier versions saved neither this nor the next
-        self.diagnostics.load_state(state.get("diagnostics", {}))
-        self.largest_reward = state.get("largest_reward", 0.0)
+        self.history.load_state(state["history"])
+        self.diagnostics.load_state(state["diagnostics"])
+        self.largest_reward = state["largest_reward"]
 
     def episode(self, episode_return: float) -> int:
         """Note a finished episode; return its number, from 0."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any
@@ -95,10 +95,10 @@ class DuplicateFilter:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state`, also one of an earlier version."""
-        self._closed = {(incarnation, stream) for incarnation, stream in state.get("closed", [])}
+        """Restore a state from `state`."""
+        self._closed = {(incarnation, stream) for incarnation, stream in state["closed"]}
         self._streams = OrderedDict(
-            ((incarnation, stream), _Stream(highest, _ranges(gaps)))
+            ((incarnation, stream), _Stream(highest, [range(*gap) for gap in gaps]))
             for incarnation, stream, highest, gaps in state["streams"]
         )
         self._missing = state["forgotten"] + sum(_lengths(self._streams.values()))
@@ -106,14 +106,3 @@ class DuplicateFilter:
 
 def _lengths(streams: Iterable[_Stream]) -> Iterable[int]:
     return (len(gap) for seen in streams for gap in seen.gaps)
-
-
-def _ranges(gaps: Iterable[int | Sequence[int]]) -> list[range]:
-    """Convert saved gaps, each [start, stop]; earlier versions saved every missing number separately."""
-    ranges: list[range] = []
-    for gap in gaps:
-        start, stop = (gap, gap + 1) if isinstance(gap, int) else gap
-        if ranges and ranges[-1].stop == start:
-            start = ranges.pop().start
-        ranges.append(range(start, stop))
-    return ranges

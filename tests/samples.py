@@ -32,6 +32,7 @@ def make_segment(spec: EnvSpec, sequence: int = 0, steps: int = 4, incarnation: 
         "rewards": np.arange(first, first + steps, dtype=np.float32),
         "terminated": np.zeros(steps, np.bool_),
         "param_version": np.zeros(steps, np.int64),
+        "span": np.ones(steps, np.uint8),
         "carried": min(sequence, 1),
         "acked": first,
         "episodes": (EpisodeEnd(steps - 1, 1.5, steps, 0.1, 0.2, 0.3, 5),),

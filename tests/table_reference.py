@@ -66,6 +66,7 @@ class Stream:
             rewards=self.rng.random(steps, np.float32),
             terminated=np.array(terminated),
             param_version=self.rng.integers(0, 1 << 40, steps),
+            span=np.ones(steps, np.uint8),
             carried=carried,
         )
 

@@ -64,15 +64,6 @@ def test_large_jumps_take_one_gap_each() -> None:
     assert max(len(gaps) for *_, gaps in window.state()["streams"]) == MAX_GAPS
 
 
-def test_windows_of_earlier_versions_load() -> None:
-    """They list every missing number by itself."""
-    window = DuplicateFilter()
-    window.load_state({"forgotten": 7, "streams": [[1, 0, 9, [2, 3, 4, 8]], [2, 0, 0, []]]})
-    assert window.missing() == 11
-    assert window.state()["streams"] == [[1, 0, 9, [[2, 5], [8, 9]]], [2, 0, 0, []]]
-    assert [window.accept(1, 0, sequence) for sequence in (3, 3, 8, 7, 10)] == [True, False, True, False, True]
-
-
 @pytest.mark.parametrize(
     ("sequences", "accepted", "missing"),
     [

@@ -14,7 +14,6 @@ from coop.common.types import Batch, EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.diagnostics import Diagnostics, dormant, effective_ranks, hidden_layers
 from coop.learner.losses import Values
-from coop.learner.telemetry import Telemetry
 
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 CONFIG = RunConfig(method="coop", learner=LearnerSettings(gamma=0.5, double=False), network=NetworkSettings(hidden=()))
@@ -135,14 +134,6 @@ def test_an_archived_batch_is_a_copy() -> None:
     assert diagnostics.archive is not None
     assert diagnostics.archive.frames[:, 0].tolist() == [0, 1, 2, 3]
     assert diagnostics.archive.ids.tolist() == [0, 1, 2]
-
-
-def test_a_state_of_an_earlier_version_begins_a_new_archive() -> None:
-    telemetry = Telemetry(0.0)
-    telemetry.load_state({"returns": [1.0], "episodes": 1, "fixed": torch.zeros(256, 4), "largest_reward": 1.0})
-    assert telemetry.diagnostics.archive is None
-    telemetry.diagnostics.add(batch(3))
-    assert telemetry.diagnostics.archive is not None
 
 
 def test_measuring_changes_nothing() -> None:

@@ -43,7 +43,7 @@ from coop.records.resumption import Start, Survey, Whole
 from coop.records.run_directory import RunDirectory
 from coop.records.sources import base_config
 from coop.studies.report.figures import evaluations
-from coop.studies.report.packed import pack
+from coop.studies.report.packing import pack
 from coop.studies.report.study import load_study
 
 COLUMNS = "env_step,update,network,episodes,return_mean,return_sd,epsilon,seconds"

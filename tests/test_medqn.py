@@ -38,6 +38,7 @@ def batch_of_two() -> Batch:
         terminated=np.array([False, True]),
         weights=np.ones(2, np.float32),
         ids=ones, param_version=ones, age=ones, reuse=ones.astype(np.int32),
+        span=ones.astype(np.uint8),
     )  # fmt: skip
 
 

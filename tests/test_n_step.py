@@ -164,22 +164,6 @@ def test_several_streams_wait_each_for_itself() -> None:
     assert sent == [(1, 0, [1, 1]), (0, 0, [4]), (1, 1, [1, 1]), (0, 1, [4, 4]), (1, 2, [1, 1])]
 
 
-def test_what_was_recorded_before_spans_one_step() -> None:
-    """Journals hold insert requests, snapshots a table's columns: both from before n-step returns are read."""
-    spec = make_spec(1)
-    segment = Stream(spec, 0, np.random.default_rng(0), 10).segment(6)
-    message = wire.decode(bytes(encode_segment("run", segment)))
-    del message.arrays["span"]
-    old = SegmentReader(spec)(message)
-    assert old.span.tolist() == [1] * 6
-    table, again = (Table(spec, 10, rng=np.random.default_rng(1)) for _ in range(2))
-    table.insert(old)
-    meta, arrays = whole_state(table)
-    del arrays["span"]
-    again.load_state(meta, arrays)
-    assert again.sample(20).span.tolist() == [1] * 20
-
-
 def test_spans_survive_the_wire_and_a_snapshot() -> None:
     spec = make_spec(1)
     span = np.array([3, 3, 2, 1], np.uint8)

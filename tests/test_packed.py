@@ -1,13 +1,16 @@
-"""Packed studies: every file comes back byte for byte, and a report of the file is the report of the folder."""
+"""Packed studies: every number comes back, and a report of the file is the report of the folder."""
 
+import csv
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from coop.common.errors import RunError, UsageError
 from coop.studies.report import cli
-from coop.studies.report.packed import FILES, PackedStudy, pack, unpack
+from coop.studies.report.packed import PackedStudy
+from coop.studies.report.packing import pack
 from coop.studies.report.study import load_study
 from coop.studies.report.writer import write_report
 from coop.studies.sweep.grid import load_grid
@@ -85,18 +88,26 @@ def test_a_study_outlives_the_rules_for_its_cells(folder: Path) -> None:
         load_grid(str(grid))
 
 
-def test_every_file_comes_back(folder: Path, tmp_path: Path) -> None:
+def test_every_number_comes_back(folder: Path, tmp_path: Path) -> None:
     told = pack(folder, tmp_path / "study.parquet")
-    assert told.startswith(f"{tmp_path}/study.parquet: 5 runs, ")
-    unpack(tmp_path / "study.parquet", tmp_path / "again")
-    assert (tmp_path / "again" / "sweep.toml").read_bytes() == (folder / "sweep.toml").read_bytes()
+    assert told.startswith(f"{tmp_path}/study.parquet: 5 runs in ")
+    packed = PackedStudy(tmp_path / "study.parquet")
+    assert packed.sweep == (folder / "sweep.toml").read_text()
     for run in folder.glob("*/"):
-        for name in FILES:
-            held, back = run / name, tmp_path / "again" / run.name / name
-            assert (back.read_bytes() if back.exists() else b"") == (held.read_bytes() if held.exists() else b""), back
-    assert PackedStudy(tmp_path / "study.parquet").columns("dqn-seed=0", "episodes.csv", ("return", "actor"))[
-        "return"
-    ] == [1.5 * n for n in range(19)]
+        for name in ("config.toml", "summary.json"):
+            assert packed.text(run.name, name) == ((run / name).read_text() if (run / name).exists() else None)
+    for run in (folder / "dqn-seed=0", folder / "dqn-seed=1", folder / "dqn-seed=2"):
+        rows = list(csv.DictReader((run / "episodes.csv").read_text().splitlines()))
+        wanted = HEADER.strip().replace("actor,", "").split(",")
+        for name, values in packed.columns(run.name, "episodes.csv", wanted).items():
+            np.testing.assert_array_equal(values, [float(row[name]) for row in rows], name)
+    seen = packed.columns("dqn-seed=1", "metrics.jsonl", ("q_gap", "sample_age_p95"), ("q_abs_mean", "note"))
+    assert seen["q_gap"] == [0.1, 0.2, 0.1 * 3]
+    assert seen["sample_age_p95"] == [1e300] * 3
+    assert seen["q_abs_mean"] == [0.5, 100.5, 1e6]
+    assert seen["note"] == [None] * 3
+    with pytest.raises(KeyError):
+        packed.columns("dqn-seed=0", "episodes.csv", ("actor",))  # no number in each run
 
 
 def test_the_report_is_the_same(
@@ -123,17 +134,11 @@ def test_the_report_is_the_same(
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("episodes.csv", HEADER + "0,5", "episodes.csv: a torn line; is the run still writing?"),
-        ("metrics.jsonl", '{"env_step": 1}\n{"env', "metrics.jsonl: a torn line; is the run still writing?"),
-        ("metrics.jsonl", '{"env_step":1}\n', "metrics.jsonl: cannot be restored byte for byte; nothing was packed"),
-        (
-            "episodes.csv",
-            HEADER + "0,5,0,1,1,1,1,1",
-            "episodes.csv: cannot be restored byte for byte; nothing was packed",
-        ),
+        ("episodes.csv", HEADER + "0,5\n", "episodes.csv, line 2: 2 values instead of 8"),
+        ("metrics.jsonl", '{"env_step": 1}\n{"env\n', "metrics.jsonl, line 2: not JSON"),
     ],
 )
-def test_what_would_not_come_back_is_not_packed(name: str, text: str, words: str, folder: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_not_packed(name: str, text: str, words: str, folder: Path, tmp_path: Path) -> None:
     (folder / "dqn-seed=1" / name).write_text(text)
     with pytest.raises(RunError) as caught:
         pack(folder, tmp_path / "study.parquet")
@@ -151,16 +156,13 @@ def test_curves_of_all_runs(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert drawn == {path.parent.name: path.read_bytes() for path in (tmp_path / "b").glob("*/learning_curve.png")}
 
 
-def test_what_cannot_be_packed_or_unpacked(folder: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_packed(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no folder with runs to pack"):
         pack(tmp_path, tmp_path / "a.parquet")
     with pytest.raises(UsageError, match=r"--pack .*none/a.parquet: No such file"):
         pack(folder, tmp_path / "none" / "a.parquet")
     with pytest.raises(UsageError, match=r"sweep.toml: not a packed study: "):
         write_report(folder / "sweep.toml", tmp_path / "out")
-    pack(folder, tmp_path / "a.parquet")
-    with pytest.raises(UsageError, match=r"--unpack .*: File exists"):
-        unpack(tmp_path / "a.parquet", folder)
 
 
 def test_a_thinned_study_keeps_its_episodes_and_warnings(folder: Path, tmp_path: Path) -> None:
@@ -171,16 +173,15 @@ def test_a_thinned_study_keeps_its_episodes_and_warnings(folder: Path, tmp_path:
     ]
     (folder / "dqn-seed=0" / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     pack(folder, tmp_path / "thin.parquet", rows=10)
-    unpack(tmp_path / "thin.parquet", tmp_path / "thin")
-    for file in ("config.toml", "summary.json", "episodes.csv"):
-        assert (tmp_path / "thin" / "dqn-seed=0" / file).read_bytes() == (folder / "dqn-seed=0" / file).read_bytes()
-    kept = [json.loads(line) for line in (tmp_path / "thin" / "dqn-seed=0" / "metrics.jsonl").read_text().splitlines()]
-    assert [row["env_step"] for row in kept] == [800, *range(2000, 20001, 2000)]
-    assert set(kept[0]) == {*ROW, "q_abs_mean", "q_bound"}
-    whole, thin = load_study(folder), load_study(tmp_path / "thin.parquet")
-    assert [run.above_bound for run in whole.runs] == [run.above_bound for run in thin.runs] == [1, 1, 0]
-    few = json.loads((tmp_path / "thin" / "dqn-seed=1" / "metrics.jsonl").read_text().splitlines()[0])
-    assert few == json.loads((folder / "dqn-seed=1" / "metrics.jsonl").read_text().splitlines()[0])
+    thin = PackedStudy(tmp_path / "thin.parquet")
+    kept = thin.columns("dqn-seed=0", "metrics.jsonl", ("env_step",), tuple(left_out))
+    assert kept["env_step"] == [800, *range(2000, 20001, 2000)]
+    assert all(kept[name] == [None] * 11 for name in left_out)
+    assert thin.columns("dqn-seed=1", "metrics.jsonl", ("q_gap",))["q_gap"] == [0.1, 0.2, 0.1 * 3]
+    assert len(thin.columns("dqn-seed=0", "episodes.csv", ("return",))["return"]) == 19
+    studies = load_study(folder), load_study(tmp_path / "thin.parquet")
+    whole, short = ([run.above_bound for run in study.runs] for study in studies)
+    assert whole == short == [1, 1, 0]
 
 
 @pytest.mark.parametrize("flags", [["--rows", "5"], ["--rows", "0", "--pack", "x.parquet"]])

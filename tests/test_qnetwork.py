@@ -86,7 +86,7 @@ def _batch(spec: EnvSpec) -> Batch:
     ones = np.ones(2, np.int64)
     return Batch(
         frames, index[:, : spec.stack], after[:, : spec.stack], ones.astype(np.int32), ones.astype(np.float32),
-        np.zeros(2, np.bool_), ones.astype(np.float32), ones, ones, ones, ones.astype(np.int32),
+        np.zeros(2, np.bool_), ones.astype(np.float32), ones, ones, ones, ones.astype(np.int32), ones.astype(np.uint8),
     )  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
 from coop.records.sources import base_config
 from coop.records.summaries import SUMMARY, read_summary
-from coop.studies.report.packed import pack, unpack
+from coop.studies.report.packed import PackedStudy
+from coop.studies.report.packing import pack
 
 EXACT = [1234567.89, -0.1, 9.0, 1e300, 0.1 + 0.2, 16777217.0, 123456789.0]
 
@@ -65,9 +66,10 @@ def test_a_packed_study_keeps_returns_exactly(tmp_path: Path) -> None:
         rows = (f"{n},{exact(value)},0.725354" for n, value in enumerate(EXACT[number:]))
         (study / str(number) / "episodes.csv").write_text("\n".join(["env_step,return,s", *rows, ""]))
     pack(study, tmp_path / "packed.parquet")
-    unpack(tmp_path / "packed.parquet", tmp_path / "back")
-    assert returns(tmp_path / "back" / "0") == EXACT
-    assert returns(tmp_path / "back" / "1") == EXACT[1:]
+    packed = PackedStudy(tmp_path / "packed.parquet")
+    for number in range(2):
+        columns = packed.columns(str(number), "episodes.csv", ("return", "s"))
+        assert columns == {"return": EXACT[number:], "s": [0.725354] * len(EXACT[number:])}
 
 
 def test_tensorboard_is_cut_back_with_the_records(tmp_path: Path) -> None:

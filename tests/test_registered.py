@@ -7,8 +7,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from coop.studies.registered import LARGE, areas, losses, outcome, rates, scores, table_of, verdict
 from coop.studies.report.study import load_study
+from results.minatar.registered import LARGE, areas, losses, outcome, rates, scores, table_of, verdict
 
 RESULTS = Path(__file__).parent.parent / "results"
 

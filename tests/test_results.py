@@ -13,13 +13,15 @@ import pytest
 from benchmarks import feedback
 from coop.evaluation.film import Film
 from coop.evaluation.saved import SavedRun
-from coop.studies import controls, registered
-from coop.studies.report import comparisons, results
+from coop.studies.report import comparisons
+from coop.studies.report import results as tables
 from coop.studies.report.baseline import baseline_table, find_baseline
 from coop.studies.report.measures import shorter_runs
 from coop.studies.report.sources import open_source
 from coop.studies.report.study import Study, load_study
 from coop.studies.stacked import verdict
+from results import controls
+from results.minatar import registered
 
 RESULTS = Path(__file__).parent.parent / "results"
 CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]
@@ -37,12 +39,12 @@ PAGES = {
     )
 }
 TABLES = {
-    "table1": results.paper_table,
-    "settings": results.settings_table,
-    "aggregate": results.aggregate_table,
-    "improvement": results.improvement_table,
-    "breaking_points": results.breaking_table,
-    "runs": results.runs_table,
+    "table1": tables.paper_table,
+    "settings": tables.settings_table,
+    "aggregate": tables.aggregate_table,
+    "improvement": tables.improvement_table,
+    "breaking_points": tables.breaking_table,
+    "runs": tables.runs_table,
     "learning": comparisons.learning_table,
     "paired": comparisons.paired_table,
     "sizes": comparisons.sizes_table,

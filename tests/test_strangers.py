@@ -13,7 +13,6 @@ import msgpack
 import msgspec
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 from commands import run_command
@@ -28,7 +27,8 @@ from coop.common.settings.tables import sealed_toml
 from coop.records.checkpoints import read_manifest, write_manifest
 from coop.records.summaries import SUMMARY, read_summary, summary_text
 from coop.studies.report import packed
-from coop.studies.report.packed import PackedStudy, unpack
+from coop.studies.report.packed import PackedStudy
+from coop.studies.report.packing import study_file
 from coop.studies.report.sources import open_source
 from coop.studies.sweep.grid import parse_grid
 
@@ -47,12 +47,9 @@ def test_names_that_are_none(name: str, tmp_path: Path) -> None:
     if "\ud800" in name:
         return
     table = pa.table({"run": ["good", name], "config.toml": ["", ""]})
-    pq.write_table(table, tmp_path / "study.parquet")
-    (tmp_path / "here").mkdir()
+    (tmp_path / "study.parquet").write_bytes(study_file(table))
     with pytest.raises(UsageError, match="run name"):
-        unpack(tmp_path / "study.parquet", tmp_path / "here" / "out")
-    assert not (tmp_path / "here" / "out").exists(), "names are checked before the first file is written"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "study.parquet"]
+        PackedStudy(tmp_path / "study.parquet")
 
 
 @pytest.mark.parametrize("name", ["coop-seed=0,replay.capacity=100", "dqn-ratio=0.25-seed=0", "x" * 100, "a b", "été"])
@@ -62,7 +59,7 @@ def test_names_that_are_some(name: str) -> None:
 
 @pytest.mark.parametrize("names", [["a", "a"], [None, "b"]])
 def test_a_packed_study_names_each_run_once(names: list[str | None], tmp_path: Path) -> None:
-    pq.write_table(pa.table({"run": names, "config.toml": ["", ""]}), tmp_path / "study.parquet")
+    (tmp_path / "study.parquet").write_bytes(study_file(pa.table({"run": names, "config.toml": ["", ""]})))
     if None in names:
         assert PackedStudy(tmp_path / "study.parquet").names == ["None", "b"]
         return
@@ -238,8 +235,6 @@ def test_reading_records_runs_nothing(trained: Path, tmp_path: Path) -> None:
             done = run_command(*map(str, command), cwd=stand)
             assert done.returncode == 0, done.stderr
             assert not sign.exists()
-    done = run_command("coop-report", "study.parquet", "--unpack", "again", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
     loaded = coop.load(run)
     assert len(loaded.episodes)
     assert loaded.summary
@@ -328,14 +323,14 @@ def test_an_array_is_no_larger_than_its_file(tmp_path: Path) -> None:
 def test_a_study_is_measured_before_it_is_spread_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "study.parquet"
     lists = pa.array([[0.0] * 200_000], pa.list_(pa.float64()))
-    pq.write_table(pa.table({"run": ["a"], "episodes.csv/return": lists}), path, compression="zstd")
+    path.write_bytes(study_file(pa.table({"run": ["a"], "episodes.csv/return": lists})))
     PackedStudy(path)
     monkeypatch.setattr(packed, "MAX_STUDY", 1 << 20)
     assert path.stat().st_size < 10_000
     with pytest.raises(UsageError, match=r"not a packed study: 200,001 values"):
         PackedStudy(path)
     texts = pa.array([["x" * 100_000] * 1_000], pa.list_(pa.string()))
-    pq.write_table(pa.table({"run": ["a"], "episodes.csv/actor": texts}), path, compression="zstd")
+    path.write_bytes(study_file(pa.table({"run": ["a"], "episodes.csv/actor": texts})))
     assert path.stat().st_size < 10_000
     with pytest.raises(UsageError, match=r"not a packed study: 100,000,00\d bytes of text"):
         PackedStudy(path)

@@ -178,7 +178,8 @@ def transition(
         rewards=np.array([reward], np.float32),
         terminated=np.array([terminated]),
         weights=np.ones(1, np.float32),
-        ids=ones, param_version=ones, age=ones, reuse=ones.astype(np.int32), restart=restart,
+        ids=ones, param_version=ones, age=ones, reuse=ones.astype(np.int32),
+        span=ones.astype(np.uint8), restart=restart,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from reprlib import repr as shown
@@ -22,7 +22,6 @@ from coop.common.errors import BadMessage
 from coop.common.types import Array
 
 PROTOCOL = 8
-ON_DISK = frozenset({1, 2, 3, 4, 5, 6, 7, 8})  # protocols whose segments and batches on disk can be read
 MAGIC = 0x434F4F50  # "COOP"
 ALIGNMENT = 64
 MAX_HEADER = 1 << 20
@@ -176,13 +175,13 @@ def _sized(memory: bytearray | None, size: int) -> bytearray:
     return memory
 
 
-def decode(payload: bytes, protocols: frozenset[int] | None = None) -> Message:
-    """Decode a message of this protocol, or of one of `protocols`, without copying.
+def decode(payload: bytes) -> Message:
+    """Decode a message of this protocol without copying.
 
     Raises:
         BadMessage: the bytes are not a whole, well-formed message of this protocol; names the field.
     """
-    header, start = _header(payload, protocols or {PROTOCOL})
+    header, start = _header(payload)
     table = _read_table(bytes(header.arrays))
     if table.size and start + table.size > len(payload):
         name, dtype, shape, offset, _ = next(each for each in table.places if each.nbytes and each.end == table.size)
@@ -199,7 +198,7 @@ def _aligned(offset: int) -> int:
     return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
-def _header(payload: bytes, protocols: Set[int]) -> tuple[_Header, int]:
+def _header(payload: bytes) -> tuple[_Header, int]:
     if not _PREFIX.size <= len(payload) <= MAX_PAYLOAD:
         raise BadMessage("payload", f"{len(payload)} bytes; allowed: {_PREFIX.size} to {MAX_PAYLOAD}")
     magic, length = _PREFIX.unpack_from(payload)
@@ -213,7 +212,7 @@ def _header(payload: bytes, protocols: Set[int]) -> tuple[_Header, int]:
         raise BadMessage("header", "must hold exactly protocol, kind, run, fields, arrays") from error
     except _NOT_MSGPACK as error:
         raise BadMessage("header", f"not msgpack ({type(error).__name__})") from error
-    if type(header.protocol) is not int or header.protocol not in protocols:
+    if type(header.protocol) is not int or header.protocol != PROTOCOL:
         raise BadMessage("protocol", f"version {shown(header.protocol)}; this process speaks {PROTOCOL}")
     for name, kind in (("kind", str), ("run", str), ("fields", dict)):
         if not isinstance(getattr(header, name), kind):

@@ -18,7 +18,6 @@ from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.settings.overrides import merged, of_method
-from coop.common.settings.renamed import current, with_stack
 from coop.common.settings.rules import check_rules
 from coop.common.suggestions import not_among
 
@@ -80,12 +79,10 @@ def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
 def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     """Turn tables into a checked config; a `[methods.NAME]` table overrides the rest for that method.
 
-    It also reads configs of earlier versions.
-
     Raises:
         UsageError: an unknown field or a value out of range; names the field, the value and what is allowed.
     """
-    return validated(of_method(with_stack(current(tables)), method))
+    return validated(of_method(tables, method))
 
 
 def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:

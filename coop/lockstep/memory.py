@@ -142,7 +142,7 @@ class NoMemory:
         self._turn: Turn
         stack = np.arange(self._spec.stack, dtype=np.int32)[None]
         self._index = stack, stack + self._spec.stack
-        self._ones = np.ones(1, np.float32), np.ones(1, np.int32)
+        self._ones = np.ones(1, np.float32), np.ones(1, np.int32), np.ones(1, np.uint8)
 
     def begin(self, obs: Array) -> None:
         """See `Memory`."""
@@ -162,10 +162,11 @@ class NoMemory:
         turn, steps = self._turn, self._turn.steps
         frames = np.concatenate((self._obs, steps.next_obs)).reshape(-1, *self._spec.frame_shape)
         self._obs = steps.obs
-        weights, reuse = self._ones
+        weights, reuse, span = self._ones
         yield Transition(
             frames, *self._index, turn.actions, steps.rewards, steps.terminated, weights,
             ids=np.array([step - 1]), param_version=np.array([turn.version]), age=np.zeros(1, np.int64), reuse=reuse,
+            span=span,
             restart=steps.obs[0] if steps.restarted[0] else None,
         )  # fmt: skip
 

@@ -122,5 +122,5 @@ def read_run_config(run_dir: Path) -> RunConfig:
         text = read_text(path, MAX_SETTINGS)
     except (OSError, UnicodeDecodeError, RunError) as error:
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
-    # Runs of a packed study have no id, and may come from versions that wrote no checksum.
+    # A config without a run, as a user writes it or takes it from a packed study, has neither.
     return parse_run_config(text, path, needed=has_run_id(run_dir))

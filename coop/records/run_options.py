@@ -18,11 +18,10 @@ from coop.common.places import absolute
 from coop.common.process import cli
 from coop.common.process.extras import check_extra
 from coop.common.process.flags import HttpAddress
-from coop.common.process.notices import note_renamed, warn
+from coop.common.process.notices import warn
 from coop.common.settings.config import RunConfig
 from coop.common.settings.effects import without_effect
 from coop.common.settings.methods import METHODS, table_of
-from coop.common.settings.renamed import current_flags
 from coop.common.settings.resuming import check_resumed
 from coop.common.settings.tables import preset_names, validated
 from coop.records.checkpoints import LEARNER, RECORDS, checkpoint_numbers
@@ -132,7 +131,6 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     """
     args = sys.argv[1:]
     base = base_config(args)
-    args = current_flags(args, base.learner.optimizer)
     extended = with_methods(kind)
     given_own = {} if base.own is None else {table_of(base.method): base.own}
     default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **given_own)
@@ -142,7 +140,7 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     named = {"env.id": options.env.id, "network.kind": options.network.kind}
     permit([*options.allow_import, *(value for name, value in named.items() if name in given)])
     if "learner.swap_every" in given and not options.two_networks and options.learner.target_update_every is None:
-        note_renamed({"--learner.swap-every": f"--learner.target-update-every for {options.method}"})
+        warn(f"--learner.swap-every: of {options.method}, the flag is --learner.target-update-every")
     for line in without_effect(options, given, lockstep=lockstep):
         warn(line)
     if options.wandb:

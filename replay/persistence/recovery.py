@@ -88,7 +88,7 @@ class Replaying:
                 continue
             kind, payload, accepted = entry
             if kind == SEGMENT:
-                segment = read(wire.decode(payload, wire.ON_DISK))
+                segment = read(wire.decode(payload))
                 self._count(accepted - segment.steps)
                 core.apply_insert(segment)
                 self._accepted = accepted

@@ -106,7 +106,7 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int, number: int) -> Mar
         state: dict[str, Any] = msgpack.unpackb((path / STATE).read_bytes(), strict_map_key=False)
         names = [name for name in manifest.files if name != STATE]
         arrays = {name.removesuffix(".npy"): _read_array(path / name) for name in names}
-        replies = [read(wire.decode(payload, wire.ON_DISK)) for payload in state["replies"]]
+        replies = [read(wire.decode(payload)) for payload in state["replies"]]
         episodes = [
             EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in state["episodes"]
         ]

@@ -63,8 +63,7 @@ class Columns:
         size = len(slots)
         self.slots[:size] = slots
         for name, column in self._named().items():
-            if name in arrays or name != "span":  # older states lack it: each transition spans one step
-                column[:size] = arrays[name]
+            column[:size] = arrays[name]
         self.terminal = int(np.count_nonzero(self.terminated[:size]))
 
     def _named(self) -> dict[str, NDArray[np.generic]]:

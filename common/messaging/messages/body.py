@@ -23,26 +23,20 @@ class Layout:
     """The arrays of a kind of message.
 
     arrays: by name (dtype, shape); a word in a shape stands for any length, equal throughout the message.
-    optional: names of arrays that may be missing.
     """
 
-    def __init__(
-        self, arrays: Mapping[str, tuple[str, tuple[int | str, ...]]], optional: Set[str] = frozenset()
-    ) -> None:
+    def __init__(self, arrays: Mapping[str, tuple[str, tuple[int | str, ...]]]) -> None:
         self.arrays = arrays
-        self._optional = optional
         self.lengths = functools.lru_cache(_LENGTHS)(self._lengths)
 
     def _lengths(self, table: ArrayTable) -> Mapping[str, int]:
         """The lengths that the words stand for; raises BadMessage for the first array that does not fit."""
         places = {place.name: place for place in table.places}
-        if places.keys() | self._optional != self.arrays.keys():
+        if places.keys() != self.arrays.keys():
             raise BadMessage("arrays", _difference(places.keys(), self.arrays.keys()))
         lengths: dict[str, int] = {}
         for name, (dtype, shape) in self.arrays.items():
-            place = places.get(name)
-            if place is None:
-                continue
+            place = places[name]
             if place.dtype != wire.DTYPES[dtype]:
                 raise BadMessage(f"arrays.{name}", f"dtype {place.dtype.name} instead of {dtype}")
             expected = tuple(

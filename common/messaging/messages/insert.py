@@ -15,7 +15,6 @@ from coop.common.types import Array, EnvSpec, Segment
 
 KIND = "insert"
 _ARRAYS = ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version", "span")
-OPTIONAL = frozenset({"span"})  # journals and snapshots from before n-step returns lack it
 _FIELDS = tuple(name for name in Segment.__struct_fields__ if name not in _ARRAYS)
 
 
@@ -48,10 +47,8 @@ def check_indices(arrays: Mapping[str, Array], frames: int) -> None:
 def check_values(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
     """Check the values of the arrays that segments and batches share; raises BadMessage."""
     check_range("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
-    most = MAX_MAGNITUDE
-    if "span" in arrays:
-        check_range("arrays.span", arrays["span"], 1, MAX_N_STEP)
-        most *= int(arrays["span"].max())  # rewards that a transition sums
+    check_range("arrays.span", arrays["span"], 1, MAX_N_STEP)
+    most = MAX_MAGNITUDE * int(arrays["span"].max())  # rewards that a transition sums
     check_range("arrays.rewards", arrays["rewards"], -most, most)
     frames = arrays["frames"]
     if frames.dtype == np.bool_:
@@ -76,7 +73,7 @@ class SegmentReader:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        self._layout = Layout(transitions(spec, "steps"), OPTIONAL)
+        self._layout = Layout(transitions(spec, "steps"))
 
     def __call__(self, message: Message) -> Segment:
         """Read one; raises BadMessage for anything that the table could not store."""

@@ -15,7 +15,7 @@ from coop.common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_INTEGER, M
 from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.messages.body import Body, Layout, check_kind, to_struct
-from coop.common.messaging.messages.insert import OPTIONAL, check_indices, check_range, check_values, transitions
+from coop.common.messaging.messages.insert import check_indices, check_range, check_values, transitions
 from coop.common.messaging.wire import Message, Source
 from coop.common.process.shared_memory import ADDRESS
 from coop.common.types import Array, Batch, EnvSpec, EpisodeRecord
@@ -165,7 +165,7 @@ class BatchReader:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        self._layout = Layout(_columns(spec), OPTIONAL)
+        self._layout = Layout(_columns(spec))
 
     def __call__(self, message: Message) -> tuple[Batch, Drawn]:
         """Read one; raises BadMessage."""

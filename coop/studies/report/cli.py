@@ -1,4 +1,4 @@
-"""`coop-report`: makes the figures, tables and page of a study; packs a study into one file, and unpacks it."""
+"""`coop-report`: makes the figures, tables and page of a study; packs a study into one file."""
 
 from __future__ import annotations
 
@@ -33,8 +33,6 @@ class ReportOptions:
     """With --pack: keep about this many rows of each run's metrics, without times and histograms."""
     curves: Path | None = None
     """Instead of a report: draw the learning curve of every run, finished or not, into a subfolder of this folder."""
-    unpack: Path | None = None
-    """Instead of a report: restore the runs of a packed file in this new folder."""
 
 
 def main() -> None:
@@ -55,13 +53,9 @@ def _run() -> None:
         raise RunError("pyarrow is not installed; it comes with the extra report: pip install 'coop-rl[report]'")
     # Imported only after the flags have been checked: the statistics' libraries take seconds.
     if options.pack is not None:
-        from coop.studies.report.packed import pack  # noqa: PLC0415
+        from coop.studies.report.packing import pack  # noqa: PLC0415
 
         print(pack(runs, options.pack, options.rows))
-    elif options.unpack is not None:
-        from coop.studies.report.packed import unpack  # noqa: PLC0415
-
-        print(unpack(runs, options.unpack))
     elif options.curves is not None:
         from coop.studies.report.writer import draw_curves  # noqa: PLC0415
 

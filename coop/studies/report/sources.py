@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+import pandas as pd
+
 from coop.common.errors import RunError
 from coop.common.process.notices import warn
-from coop.common.process.untrusted import check_links, read_text
+from coop.common.process.untrusted import check_links, check_run_name, read_text
 from coop.common.settings.tables import check_toml
 from coop.records.reading import check_records, column, read_csv, read_jsonl
 from coop.records.run_ids import RUN_ID
-from coop.studies.report.packed import CONFIG, EPISODES, SUMMARY, SWEEP, PackedStudy, run_names
+from coop.studies.report.packed import CONFIG, EPISODES, SUMMARY, SWEEP, PackedStudy
 
 
 class Source(Protocol):
@@ -77,13 +81,39 @@ class FolderSource:
 
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
         """See `Source`."""
-        path = self._folder / run / file
+        path, first = self._folder / run / file, 2 if file == EPISODES else 1
+        rows = self._read(run, file)
+        found = {name: column(rows, name, path, first) for name in wanted}
+        return found | {name: column(rows, name, path, first, optional=True) for name in optional}
+
+    def table(self, run: str, file: str) -> pd.DataFrame:
+        """All columns of a run's episodes or metrics, empty if it has none; raises RunError."""
+        try:
+            return pd.DataFrame(self._read(run, file)).apply(_numbers)
+        except FileNotFoundError:
+            return pd.DataFrame()
+
+    def _read(self, run: str, file: str) -> list[dict[str, Any]]:
         if run not in self._checked:
             check_records(self._folder / run)
             self._checked.add(run)
-        rows, first = (read_csv(path), 2) if file == EPISODES else (read_jsonl(path), 1)
-        found = {name: column(rows, name, path, first) for name in wanted}
-        return found | {name: column(rows, name, path, first, optional=True) for name in optional}
+        path = self._folder / run / file
+        return read_csv(path) if file == EPISODES else read_jsonl(path)
+
+
+def run_names(folder: Path) -> list[str]:
+    """The names of the runs in a folder, in order, without hidden folders; raises UsageError as `check_run_name`."""
+    found = (path.parent.name for path in folder.glob(f"*/{CONFIG}"))
+    return sorted(check_run_name(name, str(folder)) for name in found if not name.startswith("."))
+
+
+def _numbers(column: pd.Series) -> pd.Series:
+    """A column of text as integers or floats, if all of it are numbers."""
+    for kind in (np.int64, np.float64):
+        if column.dtype.kind not in "iuf":
+            with suppress(ValueError, TypeError, OverflowError):
+                return column.astype(kind)
+    return column
 
 
 def open_source(path: Path) -> Source:

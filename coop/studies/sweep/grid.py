@@ -25,7 +25,6 @@ from coop.common.settings.fields import Count, Positive
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
-from coop.common.settings.renamed import current
 from coop.common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
 from coop.common.suggestions import closest, refusal
 
@@ -177,9 +176,9 @@ def _cells(file: GridFile, choices: Iterable[Choice]) -> tuple[Cell, ...]:
         total_steps = choice.values.get(("total_steps",), file.fixed.get("total_steps"))
         fits = type(total_steps) is int and total_steps > 0  # other values are refused below
         start = base(choice.method, total_steps if fits else None)
-        tables = merged(start, current(file.fixed, start["learner"]["optimizer"]))
+        tables = merged(start, file.fixed)
         for path, value in choice.values.items():
-            tables = merged(tables, current(nested(path, value), tables["learner"]["optimizer"]))
+            tables = merged(tables, nested(path, value))
         cells.append(Cell(choice.name, validated({**of_method(tables, choice.method), "seed": choice.seed})))
     for cell in cells:
         check_distributed(cell.config) if file.mode == "distributed" else _check_lockstep(cell.config)

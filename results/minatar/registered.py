@@ -1,7 +1,7 @@
 """The rules of the registered MinAtar study (results/minatar/plan.md), applied to packed studies.
 
-`python -m coop.studies.registered pilot|rates|scores|outcome|games FILE` prints a table of the plan and what it says
-if study and plan are what SHA256SUMS beside them lists; `figure FILE` draws the outcome by game.
+`python results/minatar/registered.py pilot|rates|scores|outcome|games FILE` prints a table of the plan and what it
+decides; `figure FILE` draws the outcome by game. SHA256SUMS lists plan and studies.
 """
 
 from __future__ import annotations
@@ -17,11 +17,9 @@ from coop.common.settings.config import value_of
 from coop.common.settings.methods import METHODS
 from coop.studies.report.intervals import Interval, over_seeds
 from coop.studies.report.learning import area
-from coop.studies.report.packed import check_content
 from coop.studies.report.plots import Figure, Line, Panel, draw
 from coop.studies.report.study import Study, load_study
 
-PLAN = "plan.md"
 LARGE = 100_000  # transitions
 LOSS = 45.0  # percent, of dqn's area at LARGE: "small" is the capacity whose loss is nearest
 ENOUGH = 10.0  # points: the least advantage that confirms the hypothesis
@@ -195,13 +193,10 @@ def table_of(rule: str, study: Study) -> pd.DataFrame:
 
 def main() -> None:
     """Print the table of a rule for a packed study."""
-    parser = argparse.ArgumentParser("python -m coop.studies.registered", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("rule", choices=[*RULES, "figure"])
     parser.add_argument("file", type=Path, help="packed study")
     args = parser.parse_args()
-    plan = args.file.with_name(PLAN)
-    if plan.exists():
-        check_content(plan, plan.read_bytes())
     if args.rule == "figure":
         path = args.file.with_suffix("") / "report" / "outcome.png"
         draw(forest(areas(load_study(args.file), NEEDED)), path)

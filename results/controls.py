@@ -1,6 +1,6 @@
 """Tables of the results' pages that compare methods at equal updates, and how steady their networks are.
 
-`python -m coop.studies.controls updates|networks|fresh FILE` prints one of a packed study.
+`python results/controls.py updates|networks|fresh FILE` prints one of a packed study.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ TABLES = {"updates": updates, "networks": networks, "fresh": fresh}
 
 def main() -> None:
     """Print a table of a packed study."""
-    parser = argparse.ArgumentParser("python -m coop.studies.controls", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("table", choices=TABLES)
     parser.add_argument("file", type=Path, help="packed study")
     args = parser.parse_args()
