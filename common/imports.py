@@ -170,4 +170,4 @@ def check_allowed(path: str, allowed: Collection[str], field: str) -> None:
 
 def describe(error: BaseException) -> str:
     """An exception of a user's code in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from contextlib import suppress
 from pathlib import Path
 
@@ -40,13 +41,18 @@ def absolute(path: str | Path, name: str = "path") -> Path:
     """A user's path as it was meant when this command was started. name: of the argument, for the error.
 
     Raises:
-        UsageError: it is empty, or as `working_directory`.
+        UsageError: it is empty, or none that a file system takes, or as `working_directory`.
     """
     try:
         given = user_path(path)
+        meant = given if given.is_absolute() else working_directory() / given
+        meant.lstat()
     except (ValueError, RuntimeError) as error:  # the last for a home that nobody has
         raise UsageError(f"{name} = {str(path)!r}: {error}") from None
-    return given if given.is_absolute() else working_directory() / given
+    except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+            raise UsageError(f"{name} = {str(path)!r}: {error.strerror}") from None
+    return meant
 
 
 def shown(path: Path) -> Path:

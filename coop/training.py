@@ -109,11 +109,11 @@ class TrainingRun:
         """
         self._thread.join(timeout)
         failure = self._failure
-        if isinstance(failure, Exception) and not isinstance(failure, RunError):
-            raise RunError(str(failure) if isinstance(failure, CoopError) else describe(failure)) from failure
-        if failure is not None:
+        if failure is None:
+            return self.summary
+        if isinstance(failure, RunError):
             raise failure
-        return self.summary
+        raise RunError(str(failure) if isinstance(failure, CoopError) else describe(failure)) from failure
 
     def _run(self) -> None:
         try:

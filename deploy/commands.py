@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from pathlib import Path
 from types import TracebackType
@@ -51,6 +52,8 @@ def main() -> None:
     remember_working_directory()
     end_on_signals(program)
     limit_threads()
+    if os.environ.get("MPLBACKEND", "").startswith("module://"):
+        del os.environ["MPLBACKEND"]  # of the notebook that has started this command, which draws to files only
     with importing():
         run = importlib.import_module(MODULES[program]).main
     with despite_threads():

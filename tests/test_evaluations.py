@@ -71,7 +71,8 @@ def test_short_episodes_do_not_crowd_out_long_ones(episodes: int, left: int, rig
 
 
 def test_epsilon_is_the_share_of_random_actions() -> None:
-    act = exploring(lambda obs: np.zeros(len(obs), np.int64), 0.3, 5, np.random.default_rng(0))
+    spec = EnvSpec("test", (4,), "float32", 1, 5)
+    act = exploring(lambda obs: np.zeros(len(obs), np.int64), 0.3, spec, np.random.default_rng(0))
     actions = act(np.zeros((10_000, 4)))
     assert np.mean(actions != 0) == pytest.approx(0.3 * 4 / 5, abs=0.02)
 

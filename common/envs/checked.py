@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -18,7 +19,6 @@ from coop.common.imports import describe
 from coop.common.process.notices import warn, warn_once
 from coop.common.types import Array
 
-RAISED = (Exception, SystemExit)  # by users' code, which may end neither a process nor a run by itself
 _STEP = "gymnasium's step gives (observation, reward, terminated, truncated, info)"
 _RESET = "gymnasium's reset takes seed and options, and gives (observation, info)"
 _BOUND = f"allowed: finite, from -{MAX_MAGNITUDE:,.0f} to {MAX_MAGNITUDE:,.0f}"
@@ -56,6 +56,8 @@ class ObservationCheck:
     def __call__(self, given: Any) -> Array:  # noqa: ANN401 (whatever there is)
         """The observation as an array; raises Unfit."""
         observation = given if type(given) is np.ndarray else _as_array(given)
+        if observation.dtype == object:
+            raise Unfit(f"gives the observation {_shown(given)}", self._says)
         if observation.shape != self._shape:
             raise self._unfit(observation)
         if observation.dtype != self._dtype:
@@ -102,9 +104,9 @@ class CheckedEnv:
             self._steps = 0
         try:
             given = self._env.reset(seed=seed)
-        except RAISED as error:
+        except BaseException as error:
             if isinstance(error, TypeError) and "argument 'seed'" in str(error):
-                self._refuse(f"raised {_described(error)}", _RESET, reset=True)
+                self._refuse(f"raised {raised(error)}", _RESET, reset=True)
             self._failed(error, reset=True)
         if not isinstance(given, tuple) or len(given) != 2:
             self._refuse(f"gives {_shown(given)}", _RESET, reset=True)
@@ -118,7 +120,7 @@ class CheckedEnv:
         self._steps += 1
         try:
             given = self._env.step(action)
-        except RAISED as error:
+        except BaseException as error:
             self._failed(error)
         try:
             observation, reward, terminated, truncated, _ = given
@@ -141,26 +143,27 @@ class CheckedEnv:
         """The picture that it renders: [height, width] or [height, width, channels]; raises UsageError."""
         try:
             picture = np.asarray(self._env.render())
-        except RAISED as error:
-            raise UsageError(f"{self._name} can't be filmed: {_described(error)}") from error
+        except BaseException as error:
+            raise UsageError(f"{self._name} can't be filmed: {raised(error)}") from error
         if picture.dtype.kind not in "biuf" or picture.ndim not in (2, 3) or not picture.size:
             found = f"{picture.dtype}{list(picture.shape)}"
             raise UsageError(f"{self._name} can't be filmed: it renders {found}, not height x width x 3")
-        return picture
+        return picture[..., :3] if picture.ndim == 3 and picture.shape[2] == 4 else picture  # the last is opacity
 
     def close(self) -> None:
         """Close it. That it can't be closed is no reason to fail, only for a line."""
         try:
             self._env.close()
-        except RAISED as error:
-            warn(f"{self._name} raised {_described(error)} as it was closed")
+        except BaseException as error:
+            warn(f"{self._name} raised {raised(error)} as it was closed")
 
     def _scalar(self, what: str, value: Any, kind: Callable[[Any], T]) -> T:  # noqa: ANN401
         """The number or truth value that an array without dimensions, or a number of numpy, is."""
         if isinstance(value, bool | int | float) or (
             isinstance(value, np.generic | np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
         ):
-            return kind(value)
+            with suppress(OverflowError):  # of an int beyond all floats
+                return kind(value)
         return self._refuse(
             f"gives {what} {_shown(value)}", f"allowed: a single {'number' if kind is float else 'bool'}"
         )
@@ -169,7 +172,7 @@ class CheckedEnv:
         raise UsageError(f"{self._name} {self._when(reset)} {what}; {why}") from None
 
     def _failed(self, error: BaseException, *, reset: bool = False) -> NoReturn:
-        raise RunError(f"{self._name} {self._when(reset)} raised {_described(error)}") from error
+        raise RunError(f"{self._name} {self._when(reset)} raised {raised(error)}") from error
 
     def _when(self, reset: bool) -> str:
         if not self._steps:
@@ -177,8 +180,14 @@ class CheckedEnv:
         return f"at {'the reset after ' if reset else ''}step {self._steps:,}{self._of}"
 
 
-def _described(error: BaseException) -> str:
-    """An exception of a user's code in one line, with the last line of that code that it came through."""
+def raised(error: BaseException) -> str:
+    """What a user's code has raised, in one line, with the last line of that code that it came through.
+
+    It may be anything, such as SystemExit, which must not end a run, or an exception of a library that is no Exception;
+    KeyboardInterrupt alone is raised again.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        raise error
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if frame.filename != __file__ and "site-packages" not in frame.filename:
             return f"{describe(error)} ({Path(frame.filename).name}:{frame.lineno})"
@@ -198,5 +207,5 @@ def _shown(value: object) -> str:
 def _as_array(given: object) -> Array:
     try:
         return np.asarray(given)
-    except RAISED:  # numbers of unequal lengths, or an object that fails to convert
+    except Exception:  # numbers of unequal lengths, or an object that fails to convert; numpy's or its own
         raise Unfit(f"gives the observation {_shown(given)}", "allowed: an array") from None

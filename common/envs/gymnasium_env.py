@@ -13,13 +13,12 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
 from coop.common.bounds import LONGEST_EPISODE, MAX_ACTIONS, MAX_SIDE
-from coop.common.envs.checked import RAISED, CheckedEnv
+from coop.common.envs.checked import CheckedEnv, raised
 from coop.common.envs.observations import FrameMaker
 from coop.common.envs.pictures import coloured
 from coop.common.envs.protocol import Steps
 from coop.common.envs.registry import find_registered
 from coop.common.errors import UsageError
-from coop.common.imports import describe
 from coop.common.process.notices import warn_once
 from coop.common.settings.environment import EnvSettings
 from coop.common.types import Array, EnvSpec
@@ -204,8 +203,8 @@ def _make(
         envs = [gymnasium.make(plain) for _ in range(count)]
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"env.id: {settings.id!r} needs a package that is not installed: {error}") from None
-    except RAISED as error:
-        text = f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {describe(error)}"
+    except BaseException as error:
+        text = f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {raised(error)}"
         raise UsageError(text) from error
     return envs, settings.max_episode_steps or registered.max_episode_steps or 0
 
@@ -215,8 +214,8 @@ def _spaces(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> tuple[Box, D
     name = f"env.id: {settings.id!r}"
     try:
         observations, actions = env.observation_space, env.action_space
-    except RAISED as error:
-        raise UsageError(f"{name} has no observation_space and action_space: {describe(error)}") from error
+    except BaseException as error:
+        raise UsageError(f"{name} has no observation_space and action_space: {raised(error)}") from error
     if not isinstance(observations, Box) or not 1 <= len(observations.shape) <= 3:
         raise UsageError(
             f"{name} has the observation space {_one_line(observations)}; allowed is a Box of one dimension, or of "

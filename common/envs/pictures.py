@@ -22,8 +22,8 @@ def grayscale(picture: Array) -> NDArray[np.float32]:
 def coloured(frame: Array) -> NDArray[np.uint8]:
     """A picture of any numbers, [height, width] or [height, width, channels], in colour: uint8 [height, width, 3].
 
-    Three channels are red, green and blue; of other numbers of channels, each has a colour of its own, and the last
-    one that is not 0 shows. Floats run from the least to the largest value.
+    One channel is grey, three are red, green and blue; of other numbers of channels, each has a colour of its own, and
+    the last one that is not 0 shows. Floats run from the least to the largest value.
     """
     if frame.dtype.kind == "f":
         low, high = float(frame.min()), float(frame.max())
@@ -32,8 +32,8 @@ def coloured(frame: Array) -> NDArray[np.uint8]:
         frame = frame.view(np.uint8) * np.uint8(255)
     elif frame.dtype != np.uint8:
         frame = np.clip(frame, 0, 255).astype(np.uint8)
-    if frame.ndim == 2:
-        return np.repeat(frame[..., None], 3, axis=2)
+    if frame.ndim == 2 or frame.shape[2] == 1:
+        return np.repeat(frame.reshape(*frame.shape[:2], 1), 3, axis=2)
     if frame.shape[2] == 3:
         return frame
     colours = np.array([hsv_to_rgb(number / frame.shape[2], 0.65, 1.0) for number in range(frame.shape[2])])

@@ -37,6 +37,12 @@ def check_endpoints(endpoints: Sequence[str]) -> None:
                 raise UsageError(f"endpoint {endpoint!r}: {protocol}/HOST:PORT with a port from 0 to 65535 is needed")
 
 
+def on_loopback(endpoints: Sequence[str]) -> bool:
+    """Whether one of `endpoints` is a port of this machine's loopback interface."""
+    hosts = [_host_and_port(endpoint.partition("/")[2])[0] for endpoint in endpoints]
+    return any(host == "localhost" or host.startswith("127.") for host in hosts)
+
+
 def unknown_hosts(endpoints: Sequence[str]) -> list[str]:
     """Names of hosts in `endpoints` that cannot be resolved now."""
     unknown = []

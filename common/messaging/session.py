@@ -12,10 +12,17 @@ import zenoh
 
 from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import RunError, UsageError
-from coop.common.messaging.endpoints import check_endpoints, explain_listen_error, explain_shared_memory, zenoh_reason
+from coop.common.messaging.endpoints import (
+    check_endpoints,
+    explain_listen_error,
+    explain_shared_memory,
+    on_loopback,
+    zenoh_reason,
+)
 from coop.common.messaging.links import never_linger, permit_many, wait_for_words
 from coop.common.messaging.presence import LEASE
 from coop.common.messaging.transport import NoAnswer
+from coop.common.process.ports import check_loopback
 
 MAX_LINKS = 1 << 16  # of a session; Zenoh's own limit is 1,000
 LONG_QUEUE, SHORT_QUEUE = 16, 4  # parts of messages, of 64 KiB each, that a link keeps memory for once it has sent them
@@ -56,11 +63,14 @@ def open_session(
 
     Raises:
         UsageError: a Zenoh config file or an endpoint is invalid.
-        RunError: it cannot listen on an endpoint, for example because the port is in use.
+        RunError: it cannot listen on an endpoint, for example because the port is in use; or an endpoint is on a
+            loopback interface that this machine lacks.
         NoAnswer: mode is "client", and no router has answered within a second.
     """
     zenoh.init_log_from_env_or("off")
     check_endpoints((*listen, *connect))
+    if on_loopback((*listen, *connect)):
+        check_loopback()
     if listen:
         permit_many()
     try:

@@ -125,8 +125,13 @@ def encode(
     """
     arrays = arrays or {}
     table, stops, packed = _table_of(tuple([(name, array.dtype, array.shape) for name, array in arrays.items()]))
-    header = _pack({"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": packed})
-    head = _PREFIX.pack(MAGIC, len(header)) + header
+    header = {"protocol": PROTOCOL, "kind": kind, "run": run, "fields": fields, "arrays": packed}
+    try:
+        packed_header = _pack(header)
+    except UnicodeEncodeError:
+        fields = _escaped(msgspec.to_builtins(fields, builtin_types=(bytes,)))
+        packed_header = _pack({**header, "fields": fields})
+    head = _PREFIX.pack(MAGIC, len(packed_header)) + packed_header
     start = _aligned(len(head))
     payload = _sized(into, start + table.size)
     whole = memoryview(payload)
@@ -163,6 +168,18 @@ def _table_of(
     packed = _pack([(place.name, _NAMES[place.dtype], place.shape, place.offset) for place in places])
     stops = (*(place.offset for place in places[1:]), end)[: len(places)]
     return ArrayTable(tuple(places), end), stops, msgspec.Raw(packed)
+
+
+def _escaped(value: Any) -> Any:  # noqa: ANN401 (plain values)
+    """A value whose texts can be sent: names of files may hold bytes that are not UTF-8."""
+    match value:
+        case str():
+            return value.encode(errors="backslashreplace").decode()
+        case dict():
+            return {key: _escaped(each) for key, each in value.items()}
+        case list() | tuple():
+            return [*map(_escaped, value)]
+    return value
 
 
 def _sized(memory: bytearray | None, size: int) -> bytearray:

@@ -222,9 +222,7 @@ def despite_threads() -> Iterator[None]:
         sys.exit(status)  # type: ignore[arg-type] # of the SystemExit
     warn(f"the thread {left[0].name!r} has not ended; this process ends without it")
     atexit._run_exitfuncs()  # as the interpreter would
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):
-            stream.flush()
+    flush_at_end()
     os._exit(status if isinstance(status, int) else int(status is not None))
 
 

@@ -58,7 +58,8 @@ def on_output_gone(call: Callable[[], None]) -> None:
 
 def complain(text: str) -> None:
     """Print a line to standard error."""
-    print(text, file=_streams.get(2, sys.stderr), flush=True)
+    if (stream := _streams.get(2, sys.stderr)) is not None:  # otherwise `print` would take standard output
+        print(text, file=stream, flush=True)
 
 
 def flush_at_end() -> None:

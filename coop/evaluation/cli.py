@@ -16,6 +16,7 @@ from coop.common.numbers import exact
 from coop.common.places import shown
 from coop.common.process import cli
 from coop.common.process.lifecycle import raise_on_signals, run_main
+from coop.common.process.output import out
 from coop.common.settings.options import RoleOptions
 
 if TYPE_CHECKING:
@@ -85,15 +86,15 @@ def _run() -> None:
     networks = [_NETWORKS[name] for name in options.networks]
     episodes, epsilons = options.episodes or EPISODES, options.epsilon or EPSILONS
     if options.video is not None:
-        print(film_checkpoint(options.run_dir[0], options.video, options.seed, networks), flush=True)
+        print(film_checkpoint(options.run_dir[0], options.video, options.seed, networks), file=out(), flush=True)
     runs = [
         evaluate_checkpoint(path, episodes, options.seed, networks, epsilons, options.envs) for path in options.run_dir
     ]
     width = max(len(str(shown(path))) for path in options.run_dir)
-    print(f"{'run':{width}}  {HEAD}", flush=True)
+    print(f"{'run':{width}}  {HEAD}", file=out(), flush=True)
     for run in runs:
         for one in run:
-            print(f"{shown(Path(one.run))!s:{width}}  {_row(one)}", flush=True)
+            print(f"{shown(Path(one.run))!s:{width}}  {_row(one)}", file=out(), flush=True)
 
 
 def _row(one: CheckpointEvaluation) -> str:

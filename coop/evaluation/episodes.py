@@ -68,12 +68,12 @@ def greedy(network: ActingNetwork, spec: EnvSpec) -> Acting:
     return lambda obs: network.q_values(obs, spec).argmax(1)
 
 
-def exploring(act: Acting, epsilon: float, num_actions: int, rng: np.random.Generator) -> Acting:
+def exploring(act: Acting, epsilon: float, spec: EnvSpec, rng: np.random.Generator) -> Acting:
     """A policy that takes a random action with probability `epsilon`, and otherwise the one of `act`."""
 
     def explore(obs: Array) -> Array:
-        random = rng.integers(num_actions, size=len(obs), dtype=np.int32)
-        return np.where(rng.random(len(obs)) < epsilon, random, act(obs))
+        random = rng.integers(spec.num_actions, size=len(obs), dtype=np.int32)
+        return np.where(rng.random(len(obs)) < epsilon, random, chosen(act, obs, spec))
 
     return explore if epsilon else act
 
@@ -115,7 +115,7 @@ class Evaluator:
         def played() -> list[float]:
             at_once, seed = min(episodes, self._at_once), int(env_seed.generate_state(1)[0])
             with closing(make_vector_env(config.env, at_once, seed, bounded=True)) as env:
-                act = exploring(greedy(network, env.spec), self._epsilon, env.spec.num_actions, rng)
+                act = exploring(greedy(network, env.spec), self._epsilon, env.spec, rng)
                 return play(env, act, episodes, self._stopped)
 
         returns = self._tried(f"evaluation after {env_step:,} steps", played)
@@ -132,8 +132,11 @@ class Evaluator:
         from coop.evaluation.film import Film, short_gif  # noqa: PLC0415 (most runs film nothing)
 
         settings, seed = self._config.env, np.random.SeedSequence([self._config.seed, 6, env_step]).generate_state(1)
-        act = greedy(network, env_spec(settings))
-        return self._tried(f"video after {env_step:,} steps", lambda: short_gif(Film(act, settings, int(seed[0]))))
+
+        def filmed() -> bytes:
+            return short_gif(Film(greedy(network, env_spec(settings)), settings, int(seed[0])))
+
+        return self._tried(f"video after {env_step:,} steps", filmed)
 
     def _tried(self, what: str, work: Callable[[], T]) -> T | None:
         try:

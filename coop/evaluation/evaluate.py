@@ -172,5 +172,5 @@ def _returns(
     policy: Acting, settings: EnvSettings, episodes: int, seed: int, epsilon: float, at_once: int
 ) -> list[float]:
     with closing(make_vector_env(settings, min(episodes, at_once), seed, bounded=True)) as env:
-        act = exploring(policy, epsilon, env.spec.num_actions, np.random.default_rng(seed))
+        act = exploring(policy, epsilon, env.spec, np.random.default_rng(seed))
         return play(env, act, episodes)

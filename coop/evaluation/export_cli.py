@@ -13,6 +13,7 @@ from coop.common.imports import permit
 from coop.common.places import shown
 from coop.common.process.cli import parse
 from coop.common.process.lifecycle import raise_on_signals, run_main
+from coop.common.process.output import out
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ def _run() -> None:
 
     permit(options.allow_import)
     done = export(options.run_dir, options.out)
-    print(f"checkpoint {done.epoch} in {shown(options.run_dir)}, network {done.acting} acts: {', '.join(done.names)}")
+    where = f"checkpoint {done.epoch} in {shown(options.run_dir)}"
+    print(f"{where}, network {done.acting} acts: {', '.join(done.names)}", file=out())
     if done.without_onnx:
-        print(f"no ONNX files: {done.without_onnx}")
+        print(f"no ONNX files: {done.without_onnx}", file=out())

@@ -97,9 +97,11 @@ class SavedPolicy:
             or (given.dtype.kind != "f" and np.array_equal(given.astype(dtype), given))
         ):
             raise UsageError(f"observation of dtype {given.dtype}: {self.spec.env_id} has {dtype}, or ints that fit it")
-        if given.dtype.kind == "f" and not np.isfinite(given).all():
+        with np.errstate(over="ignore"):
+            stored = given.astype(dtype, copy=False)
+        if stored.dtype.kind == "f" and not np.isfinite(stored).all():
             raise UsageError(f"observation with values that are not finite: {self.spec.env_id} has finite ones")
-        return given.astype(dtype, copy=False)
+        return stored
 
 
 class SavedRun:

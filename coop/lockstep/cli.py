@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -12,6 +11,7 @@ from coop.common.places import shown
 from coop.common.process.console import say
 from coop.common.process.importing import importing
 from coop.common.process.lifecycle import Stop, run_main
+from coop.common.process.output import out
 from coop.records.run_options import RunOptions, parse_run
 
 REPLAY_PROGRESS_EVERY = 5.0  # seconds
@@ -48,7 +48,8 @@ def _run() -> None:
 
 
 def _progress(line: str) -> None:
-    say(line, end="\r" if sys.stdout.isatty() else "\n")
+    stream = out()
+    say(line, end="\r" if stream is not None and stream.isatty() else "\n")
 
 
 def _replaying(stop: Stop) -> Callable[[int, int], None]:

@@ -12,6 +12,7 @@ from tyro.conf import Positional
 from coop.common.imports import permit
 from coop.common.process import cli
 from coop.common.process.lifecycle import raise_on_signals, run_main
+from coop.common.process.output import out
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ def _run() -> None:
         f"updates {begin} to checkpoint {outcome.updates:,} on {outcome.transitions:,} transitions, "
         f"{outcome.repeated:,} of {outcome.held:,} in the closing table equal another, "
         f"{outcome.missing_segments} segments missing: parameters, optimizers and random state equal "
-        f"those of the checkpoint, bit for bit (sha256 {outcome.digest})"
+        f"those of the checkpoint, bit for bit (sha256 {outcome.digest})",
+        file=out(),
     )
     for line in outcome.not_checked:
-        print(f"not checked: {line}")
+        print(f"not checked: {line}", file=out())

@@ -15,6 +15,7 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 
 from coop.common.process.files import NO_SPACE
+from coop.common.process.output import out
 
 KEPT = 200  # lines said while the picture fills the screen
 
@@ -29,7 +30,7 @@ class LiveDisplay(ABC):
     """
 
     def __init__(self, plain_every: float, refreshes: float, *, screen: bool = False) -> None:
-        self._console = Console()
+        self._console = Console(file=out())
         self._draws = self._console.is_terminal and not self._console.is_dumb_terminal
         self._live = Live(
             console=self._console, auto_refresh=False, transient=True, screen=screen, redirect_stderr=not screen
@@ -44,7 +45,7 @@ class LiveDisplay(ABC):
     def __enter__(self) -> Self:
         if self._draws:
             self._live.start()
-            if self._screen and sys.stderr.isatty():
+            if self._screen and sys.stderr is not None and sys.stderr.isatty():
                 lines = self._redirected.enter_context(closing(_Lines(self.say, sys.stderr.fileno())))
                 self._redirected.enter_context(redirect_stderr(lines))
         return self

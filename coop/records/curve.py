@@ -36,18 +36,20 @@ def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path, eva
         OSError: it can't be written; an older one is untouched then.
     """
     # A figure without pyplot leaves the caller's backend, a notebook's for example, as it is.
-    from matplotlib.figure import Figure  # noqa: PLC0415 (half a second, needed once at the end)
+    from matplotlib import style  # noqa: PLC0415 (half a second, needed once at the end)
+    from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.subplots()
-    axes.plot(steps, returns, ".", markersize=2, alpha=0.35, label="episode")
-    axes.plot(steps, running_mean(returns), linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
-    if evaluated.size:
-        axes.plot(*evaluated, "o-", markersize=4, label="evaluation")
-    axes.set(xlabel="environment steps", ylabel="return", title=title)
-    axes.legend(loc="lower right")
-    axes.grid(alpha=0.3)
     content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=120)
+    with style.context("default"):  # not the user's own, which may need TeX or fonts
+        figure = Figure(figsize=(8, 4.5), layout="constrained")
+        axes = figure.subplots()
+        axes.plot(steps, returns, ".", markersize=2, alpha=0.35, label="episode")
+        axes.plot(steps, running_mean(returns), linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
+        if evaluated.size:
+            axes.plot(*evaluated, "o-", markersize=4, label="evaluation")
+        axes.set(xlabel="environment steps", ylabel="return", title=title)
+        axes.legend(loc="lower right")
+        axes.grid(alpha=0.3)
+        figure.savefig(content, format="png", dpi=120)
     write_atomic(path, content.getvalue())
     return path

@@ -15,7 +15,6 @@ import os
 import re
 import secrets
 import socket
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -25,7 +24,7 @@ from typing import Self
 
 from coop.common.errors import RunError
 from coop.common.process.files import guard_writes, make_folder
-from coop.common.process.output import keep_standard_files
+from coop.common.process.output import complain, keep_standard_files
 from coop.common.process.processes import INHERITED
 from coop.common.process.untrusted import check_links
 
@@ -107,9 +106,11 @@ class FileLock:
         try:
             found = _read(self.path)[1]
             if found and found != self._token:
-                text = f"{self.path.parent}: another process has taken it over while this one stood still\n"
                 with contextlib.suppress(OSError):
-                    os.write(sys.stderr.fileno(), f"error: run directory {text}".encode())
+                    complain(
+                        f"error: run directory {self.path.parent}: another process has taken it over while this one "
+                        "stood still"
+                    )
                 os._exit(RunError.exit_status)  # at once: whatever this process would still write is no longer its own
             os.utime(self.descriptor)
             self._seen = _now()

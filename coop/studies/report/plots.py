@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
@@ -119,7 +119,7 @@ def draw(figure: Figure, path: Path) -> None:
     lines = [sum(1 + _wrapped(tick).count("\n") for tick in panel.ticks) for panel in figure.panels]
     tall = max(HEIGHT, 0.6 + TICK * max(lines))
     size = (figure.width, tall * rows + 0.4)
-    with mpl.rc_context(STYLE):
+    with style.context(["default", STYLE]):  # not the user's own, which may need TeX or fonts
         canvas = Canvas(size, DPI, layout="constrained")
         grid = canvas.subplots(rows, columns, squeeze=False, sharey=figure.same_y)
         colours: dict[str, str] = {}
