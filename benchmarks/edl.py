@@ -26,8 +26,8 @@ from coop.common.settings.tables import validated
 from coop.common.types import Batch, EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.edl.arrays import AnyArray, convert_like
+from coop.learner.edl.backprop import Tape
 from coop.learner.edl.feedback import FeedbackRule
-from coop.learner.edl.passes import Tape
 
 BATCH, GAMMA, RATE = 32, 0.99, 0.1
 BLOCKS = 5

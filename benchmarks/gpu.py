@@ -183,7 +183,7 @@ def part_accuracy(options: argparse.Namespace) -> None:
     from coop.common.types import EnvSpec
     from coop.learner.edl import kernels
     from coop.learner.edl.completed import Jacobians
-    from coop.learner.edl.layers import make_passes
+    from coop.learner.edl.layers import make_backprop
     from coop.learner.edl.transforms import Transforms
 
     device, batch = torch.device(options.device), 4 if options.quick else 32
@@ -200,7 +200,7 @@ def part_accuracy(options: argparse.Namespace) -> None:
             exact = FlatNetwork(build_network("nature", spec, (), 0).double())
             x = sample_inputs(spec, batch)
             with torch.no_grad():
-                chain = make_passes(network.module, None)
+                chain = make_backprop(network.module, None)
                 transforms = Transforms(chain, chain.forward(x.to(device, dtype)))
                 found = transforms._jacobians().apply(error @ transforms._basis.T, 1.0)
                 alone = [
@@ -209,7 +209,7 @@ def part_accuracy(options: argparse.Namespace) -> None:
                     )[0]
                     for t in transforms._ts
                 ]
-                chain = make_passes(exact.module, None)
+                chain = make_backprop(exact.module, None)
                 wanted = Transforms(chain, chain.forward(x.double()))._ts
                 for layer, (got, own, t) in enumerate(zip(found, alone, wanted, strict=True)):
                     u, _, vh = torch.linalg.svd(t, full_matrices=False)

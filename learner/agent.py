@@ -37,7 +37,7 @@ from coop.learner.edl.arrays import convert_like
 from coop.learner.edl.beside import Branches
 from coop.learner.given import Given
 from coop.learner.losses import LOSSES, Values, output_error, td_errors
-from coop.learner.methods.rule import Rule
+from coop.learner.methods.rule import UpdateRule
 from coop.learner.optimizers import make_optimizer
 from coop.learner.qnetwork import as_float32, make_q_network, on_host
 from coop.learner.recorded import Capture, Late, Recorded, cuda_graph
@@ -99,7 +99,7 @@ class Agent:
         trained = self._networks if config.two_networks else self._networks[:1]
         self.optimizers = [make_optimizer(config.learner, one.theta, one.gradient) for one in trained]
         rule = loaded(METHODS.get(config.method).rule, f"method {config.method!r}")
-        self.rule: Rule = rule(config, self._noise)
+        self.rule: UpdateRule = rule(config, self._noise)
         decay = _decay_vector(config.learner.weight_decay, self.networks[0].layout)
         self._weight_decay = None if decay is None else convert_like(decay, self._networks[0].theta)
         if capture is None and self.device.type == "cuda":
@@ -200,9 +200,9 @@ class Agent:
         """Probability of a random action after `env_step` environment steps."""
         return schedules.epsilon(self.config.actor, env_step)
 
-    def exploration_rate(self) -> float:
+    def feedback_scale(self) -> float:
         """The present scale of s; 0 for the gradient methods."""
-        return 0.0 if self.config.feedback == "none" else schedules.exploration_rate(self.config.edl, self.updates)
+        return 0.0 if self.config.feedback == "none" else schedules.feedback_scale(self.config.edl, self.updates)
 
     def finite(self) -> bool:
         """True while every parameter of both networks is finite."""
@@ -236,7 +236,7 @@ class Agent:
         self.rule.load_state(state["rule"])
 
     def _draw_s(self) -> float:
-        s = self.exploration_rate()
+        s = self.feedback_scale()
         return s * float(self._noise.standard_normal()) if self.config.edl.noise == "normal" and s else s
 
     def _learning_rate(self) -> float:

@@ -12,7 +12,7 @@ from coop.common.settings.config import RunConfig
 from coop.common.types import Array, Batch, EnvSpec
 from coop.learner.agent import Update
 from coop.learner.losses import Loss, Values
-from coop.learner.methods.rule import Rule
+from coop.learner.methods.rule import UpdateRule
 
 
 class Agent(Protocol):
@@ -22,7 +22,7 @@ class Agent(Protocol):
     spec: EnvSpec
     loss: Loss
     device: torch.device
-    rule: Rule
+    rule: UpdateRule
     lag: int
 
     @property
@@ -50,7 +50,7 @@ class Agent(Protocol):
     def epsilon(self, env_step: int) -> float:
         """Probability of a random action after `env_step` environment steps."""
 
-    def exploration_rate(self) -> float:
+    def feedback_scale(self) -> float:
         """The present scale of s."""
 
     def finite(self) -> bool:

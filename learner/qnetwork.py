@@ -18,9 +18,9 @@ from coop.common.settings.methods import METHODS
 from coop.common.types import EnvSpec
 from coop.learner.edl import kernels
 from coop.learner.edl.arrays import AnyArray, assign, convert_like
+from coop.learner.edl.autograd_backprop import AutogradBackprop
+from coop.learner.edl.backprop import Tape, UnsupportedLayerError
 from coop.learner.edl.feedback import FeedbackRule
-from coop.learner.edl.graph import Graph
-from coop.learner.edl.passes import Tape, UnsupportedLayerError
 from coop.learner.edl.trainable import Trainable
 
 
@@ -57,7 +57,7 @@ class QNetwork:
             self._trained = Trainable(network, True, example)
         except UnsupportedLayerError as error:
             raise UsageError(f"network.kind = {config.network.kind!r}: {error}") from error
-        self.plain = not isinstance(self._trained.chain, Graph)
+        self.plain = not isinstance(self._trained.backprop, AutogradBackprop)
         if not self.plain and config.network.dtype != "float32":
             kind, stacks = config.network.kind, "only stacks of Linear, Conv2d, ReLU and Flatten have others"
             raise UsageError(
@@ -65,7 +65,7 @@ class QNetwork:
             )
         self._passes = self._trained if half is None else Trainable(half, True, None)
         self.in_numpy = self._passes.in_numpy
-        self._rule = FeedbackRule(self._passes.chain, config.feedback, config.seed, rng)
+        self._rule = FeedbackRule(self._passes.backprop, config.feedback, config.seed, rng)
         self._spec = spec
         self.theta: Any
         self.gradient: Any
@@ -90,7 +90,7 @@ class QNetwork:
 
     def forward(self, inputs: AnyArray) -> Tape[Any]:
         """Run a forward pass and record its activations for `backward`."""
-        return self._passes.chain.forward(self._passes.cast(inputs))
+        return self._passes.backprop.forward(self._passes.cast(inputs))
 
     def values(self, inputs: AnyArray) -> Any:  # noqa: ANN401
         """Q-values for the targets, float32 [batch, actions]."""

@@ -73,7 +73,7 @@ class StatusReporter:
             episodes=trainer.telemetry.episodes,
             return_mean_100=trainer.telemetry.return_mean,
             epsilon=trainer.epsilon(),
-            s=agent.exploration_rate(),
+            s=agent.feedback_scale(),
             waiting=self._samples.waiting,
             warning=trainer.telemetry.warning(agent),
             origin=str(self._origin),

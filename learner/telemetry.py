@@ -65,7 +65,7 @@ class Telemetry:
             "acting": agent.acting + 1,
             "td_error": float(np.abs(errors).mean()),
             "loss": float(agent.loss.cost(errors).mean()),
-            "s": agent.exploration_rate(),
+            "s": agent.feedback_scale(),
             "epsilon": epsilon,
             **measured,
             **self._bound(agent),

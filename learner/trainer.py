@@ -177,7 +177,7 @@ class Trainer:
         if not drawn.episodes:
             return []
         self.drawn = msgspec.structs.replace(drawn, episodes=())
-        number, updates, s = self.telemetry.episode, self.agent.updates, self.agent.exploration_rate()
+        number, updates, s = self.telemetry.episode, self.agent.updates, self.agent.feedback_scale()
         return [EpisodeRow(number(record.end.episode_return), record, updates, s) for record in drawn.episodes]
 
     def _metrics(self, now: float) -> dict[str, Any] | None:

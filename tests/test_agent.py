@@ -39,7 +39,7 @@ def test_roles_swap_every_c_updates(method: str) -> None:
     agent = Agent(_config(method), SPEC)
     assert len(agent.optimizers) == 2
     assert agent.versions == [0, 0]
-    assert (agent.exploration_rate() == 0) == (method == "g-coop")
+    assert (agent.feedback_scale() == 0) == (method == "g-coop")
     assert not torch.equal(agent.networks[0].flat, agent.networks[1].flat)
     for number, batch in enumerate(batches(35)):
         before = [network.snapshot() for network in agent.networks]
@@ -78,7 +78,7 @@ def test_coop_without_s_is_g_coop() -> None:
         torch.testing.assert_close(one.flat, other.flat, rtol=1e-5, atol=1e-6)
     edl = Agent(config, SPEC)
     edl.update(batches(1)[0])
-    assert edl.exploration_rate() > 0
+    assert edl.feedback_scale() > 0
 
 
 @pytest.mark.parametrize(("double", "bound"), [(False, None), (True, None), (True, 0.01)])

@@ -12,7 +12,7 @@ import pytest
 import coop
 from coop.common.settings.methods import METHODS
 from coop.learner.losses import Values
-from coop.learner.methods.rule import Rule
+from coop.learner.methods.rule import UpdateRule
 from coop.lockstep import cli as lockstep_cli
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
@@ -188,7 +188,7 @@ def test_a_sweep(tmp_path: Path) -> None:
         coop.sweep(grid, tmp_path, jobs=0)
 
 
-class Pessimist(Rule):
+class Pessimist(UpdateRule):
     """Targets bootstrap from the worst action."""
 
     def bootstrap(self, next_values: Values, preferred: Values) -> Values:

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 
 from coop.common.networks.convolution import ConvolutionNetwork
 from coop.common.networks.dense import Dense
-from coop.learner.edl.backprop import Chain
-from coop.learner.edl.convolution import ConvolutionChain
-from coop.learner.edl.dense import DenseChain
-from coop.learner.edl.passes import UnsupportedLayerError
+from coop.learner.edl.backprop import UnsupportedLayerError
+from coop.learner.edl.convolution import ConvolutionBackprop
+from coop.learner.edl.numpy_backprop import NumpyBackprop
+from coop.learner.edl.torch_backprop import TorchBackprop
 
 
 def _uneven() -> nn.Sequential:
@@ -52,13 +52,13 @@ def _jacobians(network: nn.Sequential, x: Tensor) -> list[Tensor]:
 def test_cotangents_are_those_of_autograd(batch: int, shared: bool) -> None:
     """Units as cotangents, one set for all samples or one for each; as many samples as actions is a case of its own."""
     network, x = _uneven(), _inputs(batch)
-    chain = Chain(network)
+    backprop = TorchBackprop(network)
     units = torch.eye(3, dtype=torch.float64).expand(1 if shared else batch, 3, 3).clone()
     before = units.clone()
     with torch.no_grad():
-        found = list(chain.walk(chain.forward(x), units))
+        found = list(backprop.cotangents(backprop.forward(x), units))
     expected = _jacobians(network, x)
-    assert [index for index, _ in found] == list(reversed(chain.parametrised)) == [10, 8, 5, 2, 0]
+    assert [index for index, _ in found] == list(reversed(backprop.parametrised)) == [10, 8, 5, 2, 0]
     for (_, rows), jacobian in zip(found, expected, strict=True):
         torch.testing.assert_close(rows.expand_as(jacobian), jacobian)
         assert jacobian.any()
@@ -71,11 +71,11 @@ def test_gradients_are_those_of_autograd(batch: int) -> None:
     error = torch.randn(batch, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     names = dict(network.named_parameters())
     expected = torch.autograd.grad(network(x), list(names.values()), error)
-    chain, out = Chain(network), {name: torch.full_like(p, torch.nan) for name, p in names.items()}
+    backprop, out = TorchBackprop(network), {name: torch.full_like(p, torch.nan) for name, p in names.items()}
     with torch.no_grad():
-        tape = chain.forward(x)
-        for index, delta in chain.walk(tape, error[:, None]):
-            chain.write(tape, index, delta[:, 0], out)
+        tape = backprop.forward(x)
+        for index, delta in backprop.cotangents(tape, error[:, None]):
+            backprop.write_gradients(tape, index, delta[:, 0], out)
     for name, gradient in zip(names, expected, strict=True):
         torch.testing.assert_close(out[name], gradient)
 
@@ -84,12 +84,12 @@ def test_gradients_are_those_of_autograd(batch: int) -> None:
 def test_a_relu_at_the_end_leaves_the_callers_cotangents(batch: int) -> None:
     torch.manual_seed(0)
     network = nn.Sequential(nn.Linear(2, 4), nn.ReLU(), nn.Linear(4, 2), nn.ReLU()).double()
-    x, chain = torch.randn(batch, 2, dtype=torch.float64), Chain(network)
+    x, backprop = torch.randn(batch, 2, dtype=torch.float64), TorchBackprop(network)
     for b in {1, batch}:
         cotangents = torch.randn(b, 2, 2, dtype=torch.float64)
         before = cotangents.clone()
         with torch.no_grad():
-            found = [rows for _, rows in chain.walk(chain.forward(x), cotangents)]
+            found = [rows for _, rows in backprop.cotangents(backprop.forward(x), cotangents)]
         assert torch.equal(cotangents, before)
         for rows, jacobian in zip(found, _jacobians(network, x), strict=True):
             torch.testing.assert_close(rows, before @ jacobian)
@@ -97,7 +97,8 @@ def test_a_relu_at_the_end_leaves_the_callers_cotangents(batch: int) -> None:
 
 @pytest.mark.parametrize("narrow", [False, True])
 @pytest.mark.parametrize(
-    ("kind", "form"), [(lambda n: DenseChain(Dense(n)), "mlp"), (lambda n: ConvolutionChain(ConvolutionNetwork(n)), "")]
+    ("kind", "form"),
+    [(lambda n: NumpyBackprop(Dense(n)), "mlp"), (lambda n: ConvolutionBackprop(ConvolutionNetwork(n)), "")],
 )
 def test_the_passes_in_numpy_walk_the_same_way(kind: Callable[[Any], Any], form: str, narrow: bool) -> None:
     """Each k of the cotangents by itself, also through a layer of one unit."""
@@ -108,12 +109,12 @@ def test_the_passes_in_numpy_walk_the_same_way(kind: Callable[[Any], Any], form:
     network = nn.Sequential(*first, *middle, nn.ReLU(), nn.Linear(width, 3)).double()
     nn.init.constant_(network[-3].bias, 3.0)  # alive
     x = torch.randn(4, *((5,) if form else (1, 3, 3)), dtype=torch.float64)
-    chain, other = kind(network), Chain(network)
+    backprop, other = kind(network), TorchBackprop(network)
     for b in (1, 4):
         cotangents = torch.randn(b, 3, 3, dtype=torch.float64)
         with torch.no_grad():
-            expected = [rows for _, rows in other.walk(other.forward(x), cotangents)]
-        found = [rows for _, rows in chain.walk(chain.forward(x.numpy()), cotangents.numpy().copy())]
+            expected = [rows for _, rows in other.cotangents(other.forward(x), cotangents)]
+        found = [rows for _, rows in backprop.cotangents(backprop.forward(x.numpy()), cotangents.numpy().copy())]
         for rows, wanted in zip(found, expected, strict=True):
             torch.testing.assert_close(torch.from_numpy(rows).reshape(wanted.shape), wanted)
             assert wanted.any()
@@ -138,5 +139,5 @@ RELU, LINEAR = nn.ReLU(), nn.Linear(2, 2)
 )  # fmt: skip
 def test_what_a_plain_stack_does_not_hold(network: nn.Sequential, text: str) -> None:
     with pytest.raises(UnsupportedLayerError) as refused:
-        Chain(network)
+        TorchBackprop(network)
     assert str(refused.value) == text

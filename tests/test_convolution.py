@@ -11,9 +11,9 @@ from coop.common.networks.convolution import ConvolutionNetwork
 from coop.common.networks.network import FlatNetwork
 from coop.common.settings.config import LearnerSettings
 from coop.common.types import Array
-from coop.learner.edl.backprop import Chain
-from coop.learner.edl.convolution import ConvolutionChain
+from coop.learner.edl.convolution import ConvolutionBackprop
 from coop.learner.edl.feedback import FEEDBACKS, FeedbackRule
+from coop.learner.edl.torch_backprop import TorchBackprop
 from coop.learner.optimizers import make_optimizer
 
 
@@ -55,12 +55,12 @@ def test_values_and_gradients_agree(
         network.double() if dtype is np.float64 else network.float()
         found = {name: np.full(p.shape, np.nan, dtype) for name, p in network.named_parameters()}
         expected = {name: torch.from_numpy(array.copy()) for name, array in found.items()}
-        rule = FeedbackRule(ConvolutionChain(ConvolutionNetwork(network)), feedback)
-        other = FeedbackRule(Chain(network), feedback)
+        rule = FeedbackRule(ConvolutionBackprop(ConvolutionNetwork(network)), feedback)
+        other = FeedbackRule(TorchBackprop(network), feedback)
         with torch.no_grad():
             tape, other_tape = (
-                rule.chain.forward(x.astype(dtype)),
-                other.chain.forward(torch.from_numpy(x.astype(dtype))),
+                rule.backprop.forward(x.astype(dtype)),
+                other.backprop.forward(torch.from_numpy(x.astype(dtype))),
             )
             rule.backward(tape, error.astype(dtype), s, found)
             other.backward(other_tape, torch.from_numpy(error.astype(dtype)), s, expected)
@@ -71,11 +71,11 @@ def test_values_and_gradients_agree(
 
 def test_the_head_of_a_tape_is_the_tape_of_the_first_samples() -> None:
     module = _network((2, 5, 3), (6, 6), [20], 3)
-    chain, x, error = ConvolutionChain(ConvolutionNetwork(module)), _pictures(8, 2, (6, 6)), np.ones((3, 3))
+    backprop, x, error = ConvolutionBackprop(ConvolutionNetwork(module)), _pictures(8, 2, (6, 6)), np.ones((3, 3))
     gradients = []
-    for tape in (chain.forward(x).head(3), chain.forward(x[:3])):
+    for tape in (backprop.forward(x).head(3), backprop.forward(x[:3])):
         out = {name: np.empty(p.shape) for name, p in module.named_parameters()}
-        FeedbackRule(chain, "transform").backward(tape, error, 0.3, out)
+        FeedbackRule(backprop, "transform").backward(tape, error, 0.3, out)
         gradients.append(out)
     for name, gradient in gradients[0].items():
         np.testing.assert_allclose(gradient, gradients[1][name], rtol=1e-9)

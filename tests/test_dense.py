@@ -12,9 +12,9 @@ from torch import nn
 from coop.common.networks.dense import Dense
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.types import Array, EnvSpec
-from coop.learner.edl.backprop import Chain
-from coop.learner.edl.dense import DenseChain
 from coop.learner.edl.feedback import FEEDBACKS, FeedbackRule, feedback_matrices
+from coop.learner.edl.numpy_backprop import NumpyBackprop
+from coop.learner.edl.torch_backprop import TorchBackprop
 
 
 def _mlp(widths: list[int], seed: int) -> nn.Sequential:
@@ -28,11 +28,11 @@ def _mlp(widths: list[int], seed: int) -> nn.Sequential:
 def _compare(network: nn.Sequential, feedback: str, s: float, x: Array, error: Array) -> None:
     found = {name: np.full(p.shape, np.nan) for name, p in network.named_parameters()}
     expected = {name: torch.full(p.shape, torch.nan).double() for name, p in network.named_parameters()}
-    rule, other = FeedbackRule(DenseChain(Dense(network)), feedback), FeedbackRule(Chain(network), feedback)
-    tape = rule.chain.forward(x)
+    rule, other = FeedbackRule(NumpyBackprop(Dense(network)), feedback), FeedbackRule(TorchBackprop(network), feedback)
+    tape = rule.backprop.forward(x)
     rule.backward(tape, error, s, found)
     with torch.no_grad():
-        other_tape = other.chain.forward(torch.from_numpy(x))
+        other_tape = other.backprop.forward(torch.from_numpy(x))
         other.backward(other_tape, torch.from_numpy(error), s, expected)
     np.testing.assert_allclose(tape.output, other_tape.output, rtol=1e-10, atol=1e-12)
     for name, gradient in expected.items():
@@ -75,12 +75,12 @@ def test_samples_that_lack_rank_get_a_whole_polar_factor() -> None:
     assert isinstance(hidden, nn.Linear)
     hidden.bias.data[:] = torch.tensor([9.0, -9, -9, -9, -9])
     x, s = np.random.default_rng(0).standard_normal((4, 3)), 0.5
-    rule = FeedbackRule(DenseChain(Dense(network)))
+    rule = FeedbackRule(NumpyBackprop(Dense(network)))
     out = {name: np.empty(p.shape) for name, p in network.named_parameters()}
     b = np.empty((4, 2, 5))
     for sample, row in np.ndindex(4, 2):  # the hidden layer's bias gradient is B^T e
         with np.errstate(divide="ignore", invalid="ignore"):  # as an update does
-            rule.backward(rule.chain.forward(x[[sample]]), np.eye(2)[[row]], s, out)
+            rule.backward(rule.backprop.forward(x[[sample]]), np.eye(2)[[row]], s, out)
         b[sample, row] = out["0.bias"]
     values = np.linalg.svd(b, compute_uv=False)
     t, whole = (feedback_matrices(network, torch.from_numpy(x), rate)["0"] for rate in (0.0, s))

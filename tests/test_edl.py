@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from coop.common.networks.dense import Dense
 from coop.common.networks.network import build_network
 from coop.common.types import EnvSpec
-from coop.learner.edl.backprop import Chain
-from coop.learner.edl.dense import DenseChain
 from coop.learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
+from coop.learner.edl.numpy_backprop import NumpyBackprop
+from coop.learner.edl.torch_backprop import TorchBackprop
 from coop.learner.edl.transforms import Transforms, _basis
 
 
@@ -231,9 +231,9 @@ def test_random_feedback_is_fixed() -> None:
     assert torch.equal(fixed["out"], torch.eye(3, dtype=torch.float64))
     rows = torch.cat([fixed["fc1"], fixed["fc2"], other["fc1"], other["fc2"]])
     torch.testing.assert_close(rows @ rows.T, torch.eye(12, dtype=torch.float64), atol=0.25, rtol=0)
-    rule, zero = (FeedbackRule(Chain(network), "random", **seed) for seed in ({}, {"seed": 0}))
-    tape, error = rule.chain.forward(first), torch.eye(3, dtype=torch.float64)[:1]
-    for index in rule.chain.parametrised:
+    rule, zero = (FeedbackRule(TorchBackprop(network), "random", **seed) for seed in ({}, {"seed": 0}))
+    tape, error = rule.backprop.forward(first), torch.eye(3, dtype=torch.float64)[:1]
+    for index in rule.backprop.parametrised:
         assert torch.equal(rule._aligned(tape, index, error), zero._aligned(tape, index, error))
 
 
@@ -267,8 +267,8 @@ def test_the_basis_is_orthogonal_and_parts_the_common_value(actions: int, librar
 
 def test_transforms_in_numpy_start_from_the_basis_of_the_output_weight() -> None:
     network, x, _ = _case("mlp", 6, 3)
-    chain = DenseChain(Dense(network))
+    backprop = NumpyBackprop(Dense(network))
     weight = network.get_parameter("out.weight").detach().numpy()
-    rows = Transforms(chain, chain.forward(x.numpy()))._basis @ weight
+    rows = Transforms(backprop, backprop.forward(x.numpy()))._basis @ weight
     gram = rows @ rows.T
     np.testing.assert_allclose(gram, np.diag(gram.diagonal()), atol=1e-7)

@@ -7,11 +7,11 @@ from torch import Tensor, nn
 
 from coop.common.networks.network import build_network
 from coop.common.types import EnvSpec
-from coop.learner.edl.backprop import Chain
+from coop.learner.edl.autograd_backprop import AutogradBackprop
+from coop.learner.edl.backprop import UnsupportedLayerError
 from coop.learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
-from coop.learner.edl.graph import Graph
-from coop.learner.edl.layers import _examined, make_passes
-from coop.learner.edl.passes import UnsupportedLayerError
+from coop.learner.edl.layers import _examined, make_backprop
+from coop.learner.edl.torch_backprop import TorchBackprop
 from coop.learner.edl.transforms import Transforms
 
 
@@ -79,7 +79,7 @@ def test_autograd_and_the_chain_agree(kind: str, actions: int, batch: int, feedb
     found = []
     for dtype in (torch.float64, torch.float32):
         network, x, error = network.to(dtype), x.to(dtype), error.to(dtype)
-        for passes in (Chain(network), _examined(network, x)):
+        for passes in (TorchBackprop(network), _examined(network, x)):
             out = {name: torch.full_like(p, torch.nan) for name, p in network.named_parameters()}
             tape = passes.forward(x)
             with torch.inference_mode():
@@ -126,8 +126,8 @@ def test_without_feedback_any_parameter_gets_the_ordinary_gradient() -> None:
         )
     )
     assert _relative(edl_gradients(network, x, error, 0.7, "none"), expected) < 1e-12
-    assert isinstance(make_passes(network, None), Graph)
-    assert isinstance(make_passes(nn.Sequential(nn.Linear(5, 3)), x), Chain)
+    assert isinstance(make_backprop(network, None), AutogradBackprop)
+    assert isinstance(make_backprop(nn.Sequential(nn.Linear(5, 3)), x), TorchBackprop)
 
 
 @pytest.mark.parametrize("actions", [2, 3, 6])
@@ -155,7 +155,7 @@ def test_a_dueling_network_needs_no_completion(actions: int) -> None:
     with torch.no_grad():
         network.get_parameter("value.2.weight").mul_(30)
     x = _inputs(shape, actions, 32)[0].float()
-    passes = make_passes(network.float(), x)
+    passes = make_backprop(network.float(), x)
     jacobians = Transforms(passes, passes.forward(x))._jacobians()
     layers, _, _ = jacobians._solve(torch.eye(actions, dtype=torch.float64)[None, None])
     completed = [layer.completed() for layer in layers]

@@ -6,10 +6,10 @@ from custom_networks import Centred, Duel, Negative, Residual
 from test_graph import _by_svd, _inputs, _networks, _relative
 from torch import Tensor, nn
 
+from coop.learner.edl.autograd_backprop import AutogradBackprop, Layer
+from coop.learner.edl.backprop import Tape, UnsupportedLayerError
 from coop.learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
-from coop.learner.edl.graph import Graph, Layer
-from coop.learner.edl.layers import _range, make_passes
-from coop.learner.edl.passes import Tape, UnsupportedLayerError
+from coop.learner.edl.layers import _range, make_backprop
 
 
 class Odd(nn.Module):
@@ -91,8 +91,8 @@ def test_a_module_that_is_a_layer_itself() -> None:
 def test_the_output_weight_is_that_of_a_linear_at_the_end(index: int, ends: str | None) -> None:
     """A dueling head has its mean subtracted and a doubled stack its output doubled, so no layer's output is theirs."""
     network, shape = _networks(3)[index]
-    passes = make_passes(network, _inputs(shape, 3, 4)[0])
-    assert isinstance(passes, Graph)
+    passes = make_backprop(network, _inputs(shape, 3, 4)[0])
+    assert isinstance(passes, AutogradBackprop)
     assert passes.output_weight is (network.get_parameter(ends) if ends else None)
 
 
@@ -107,14 +107,14 @@ def test_the_output_weight_is_that_of_a_linear_at_the_end(index: int, ends: str 
 )
 def test_what_takes_no_feedback(network: nn.Module, batch: int, text: str) -> None:
     with pytest.raises(UnsupportedLayerError) as refused:
-        make_passes(network, torch.randn(batch, 5, generator=torch.Generator().manual_seed(0)))
+        make_backprop(network, torch.randn(batch, 5, generator=torch.Generator().manual_seed(0)))
     assert str(refused.value) == text
 
 
 @pytest.mark.parametrize("runs", [(1, 0), (2, 1), (2, 0)])
 def test_a_module_must_run_each_layer_once_later_too(runs: tuple[int, int]) -> None:
     network = Moody()
-    passes = make_passes(network, x := torch.randn(6, 5))
+    passes = make_backprop(network, x := torch.randn(6, 5))
     passes.forward(x)
     network.runs = runs
     with pytest.raises(UnsupportedLayerError, match=r"^its layers do not run once in every forward pass$"):
@@ -123,7 +123,7 @@ def test_a_module_must_run_each_layer_once_later_too(runs: tuple[int, int]) -> N
 
 def test_the_head_of_a_tape_is_the_tape_of_the_first_samples() -> None:
     network = Duel(5, 3).double()
-    passes = make_passes(network, x := _inputs((5,), 3, 8)[0])
+    passes = make_backprop(network, x := _inputs((5,), 3, 8)[0])
     tape = passes.forward(x)
     assert tape.head(8) is tape
     error = torch.ones(3, 3, dtype=torch.float64)
@@ -141,14 +141,14 @@ def test_the_head_of_a_tape_is_the_tape_of_the_first_samples() -> None:
 
 
 def test_a_tape_of_other_passes_holds_no_graph() -> None:
-    passes = make_passes(Residual(5, 3), x := torch.randn(6, 5))
+    passes = make_backprop(Residual(5, 3), x := torch.randn(6, 5))
     with pytest.raises(TypeError, match=r"^a Tape holds no graph$"):
-        next(passes.walk(Tape(torch.zeros(6, 3), [x]), torch.zeros(6, 1, 3)))
+        next(passes.cotangents(Tape(torch.zeros(6, 3), [x]), torch.zeros(6, 1, 3)))
 
 
 def test_passes_leave_no_hooks_behind() -> None:
     network = Residual(5, 3)
-    make_passes(network, x := torch.randn(6, 5)).forward(x)
+    make_backprop(network, x := torch.randn(6, 5)).forward(x)
     assert not any(layer._forward_hooks for layer in network.modules())
 
 
@@ -168,7 +168,7 @@ def test_a_direction_that_is_seldom_strong_is_no_lost_rank(size: float) -> None:
     torch.manual_seed(0)
     network = Faint().double()
     x, error = _inputs((5,), 3, 6)
-    assert make_passes(network, x).range_of(0) is None
+    assert make_backprop(network, x).range_of(0) is None
     assert _relative(edl_gradients(network, x, error, 0.3), _by_svd(network, x, error, 0.3)) < 1e-6
 
 
@@ -176,7 +176,7 @@ def test_a_direction_that_is_seldom_strong_is_no_lost_rank(size: float) -> None:
 def test_the_range_of_a_dueling_head_lies_beside_the_mean(dtype: torch.dtype) -> None:
     """Advantages reach the two directions beside (1, 1, 1), the value only that one, the trunk all three."""
     torch.manual_seed(0)
-    passes = make_passes(Duel(5, 3).to(dtype), _inputs((5,), 3, 8)[0].to(dtype))
+    passes = make_backprop(Duel(5, 3).to(dtype), _inputs((5,), 3, 8)[0].to(dtype))
     mean = torch.full((3, 3), 1 / 3, dtype=dtype)
     beside = torch.eye(3, dtype=dtype) - mean
     expected = {"trunk.": None, "advantage.0.": (beside, 2), "advantage.2.": (beside, 2), "value.0.": (mean, 1),

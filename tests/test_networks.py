@@ -17,7 +17,7 @@ from coop.common.settings.config import NETWORK_KINDS, NetworkSettings, RunConfi
 from coop.common.settings.tables import validated
 from coop.common.types import EnvSpec
 from coop.evaluation.evaluate import evaluate_checkpoint
-from coop.learner.edl.graph import Graph
+from coop.learner.edl.autograd_backprop import AutogradBackprop
 from coop.lockstep.lockstep import Lockstep
 from coop.records.kept import load_learner
 from coop.records.resumption import survey
@@ -118,7 +118,7 @@ def test_every_method_trains_it_the_same_way_for_a_seed_and_after_a_resume(
         _play(resumed, directory, 20)
         resumed.save(directory)
     resumed.env.close()
-    assert isinstance(whole.agent._networks[0]._trained.chain, Graph)
+    assert isinstance(whole.agent._networks[0]._trained.backprop, AutogradBackprop)
     for network, same, initial in zip(whole.agent.networks, resumed.agent.networks, before, strict=True):
         assert torch.equal(network.flat, same.flat)
         assert torch.isfinite(network.flat).all()

@@ -54,10 +54,10 @@ EVICTION = EvictionPolicy("most-drawn", MostDrawn)
 SAMPLER = SamplingPolicy("newest", make_newest)
 """
 RULES = """
-from coop.learner.methods.rule import Rule
+from coop.learner.methods.rule import UpdateRule
 
 
-class Soft(Rule):
+class Soft(UpdateRule):
     def bootstrap(self, next_values, preferred):
         weight = self.config.own.weight
         return weight * next_values.max(1) + (1 - weight) * next_values.mean(1)

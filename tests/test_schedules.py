@@ -38,7 +38,7 @@ def test_epsilon(decay: str, env_step: int, expected: float) -> None:
 )
 def test_exploration_rate(stepwise: bool, update: int, expected: float) -> None:
     settings = EdlSettings(rate=0.1, decay=0.5, decay_every=10, decay_stepwise=stepwise)
-    assert schedules.exploration_rate(settings, update) == pytest.approx(expected)
+    assert schedules.feedback_scale(settings, update) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

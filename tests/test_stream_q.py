@@ -273,7 +273,7 @@ def test_stacked_pictures_are_shown_oldest_first() -> None:
 
 def test_what_metrics_read_of_the_agent() -> None:
     agent = linear_agent()
-    assert (agent.exploration_rate(), agent.state()["acting"], agent.device) == (0.0, 0, torch.device("cpu"))
+    assert (agent.feedback_scale(), agent.state()["acting"], agent.device) == (0.0, 0, torch.device("cpu"))
     assert agent.loss.cost(np.array([2.0], np.float32)) == pytest.approx([2.0])
     values = np.array([[1.0, 3.0]], np.float32)
     assert agent.rule.bootstrap(values, values) == pytest.approx([3.0])

@@ -108,7 +108,7 @@ def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
     assert [row.number for row in rows] == [0, 1, 2]
     assert [row.record.end.episode_return for row in rows] == [5.0, 7.0, 9.0]
     assert [row.update for row in rows] == [1, 1, 1]
-    assert rows[0].s == trainer.agent.exploration_rate() > 0
+    assert rows[0].s == trainer.agent.feedback_scale() > 0
     assert trainer.telemetry.return_mean == 7.0
     assert trainer.drawn.inserted == 210
     assert trainer.drawn.episodes == ()

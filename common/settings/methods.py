@@ -20,8 +20,8 @@ class Method:
         two_networks: two independent networks, each of which gives the other's targets; their roles swap every C
             updates. If False, the second network is a copy of the first, made every C updates, and gives the targets.
         error_driven: error-driven learning feeds the error back; if False, the ordinary gradient does.
-        rule: of the targets and the extra cost: a `coop.learner.methods.rule.Rule`, or "module:Class" to import it in
-            the learner only.
+        rule: of the targets and the extra cost: a `coop.learner.methods.rule.UpdateRule`, or
+            "module:Class" to import it in the learner only.
         network: makes the Q-network, with the arguments and result of `coop.common.networks.network.build_network`;
             "module:function" to import it where networks are made.
         stream: for a method without a replay buffer, its agent, a class like
@@ -36,7 +36,7 @@ class Method:
     summary: str
     two_networks: bool = False
     error_driven: bool = False
-    rule: str | Callable[..., Any] = "coop.learner.methods.rule:Rule"
+    rule: str | Callable[..., Any] = "coop.learner.methods.rule:UpdateRule"
     network: str | Callable[..., Any] = "coop.common.networks.network:build_network"
     stream: str | Callable[..., Any] | None = None
     settings: type[Any] | None = None

@@ -22,7 +22,7 @@ def linear(start: float, final: float, progress: float) -> float:
     return final + (start - final) * max(0.0, 1.0 - progress)
 
 
-def exploration_rate(settings: EdlSettings, update: int) -> float:
+def feedback_scale(settings: EdlSettings, update: int) -> float:
     """The paper's s before any N(0, 1) draw: rate * decay^(update / decay_every), with integer powers if stepwise."""
     power = update // settings.decay_every if settings.decay_stepwise else update / settings.decay_every
     return settings.rate * float(settings.decay**power)

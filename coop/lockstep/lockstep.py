@@ -18,7 +18,7 @@ from coop.common.process.randomness import generator_state, set_generator_state
 from coop.common.settings.config import RunConfig
 from coop.common.types import EpisodeRecord
 from coop.learner.trainer import Effects, Trainer
-from coop.lockstep.memory import make_memory
+from coop.lockstep.memory import make_experience
 from coop.records.checkpoints import REPLAY
 from coop.records.kept import fitting, save_epoch
 from coop.records.resumption import Whole
@@ -41,7 +41,7 @@ class Lockstep:
         self.config = config
         self.step = 0
         self.env = make_vector_env(config.env, 1, int(env_seed.generate_state(1)[0]))
-        self.agent, self.memory = make_memory(config, self.env.spec)
+        self.agent, self.memory = make_experience(config, self.env.spec)
         self.trainer = Trainer(self.agent, time.monotonic())
         self._policy_rng = np.random.default_rng(policy_seed)
         first, second = self.agent.networks

@@ -26,7 +26,7 @@ from coop.replay.core import ReplayCore
 from coop.replay.persistence.storage import Mark, load_snapshot, save_snapshot
 
 
-class Memory(Protocol):
+class Experience(Protocol):
     """The way from steps to batches."""
 
     def begin(self, obs: Array) -> None:
@@ -54,13 +54,13 @@ class Memory(Protocol):
         """Restore what `save` stored; raises UsageError if that is no longer whole."""
 
 
-def make_memory(config: RunConfig, spec: EnvSpec) -> tuple[AnyAgent, Memory]:
+def make_experience(config: RunConfig, spec: EnvSpec) -> tuple[AnyAgent, Experience]:
     """The agent of a run's method, and the memory that it learns from."""
     stream = METHODS.get(config.method).stream
     if stream is None:
         return Agent(config, spec), TableMemory(config, spec)
     agent = loaded(stream, f"method {config.method!r}")(config, spec)
-    return agent, NoMemory(agent)
+    return agent, LatestTransition(agent)
 
 
 class TableMemory:
@@ -81,12 +81,12 @@ class TableMemory:
         self.begin = self._segments.begin
 
     def add(self, turn: Turn, step: int) -> None:
-        """See `Memory`."""
+        """See `Experience`."""
         for segment in self._cut(turn, turn.version, step):
             self.table.insert(segment)
 
     def follow(self, turn: Turn, step: int) -> None:
-        """See `Memory`: the table is restored from its snapshot."""
+        """See `Experience`: the table is restored from its snapshot."""
         self._cut(turn, self._updates_by(step - 1), step)
 
     def _cut(self, turn: Turn, version: int, step: int) -> list[Segment]:
@@ -97,7 +97,7 @@ class TableMemory:
         return segments
 
     def batches(self, step: int) -> Iterator[Batch]:
-        """See `Memory`."""
+        """See `Experience`."""
         for _ in range(self._due(step)):
             yield self.table.sample(self._config.learner.batch_size)
 
@@ -111,7 +111,7 @@ class TableMemory:
         return math.floor(settings.ratio * max(0, step - settings.learning_starts))
 
     def counters(self) -> dict[str, int]:
-        """See `Memory`."""
+        """See `Experience`."""
         table = self.table
         return {
             "size": len(table),
@@ -121,18 +121,18 @@ class TableMemory:
         }
 
     def save(self, folder: Path, mark: Mark) -> None:
-        """See `Memory`."""
+        """See `Experience`."""
         save_snapshot(self._core.snapshot(mark.number), threading.Condition(), folder, mark)
 
     def load(self, folder: Path, mark: Mark) -> None:
-        """See `Memory`."""
+        """See `Experience`."""
         try:
             load_snapshot(self._core, folder, mark.run_id, mark.number)
         except Damaged as damaged:
             raise UsageError(f"{folder}: {damaged}") from damaged
 
 
-class NoMemory:
+class LatestTransition:
     """The newest transition alone, of which the agent learns once."""
 
     def __init__(self, agent: StreamAgent) -> None:
@@ -145,20 +145,20 @@ class NoMemory:
         self._ones = np.ones(1, np.float32), np.ones(1, np.int32), np.ones(1, np.uint8)
 
     def begin(self, obs: Array) -> None:
-        """See `Memory`."""
+        """See `Experience`."""
         self._obs = obs
         self._agent.begin(obs[0])
 
     def add(self, turn: Turn, step: int) -> None:
-        """See `Memory`."""
+        """See `Experience`."""
         self._turn = turn
 
     def follow(self, turn: Turn, step: int) -> None:
-        """See `Memory`."""
+        """See `Experience`."""
         self._obs = turn.steps.obs
 
     def batches(self, step: int) -> Iterator[Batch]:
-        """See `Memory`."""
+        """See `Experience`."""
         turn, steps = self._turn, self._turn.steps
         frames = np.concatenate((self._obs, steps.next_obs)).reshape(-1, *self._spec.frame_shape)
         self._obs = steps.obs
@@ -171,14 +171,14 @@ class NoMemory:
         )  # fmt: skip
 
     def counters(self) -> dict[str, int]:
-        """See `Memory`."""
+        """See `Experience`."""
         return {}
 
     def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
-        """See `Memory`."""
+        """See `Experience`."""
 
     def save(self, folder: Path, mark: Mark) -> None:
-        """See `Memory`."""
+        """See `Experience`."""
 
     def load(self, folder: Path, mark: Mark) -> None:
-        """See `Memory`."""
+        """See `Experience`."""

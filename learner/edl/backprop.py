@@ -1,158 +1,102 @@
-"""A hand-written forward and backward for Linear, Conv2d, ReLU and Flatten in PyTorch, without autograd."""
+"""What a feedback rule asks of a network: one forward pass, recorded, and the products of backpropagation."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Generic
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself uses
-from torch import Tensor, nn
 
-from coop.common.networks.network import layer_functions
-from coop.learner.edl.arrays import in_dtype
-from coop.learner.edl.passes import Passes, Tape, UnsupportedLayerError
-
-Parametrised = nn.Linear | nn.Conv2d
+from coop.common.errors import UsageError
+from coop.learner.edl.arrays import ArrayT
 
 
-class Chain(Passes[Tensor]):
-    """The steps of a network, checked once, and the products of backpropagation.
+class UnsupportedLayerError(UsageError, ValueError):
+    """A layer has no meaning in these passes; the message names it."""
 
-    names: prefix of the parameters' names of each step. parametrised: indices of the Linear and Conv2d steps.
+
+@dataclass(slots=True)
+class Tape(Generic[ArrayT]):
+    """The activations of one forward pass, for the backward passes.
+
+    output: [batch, actions]. inputs: the input of each step, [batch, *shape], images channels last.
     """
 
-    def __init__(self, network: nn.Module) -> None:
-        """Raise UnsupportedLayerError for any other layer, and for unsupported options of a known one."""
-        leaves = list(_leaves(network, ""))
-        for name, step in leaves:
-            _check(name.removesuffix("."), step)
-        self.names = [name for name, _ in leaves]
-        self._steps = [step for _, step in leaves]
-        self._functions = layer_functions(self._steps)
-        # Looking up a module's attribute costs as much as a small product, so the parameters are kept here.
-        self._weights = [step.weight if isinstance(step, Parametrised) else None for step in self._steps]
-        self._biases = [step.bias if isinstance(step, Parametrised) else None for step in self._steps]
-        self.parametrised = [i for i, weight in enumerate(self._weights) if weight is not None]
-        held = sum(self._biases[i] is not None for i in self.parametrised) + len(self.parametrised)
-        if not self.parametrised or len(list(network.parameters())) < held:
-            raise UnsupportedLayerError("the network must hold parameters, and none twice")
+    output: ArrayT
+    inputs: list[ArrayT]
+
+    def head(self, batch: int) -> Tape[ArrayT]:
+        """The tape of the first `batch` samples."""
+        return Tape(self.output[:batch], [x[:batch] for x in self.inputs])
+
+    def output_of(self, index: int) -> ArrayT:
+        """The output of step `index`: [batch, *shape]; if a ReLU follows, only its shape and sign are valid."""
+        return self.inputs[index + 1] if index + 1 < len(self.inputs) else self.output
+
+
+@dataclass(frozen=True, slots=True)
+class Subspace:
+    """The actions' directions that one layer reaches, where its T(i) [A, n] lacks rank for every input and weight.
+
+    basis: [A, k], orthonormal columns, whose span holds every T(i)'s. outside: [A, A], the projection on its
+    complement. rank: the largest rank of T(i), at most k.
+    """
+
+    basis: torch.Tensor
+    outside: torch.Tensor
+    rank: int
+
+
+class Backprop(ABC, Generic[ArrayT]):
+    """The forward and backward passes of one network, in arrays of one library; it consists of steps, in order.
+
+    names: prefix of the parameters' names of each step. parametrised: indices of the steps that feedback trains.
+    """
+
+    names: list[str]
+    parametrised: list[int]
 
     @property
-    def output_weight(self) -> Tensor | None:
-        """The weight [actions, n] of the last step, None if that is not Linear."""
-        return self._weights[-1] if isinstance(self._steps[-1], nn.Linear) else None
+    @abstractmethod
+    def output_weight(self) -> ArrayT | None:
+        """The weight [actions, n] of a Linear layer whose output is the network's; None if there is none."""
 
-    def forward(self, x: Tensor) -> Tape[Tensor]:
-        """Run the network on x, float [batch, *input]."""
-        inputs: list[Tensor] = []
-        if x.dim() == 4:
-            x = x.contiguous(memory_format=torch.channels_last)
-        with torch.no_grad():
-            for function in self._functions:
-                inputs.append(x)
-                x = function(x)
-        return Tape(x, inputs)
+    @abstractmethod
+    def forward(self, x: ArrayT) -> Tape[ArrayT]:
+        """Run the network on x, <float>[batch, *input]."""
 
-    def walk(
-        self, tape: Tape[Tensor], cotangent: Tensor, dtype: torch.dtype | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
+    @abstractmethod
+    def cotangents(
+        self, tape: Tape[ArrayT], cotangent: ArrayT, dtype: torch.dtype | None = None
+    ) -> Iterator[tuple[int, ArrayT]]:
         """Propagate cotangents of the output to every pre-activation: (step, [b, k, *output of step]), last first.
 
         cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
-        share, and then stays 1 until a ReLU makes samples differ. dtype: of the computation, the network's if None.
+        share. dtype: of the computation, the network's if None.
         """
-        rows = cotangent
-        fresh = False  # whether `rows` may be overwritten
-        first = self.parametrised[0]
-        for index in reversed(range(len(self._steps))):
-            step, weight, h = self._steps[index], self._weights[index], tape.inputs[index]
-            if weight is not None:
-                yield index, rows
-                if index == first:
-                    return
-                weight = in_dtype(weight, dtype)
-                rows = _transposed(step, rows, weight, h) if isinstance(step, nn.Conv2d) else rows @ weight
-                fresh = True
-            elif isinstance(step, nn.ReLU):
-                rows = _masked(rows, tape.output_of(index), fresh)
-                fresh = True
-            elif h.dim() == 4:
-                pictures = rows.reshape(-1, *h.shape[1:]).contiguous(memory_format=torch.channels_last)
-                rows = pictures.view(*rows.shape[:2], *h.shape[1:])
-            else:
-                rows = rows.view(*rows.shape[:2], *h.shape[1:])
 
-    def write(self, tape: Tape[Tensor], index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
+    @abstractmethod
+    def write_gradients(self, tape: Tape[ArrayT], index: int, delta: ArrayT, out: Mapping[str, ArrayT]) -> None:
         """Write the gradients of step `index`'s parameters, given delta [batch, *output] at its pre-activation."""
-        step, bias, name = self._steps[index], self._biases[index], self.names[index]
-        h = tape.inputs[index]
-        if isinstance(step, nn.Linear):
-            torch.mm(delta.t(), h, out=out[name + "weight"])
-            if bias is not None:
-                torch.sum(delta, 0, out=out[name + "bias"])
-        elif isinstance(step, nn.Conv2d):
-            _, weight_grad, bias_grad = torch.ops.aten.convolution_backward(
-                delta, h, self._weights[index], [step.out_channels], step.stride, step.padding, step.dilation,
-                False, [0, 0], step.groups, [False, True, bias is not None],
-            )  # fmt: skip
-            out[name + "weight"].copy_(weight_grad)
-            if bias is not None:
-                out[name + "bias"].copy_(bias_grad)
+
+    def write_rest(self, tape: Tape[ArrayT], error: ArrayT, out: Mapping[str, ArrayT]) -> None:
+        """Write the ordinary gradients of the parameters outside the steps; most have none.
+
+        error: [batch, actions], at the output.
+        """
+
+    def range_of(self, index: int) -> Subspace | None:
+        """The range of T of step `index`; None if some weights and inputs give it full rank."""
+        return None
 
     @staticmethod
-    def gram(t: Tensor) -> Tensor:
+    @abstractmethod
+    def gram(t: ArrayT) -> ArrayT:
         """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
-        return torch.bmm(t, t.mT)
 
     @staticmethod
-    def combine(weights: Tensor, t: Tensor) -> Tensor:
+    @abstractmethod
+    def combine(weights: ArrayT, t: ArrayT) -> ArrayT:
         """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""
-        if len(t) < len(weights):
-            return weights @ t[0]
-        if weights.shape[1] == 2:
-            (v, w), (first, second) = weights.unsqueeze(-1).unbind(1), t.unbind(1)
-            return torch.addcmul(v * first, w, second)
-        return torch.bmm(weights.unsqueeze(1), t).squeeze(1)
-
-
-def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:
-    """Propagate cotangents [b, k, *shape] through a ReLU whose output is `activation` [batch, *shape]."""
-    if rows.shape[1] == 1 or rows.is_cuda:
-        masked: Tensor = torch.ops.aten.threshold_backward(rows, activation.unsqueeze(1), 0)
-        return masked
-    mask = activation.sign().to(rows.dtype).unsqueeze(1)  # a ReLU's output is never negative
-    return rows.mul_(mask) if in_place and rows.shape[0] == mask.shape[0] else rows * mask
-
-
-def _transposed(conv: nn.Conv2d, rows: Tensor, weight: Tensor, h: Tensor) -> Tensor:
-    """Propagate cotangents [b, k, *output] through a convolution of h [batch, *input]: [b, k, *input]."""
-    spare = [
-        h.shape[2 + i] + 2 * int(conv.padding[i]) - conv.dilation[i] * (conv.kernel_size[i] - 1) - 1
-        - (rows.shape[3 + i] - 1) * conv.stride[i]
-        for i in (0, 1)
-    ]  # fmt: skip
-    padding = [int(p) for p in conv.padding]
-    pictures = F.conv_transpose2d(
-        rows.flatten(0, 1), weight, None, conv.stride, padding, spare, conv.groups, conv.dilation
-    )
-    return pictures.view(*rows.shape[:2], *pictures.shape[1:])
-
-
-def _leaves(module: nn.Module, prefix: str) -> Iterator[tuple[str, nn.Module]]:
-    """Yield (prefix of parameter names, layer) in order, including those of nested Sequentials."""
-    if type(module) is not nn.Sequential:  # a subclass may have a forward of its own
-        yield prefix, module
-        return
-    for name, child in module._modules.items():
-        if child is not None:
-            yield from _leaves(child, f"{prefix}{name}.")
-
-
-def _check(name: str, step: nn.Module) -> None:
-    if type(step) not in (nn.Linear, nn.Conv2d, nn.ReLU, nn.Flatten):
-        kind = type(step).__name__
-        raise UnsupportedLayerError(f"layer {name!r} is a {kind}; handled are Linear, Conv2d, ReLU and Flatten")
-    if isinstance(step, nn.Flatten) and (step.start_dim, step.end_dim) != (1, -1):
-        raise UnsupportedLayerError(f"layer {name!r}: a Flatten must start at dimension 1 and end at -1")
-    if isinstance(step, nn.Conv2d) and (step.padding_mode != "zeros" or isinstance(step.padding, str)):
-        raise UnsupportedLayerError(f"layer {name!r}: a Conv2d must pad with zeros, by a given size")

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from coop.learner.edl import kernels
-from coop.learner.edl.passes import Range
+from coop.learner.edl.backprop import Subspace
 from coop.learner.edl.polar import inverse_root
 
 _EXACT = 2**18  # numbers in a layer's T up to which its Gram matrices are computed in float64
@@ -28,7 +28,7 @@ class Jacobians:
     which the rows have been multiplied. batch: number of samples.
     """
 
-    def __init__(self, ts: Sequence[Tensor], ranges: Sequence[Range | None], basis: Tensor, batch: int) -> None:
+    def __init__(self, ts: Sequence[Tensor], ranges: Sequence[Subspace | None], basis: Tensor, batch: int) -> None:
         self._ts, self._basis, self._batch = ts, basis, batch
         # The kernels compute Gram matrices of their own.
         self._fused = kernels.fits(ts, batch) and all(reach is None for reach in ranges)
@@ -77,7 +77,7 @@ class _Layer:
     completable: T can be completed to more rank.
     """
 
-    def __init__(self, t: Tensor, reach: Range | None, basis: Tensor) -> None:
+    def __init__(self, t: Tensor, reach: Subspace | None, basis: Tensor) -> None:
         actions, width = t.shape[1:]
         exact = t.dtype == torch.float64 or t.numel() <= _EXACT
         self._t = t

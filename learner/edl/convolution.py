@@ -9,20 +9,20 @@ import torch
 
 from coop.common.networks.convolution import product
 from coop.common.types import Array
-from coop.learner.edl.dense import DenseChain
-from coop.learner.edl.passes import Tape
+from coop.learner.edl.backprop import Tape
+from coop.learner.edl.numpy_backprop import NumpyBackprop
 
 
-class ConvolutionChain(DenseChain):
+class ConvolutionBackprop(NumpyBackprop):
     """The products of backpropagation for a `ConvolutionNetwork`; the outputs of every step are [batch, n].
 
     The convolution comes first, so nothing is propagated through it. The tape holds `ConvolutionNetwork.activations`.
     """
 
-    def walk(
+    def cotangents(
         self, tape: Tape[Array], cotangent: Array, dtype: torch.dtype | None = None
     ) -> Iterator[tuple[int, Array]]:
-        """As `Chain.walk`: (layer, cotangents [b, k, n] of its pre-activation), last first; in the network's dtype."""
+        """As `TorchBackprop.cotangents`, in the network's dtype: (layer, cotangents [b, k, n] of its outputs)."""
         rows = cotangent
         for index in reversed(self.parametrised):
             yield index, rows
@@ -38,7 +38,7 @@ class ConvolutionChain(DenseChain):
                 mask = np.ascontiguousarray(h > 0).astype(h.dtype)
                 rows = (np.multiply(rows, mask, out=rows) if b == len(mask) else rows * mask).swapaxes(0, 1)
 
-    def write(self, tape: Tape[Array], index: int, delta: Array, out: Mapping[str, Array]) -> None:
+    def write_gradients(self, tape: Tape[Array], index: int, delta: Array, out: Mapping[str, Array]) -> None:
         """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its pre-activation."""
         weight, bias = (out[self.names[index] + kind] for kind in ("weight", "bias"))
         h = tape.inputs[index]

@@ -9,8 +9,8 @@ orthogonal polar factor P(i) = U V^T,
 
 Other code calls `edl_gradients` and `feedback_matrices`. A learner keeps one `FeedbackRule` per network:
 
-    rule = FeedbackRule(make_passes(network, x), feedback="transform")
-    tape = rule.chain.forward(x)                # tape.output: [batch, actions]
+    rule = FeedbackRule(make_backprop(network, x), feedback="transform")
+    tape = rule.backprop.forward(x)                # tape.output: [batch, actions]
     rule.backward(tape, error, s, out)          # overwrites out[name], e.g. FlatNetwork.gradients
 
 With s = 0, or feedback "none", backward is plain backpropagation and costs one gradient.
@@ -29,9 +29,9 @@ from torch import Tensor, nn
 
 from coop.common.process.memory import keep_freed_memory
 from coop.learner.edl.arrays import ArrayT, at_least_float32, convert_like
+from coop.learner.edl.backprop import Backprop, Tape
 from coop.learner.edl.beside import Branches
-from coop.learner.edl.layers import make_passes
-from coop.learner.edl.passes import Passes, Tape
+from coop.learner.edl.layers import make_backprop
 from coop.learner.edl.polar import polar, polar_of_product
 from coop.learner.edl.transforms import Transforms
 
@@ -41,18 +41,18 @@ FEEDBACKS = ("none", "transform", "weight-gradient", "random")
 class FeedbackRule(Generic[ArrayT]):
     """The backward pass of one network under one feedback.
 
-    chain: the passes of the network, in PyTorch or in numpy; all arrays are of the same library.
+    backprop: the passes of the network, in PyTorch or in numpy; all arrays are of the same library.
     feedback: "none" (backpropagation), "transform" (the equations above), "weight-gradient" (backpropagation, then
         U (S + s I) V^T of each weight gradient; biases plain) or "random" (fixed B(i), direct feedback alignment).
     seed: of the fixed matrices of "random".
     rng: draws the completion of rank-deficient gradients for "weight-gradient" (default: a generator from `seed`).
     """
 
-    chain: Passes[ArrayT]
+    backprop: Backprop[ArrayT]
 
     def __init__(
         self,
-        chain: Passes[ArrayT],
+        backprop: Backprop[ArrayT],
         feedback: str = "transform",
         seed: int = 0,
         rng: np.random.Generator | None = None,
@@ -60,7 +60,7 @@ class FeedbackRule(Generic[ArrayT]):
         if feedback not in FEEDBACKS:
             raise ValueError(f"feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
         keep_freed_memory()
-        self.chain = chain
+        self.backprop = backprop
         self.feedback = feedback
         self._seed = seed
         self._rng = rng or np.random.default_rng(seed)
@@ -69,36 +69,36 @@ class FeedbackRule(Generic[ArrayT]):
     def backward(self, tape: Tape[ArrayT], error: ArrayT, s: Any, out: Mapping[str, ArrayT]) -> None:  # noqa: ANN401
         """Write one gradient per named parameter into `out`.
 
-        tape: of the chain's forward pass. error: [batch, actions], the output error e, already divided by the batch
+        tape: of the backprop's forward pass. error: [batch, actions], the output error e, already divided by the batch
         size. s: the exploration rate, a number, or a tensor of one on the network's device, whose value then decides
         nothing. The caller disables autograd and numpy's warnings of non-finite values.
         """
         branches = Branches(error)  # of each layer's parameters beside the others and what passes between layers
         for index, delta in self._feedback(tape, error, s):
-            branches.run(partial(self.chain.write, tape, index, delta, out), delta)
+            branches.run(partial(self.backprop.write_gradients, tape, index, delta, out), delta)
             if self.feedback == "weight-gradient" and _given(s):
-                gradient = out[self.chain.names[index] + "weight"]
+                gradient = out[self.backprop.names[index] + "weight"]
                 gradient += s * _polar_of_gradient(gradient, delta, tape.inputs[index], self._rng)
         branches.join()
-        self.chain.write_rest(tape, error, out)
+        self.backprop.write_rest(tape, error, out)
 
     def _feedback(self, tape: Tape[ArrayT], error: ArrayT, s: Any) -> Iterator[tuple[int, ArrayT]]:  # noqa: ANN401
         """Yield (step, what it is sent [batch, *output of step])."""
         if self.feedback == "random":
-            yield from ((index, self._aligned(tape, index, error)) for index in self.chain.parametrised)
+            yield from ((index, self._aligned(tape, index, error)) for index in self.backprop.parametrised)
         elif self.feedback == "transform" and _given(s):  # sigma(i) = T(i)^T (I + s G(i)^(-1/2)) e
-            yield from Transforms(self.chain, tape).apply_feedback(error, s)
+            yield from Transforms(self.backprop, tape).apply_feedback(error, s)
         else:
-            yield from ((index, delta[:, 0]) for index, delta in self.chain.walk(tape, error[:, None]))
+            yield from ((index, delta[:, 0]) for index, delta in self.backprop.cotangents(tape, error[:, None]))
 
     def _aligned(self, tape: Tape[ArrayT], index: int, error: ArrayT) -> ArrayT:
         """B(i)^T e with the fixed B(i) of layer `index`; that of a last layer is the identity, like T(d)."""
         shape = tape.output_of(index).shape
-        if index == self.chain.parametrised[-1] and math.prod(shape) == math.prod(error.shape):
+        if index == self.backprop.parametrised[-1] and math.prod(shape) == math.prod(error.shape):
             return error.reshape(shape)
         if index not in self._fixed:
             size = math.prod(shape[1:])
-            layer = self.chain.parametrised.index(index)
+            layer = self.backprop.parametrised.index(index)
             generator = torch.Generator().manual_seed(self._seed * 1000 + layer)
             draw = torch.randn(error.shape[1], size, generator=generator, dtype=torch.float64) / math.sqrt(size)
             self._fixed[index] = convert_like(draw, error)
@@ -137,10 +137,10 @@ def edl_gradients(
     exploration rate. feedback, seed: see FeedbackRule. Raises UnsupportedLayerError, which names the
     layer, for a network on which the feedback has no meaning.
     """
-    chain = make_passes(network, None if feedback == "none" else obs)
+    backprop = make_backprop(network, None if feedback == "none" else obs)
     out = {name: torch.empty_like(p) for name, p in network.named_parameters()}
     with torch.no_grad():
-        FeedbackRule(chain, feedback, seed).backward(chain.forward(obs), output_error, s, out)
+        FeedbackRule(backprop, feedback, seed).backward(backprop.forward(obs), output_error, s, out)
     return out
 
 
@@ -149,7 +149,7 @@ def feedback_matrices(network: nn.Module, obs: Tensor, s: float) -> dict[str, Te
 
     n_i counts layer i's pre-activations, in the order [channels, height, width] for a convolution.
     """
-    chain = make_passes(network, obs)
+    backprop = make_backprop(network, obs)
     with torch.no_grad():
-        found = Transforms(chain, chain.forward(obs)).matrices(s)
-    return {chain.names[index].removesuffix("."): b for index, b in reversed(found)}
+        found = Transforms(backprop, backprop.forward(obs)).matrices(s)
+    return {backprop.names[index].removesuffix("."): b for index, b in reversed(found)}

@@ -11,16 +11,16 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from coop.common.networks.custom import state_problems
-from coop.learner.edl.backprop import Chain
-from coop.learner.edl.graph import Call, Graph, Layer, record
-from coop.learner.edl.passes import Passes, Range, UnsupportedLayerError
+from coop.learner.edl.autograd_backprop import AutogradBackprop, Call, Layer, record
+from coop.learner.edl.backprop import Backprop, Subspace, UnsupportedLayerError
+from coop.learner.edl.torch_backprop import TorchBackprop
 
 _ROUNDING = 1e-5  # of singular values of T in float32, relative to the largest
 _TRIALS = 3
 _SAMPLES = 8  # of an example
 
 
-def make_passes(module: nn.Module, example: Tensor | None) -> Passes[Tensor]:
+def make_backprop(module: nn.Module, example: Tensor | None) -> Backprop[Tensor]:
     """The hand-written chain for a plain stack of Linear, Conv2d, ReLU and Flatten; autograd for any other module.
 
     example: float [batch, *input], on which the module is tried; None if it is trained by ordinary gradients only.
@@ -29,12 +29,12 @@ def make_passes(module: nn.Module, example: Tensor | None) -> Passes[Tensor]:
         UnsupportedLayerError: error-driven feedback has no meaning for a layer.
     """
     try:
-        return Chain(module)
+        return TorchBackprop(module)
     except UnsupportedLayerError:
-        return Graph(module) if example is None else _examined(module, example[:_SAMPLES])
+        return AutogradBackprop(module) if example is None else _examined(module, example[:_SAMPLES])
 
 
-def _examined(module: nn.Module, x: Tensor) -> Graph:
+def _examined(module: nn.Module, x: Tensor) -> AutogradBackprop:
     """The passes with feedback for each Linear and Conv2d that the output depends on."""
     if problem := next(state_problems(module), None):
         raise UnsupportedLayerError(problem)
@@ -48,7 +48,7 @@ def _examined(module: nn.Module, x: Tensor) -> Graph:
         raise UnsupportedLayerError("no Linear or Conv2d layer takes error-driven feedback")
     last = layers[-1]
     ends = isinstance(last.module, nn.Linear) and trials[0].ends_with(last)
-    return Graph(module, [replace(layer, range=_range(trials, layer)) for layer in layers], ends=ends)
+    return AutogradBackprop(module, [replace(layer, range=_range(trials, layer)) for layer in layers], ends=ends)
 
 
 def _candidates(module: nn.Module) -> Iterator[Layer]:
@@ -135,7 +135,7 @@ class _Trial:
         return rows.movedim(0, 1).flatten(2).double().nan_to_num()
 
 
-def _range(trials: Sequence[_Trial], layer: Layer) -> Range | None:
+def _range(trials: Sequence[_Trial], layer: Layer) -> Subspace | None:
     """The range of the layer's T; None if T has full rank for some weights."""
     ts = torch.cat([trial.transforms(layer) for trial in trials])
     grams = ts @ ts.mT
@@ -147,7 +147,7 @@ def _range(trials: Sequence[_Trial], layer: Layer) -> Range | None:
     if basis.shape[1] == actions and rank == min(actions, width):
         return None
     outside = torch.eye(actions).to(basis) - basis @ basis.mT
-    return Range(basis.to(layer.module.weight), outside.to(layer.module.weight), rank)
+    return Subspace(basis.to(layer.module.weight), outside.to(layer.module.weight), rank)
 
 
 def _named(layer: Layer) -> str:

@@ -12,10 +12,10 @@ from coop.common.networks.convolution import ConvolutionNetwork
 from coop.common.networks.dense import Dense
 from coop.common.networks.network import FlatNetwork
 from coop.learner.edl.arrays import AnyArray, convert_like
-from coop.learner.edl.convolution import ConvolutionChain
-from coop.learner.edl.dense import DenseChain
-from coop.learner.edl.layers import make_passes
-from coop.learner.edl.passes import Passes
+from coop.learner.edl.backprop import Backprop
+from coop.learner.edl.convolution import ConvolutionBackprop
+from coop.learner.edl.layers import make_backprop
+from coop.learner.edl.numpy_backprop import NumpyBackprop
 
 
 class Trainable:
@@ -23,18 +23,18 @@ class Trainable:
 
     theta, gradient: <float>[P], in the order of the network's layout, for the optimizer; of numpy for small networks.
     gradients: name -> view of `gradient` in the shape of the parameter, of the library of the passes.
-    chain: the network's forward and backward passes. values: its forward pass alone.
+    backprop: the network's forward and backward passes. values: its forward pass alone.
 
     Its users do not know the library, so the type checker does not see it here; inside the passes it does.
     """
 
-    chain: Passes[Any]
+    backprop: Backprop[Any]
     values: Callable[[Any], Any]
     theta: Any
     gradient: Any
 
     def __init__(self, network: FlatNetwork, in_numpy: bool, example: Tensor | None) -> None:
-        """in_numpy: use numpy if the network has a form in numpy. example: see `make_passes`, which may raise."""
+        """in_numpy: use numpy if the network has a form in numpy. example: see `make_backprop`, which may raise."""
         form = network.in_numpy if in_numpy and isinstance(network.in_numpy, Dense) else None
         self.in_numpy = form is not None
         self.values = form or network
@@ -44,13 +44,13 @@ class Trainable:
         self.gradients = network.views(in_passes)
         match form:
             case None:
-                self.chain = make_passes(network.module, example)
+                self.backprop = make_backprop(network.module, example)
             case ConvolutionNetwork():
-                self.chain = ConvolutionChain(form)
+                self.backprop = ConvolutionBackprop(form)
                 # With many parameters, PyTorch's fused operations are worth their calls.
                 self.theta, self.gradient = theta, gradient
             case _:
-                self.chain = DenseChain(form)
+                self.backprop = NumpyBackprop(form)
 
     def cast(self, array: AnyArray) -> Any:  # noqa: ANN401
         """Convert an array of either library for this network's passes."""

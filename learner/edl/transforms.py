@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from coop.learner.edl.arrays import ArrayT, Namespace, at_least_float32, convert_like, in_dtype, namespace, widened
+from coop.learner.edl.backprop import Backprop, Tape
 from coop.learner.edl.completed import Jacobians
-from coop.learner.edl.passes import Passes, Tape
 from coop.learner.edl.polar import polar_by_svd, whitened
 
 _SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
@@ -25,27 +25,27 @@ class Transforms(Generic[ArrayT]):
     share most of their gradient; Q separates this part from the differences, which keeps the Gram matrices accurate in
     the network's own dtype. T of a final Linear layer is the identity and is not held.
 
-    The polar factor of a T that lacks rank by construction (see `Range`) is the thin one, which stays in T's range.
+    The polar factor of a T that lacks rank by construction (see `Subspace`) is the thin one, which stays in T's range.
 
     For arrays of numpy, samples without an accurate Gram matrix are found and get an SVD each. For tensors no value
     decides what is computed (see `coop.learner.edl.completed`).
     """
 
-    _chain: Passes[ArrayT]
+    _backprop: Backprop[ArrayT]
     _basis: ArrayT
     _dtype: Any
     _batch: int
     _actions: int
     _ts: list[ArrayT]
 
-    def __init__(self, chain: Passes[ArrayT], tape: Tape[ArrayT]) -> None:
+    def __init__(self, backprop: Backprop[ArrayT], tape: Tape[ArrayT]) -> None:
         """T(i) has the network's dtype; the algebra on them uses at least float32."""
-        self._chain = chain
+        self._backprop = backprop
         self._batch, self._actions = tape.output.shape
         self._dtype = tape.output.dtype
-        self._basis = _basis(chain.output_weight, at_least_float32(tape.output))
-        walk = chain.walk(tape, in_dtype(self._basis[None], self._dtype))
-        self._linear_end = next(walk)[0] if chain.output_weight is not None else None
+        self._basis = _basis(backprop.output_weight, at_least_float32(tape.output))
+        walk = backprop.cotangents(tape, in_dtype(self._basis[None], self._dtype))
+        self._linear_end = next(walk)[0] if backprop.output_weight is not None else None
         # The layers held, last first: step, shape of its output, and T as [batch or 1, A, n].
         self._layers: list[tuple[int, tuple[int, ...]]] = []
         self._ts = []
@@ -53,7 +53,7 @@ class Transforms(Generic[ArrayT]):
             self._layers.append((index, t.shape[2:]))
             flat = _flat(t)
             self._ts.append(flat if flat.dtype == self._basis.dtype else convert_like(flat, self._basis))
-        self._ranges = [chain.range_of(index) for index, _ in self._layers]
+        self._ranges = [backprop.range_of(index) for index, _ in self._layers]
 
     def apply_feedback(self, error: ArrayT, s: Any) -> Iterator[tuple[int, ArrayT]]:  # noqa: ANN401
         """Yield (step, B(i)^T e) for each layer, last first: error [batch, A] -> [batch, *shape].
@@ -73,7 +73,7 @@ class Transforms(Generic[ArrayT]):
         white, doubtful = whitened(self._grams(), e)
         weights = e + s * white
         for i, (index, shape) in enumerate(self._layers):
-            sigma = self._chain.combine(weights[i], self._ts[i])
+            sigma = self._backprop.combine(weights[i], self._ts[i])
             if doubtful is not None and doubtful[i].any():
                 where = doubtful[i]
                 sigma[where] += s * (e[where][:, None] @ self._by_svd(i, where))[:, 0]
@@ -119,7 +119,7 @@ class Transforms(Generic[ArrayT]):
 
     def _gram(self, i: int) -> ArrayT:
         """G of the i-th layer held: [batch or 1, A, A]."""
-        gram: ArrayT = self._chain.gram(self._ts[i])
+        gram: ArrayT = self._backprop.gram(self._ts[i])
         return gram
 
     def _by_svd(self, i: int, where: ArrayT) -> ArrayT:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from coop.common.settings.config import RunConfig
 from coop.common.settings.medqn import MedqnSettings
 from coop.learner.edl.arrays import AnyArray
-from coop.learner.methods.rule import Rule
+from coop.learner.methods.rule import UpdateRule
 from coop.learner.qnetwork import QNetwork, as_float32, on_host
 
 Bounds = NDArray[np.float32]
 
 
-class Consolidation(Rule):
+class Consolidation(UpdateRule):
     """Keeps the network near its target network: cost lambda * mean over states of sum_a (Q(s, a) - Q_target(s, a))^2.
 
     Attributes:
@@ -38,7 +38,7 @@ class Consolidation(Rule):
         return start + (end - start) * min(1.0, update / self.config.planned_updates)
 
     def add_cost(self, online: QNetwork, target: QNetwork, inputs: AnyArray, update: int) -> None:
-        """See `Rule`."""
+        """See `UpdateRule`."""
         obs = inputs[: len(inputs) // 2]
         states = obs if self.settings.states == "real" else self._draw(inputs, len(obs))
         tape = online.forward(states)
@@ -55,9 +55,9 @@ class Consolidation(Rule):
         return states
 
     def state(self) -> dict[str, Any]:
-        """See `Rule`."""
+        """See `UpdateRule`."""
         return {"low": torch.tensor(self.low), "high": torch.tensor(self.high)}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """See `Rule`."""
+        """See `UpdateRule`."""
         self.low, self.high = state["low"].numpy(), state["high"].numpy()

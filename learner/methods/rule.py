@@ -11,7 +11,7 @@ from coop.learner.edl.arrays import AnyArray, ArrayT, chosen
 from coop.learner.qnetwork import QNetwork
 
 
-class Rule:
+class UpdateRule:
     """What a method changes in the update; this one, of the paper's four methods, changes nothing.
 
     A class of its own gets the values in numpy. With `on_device = True` it gets the arrays of the networks, numpy's

@@ -18,7 +18,7 @@ from coop.common.types import Array, Batch, EnvSpec
 from coop.learner.agent import Update
 from coop.learner.losses import LOSSES, Values
 from coop.learner.methods.moments import RewardScale, RunningMoments
-from coop.learner.methods.rule import Rule
+from coop.learner.methods.rule import UpdateRule
 from coop.learner.methods.traces import Traces, bounded_step
 from coop.learner.qnetwork import make_network
 
@@ -61,7 +61,7 @@ class StreamAgent:
         self.updates = 0
         self._settings = config.own
         self.device = torch.device("cpu")
-        self.rule = Rule(config, np.random.default_rng(0))  # which draws no numbers
+        self.rule = UpdateRule(config, np.random.default_rng(0))  # which draws no numbers
         self._network = make_network(config, spec, 0, self.device)
         assert isinstance(self._network.in_numpy, NormalisedNetwork)
         self._form = self._network.in_numpy
@@ -117,7 +117,7 @@ class StreamAgent:
         progress = env_step / (settings.epsilon_share * self.config.total_steps)
         return schedules.linear(settings.epsilon_start, settings.epsilon_final, progress)
 
-    def exploration_rate(self) -> float:
+    def feedback_scale(self) -> float:
         """The scale of s: 0, as the ordinary gradient is taken."""
         return 0.0
 

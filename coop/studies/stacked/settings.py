@@ -111,7 +111,7 @@ class StackSettings:
     def exploration_rates(self) -> Floats:
         """The share of the first s at each update, before a draw from N(0, 1): float64 [updates]."""
         ours = cast(Any, _Scaled(self))
-        return np.array([schedules.exploration_rate(ours, update) for update in range(self.updates)])
+        return np.array([schedules.feedback_scale(ours, update) for update in range(self.updates)])
 
     @cached_property
     def corrections(self) -> tuple[Floats, Floats]:

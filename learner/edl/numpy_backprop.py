@@ -1,4 +1,4 @@
-"""Forward and backward passes of Linear and ReLU networks in numpy, the counterpart of `backprop.Chain`."""
+"""Forward and backward passes of Linear and ReLU networks in numpy, the counterpart of `TorchBackprop`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 
 from coop.common.networks.dense import Dense
 from coop.common.types import Array
-from coop.learner.edl.passes import Passes, Tape
+from coop.learner.edl.backprop import Backprop, Tape
 
 
-class DenseChain(Passes[Array]):
-    """The products of backpropagation, like `Chain`; a step is a Linear layer with its ReLU."""
+class NumpyBackprop(Backprop[Array]):
+    """The products of backpropagation, like `TorchBackprop`; a step is a Linear layer with its ReLU."""
 
     def __init__(self, network: Dense) -> None:
         self._network = network
@@ -30,10 +30,10 @@ class DenseChain(Passes[Array]):
         *inputs, output = self._network.activations(x)
         return Tape(output, inputs)
 
-    def walk(
+    def cotangents(
         self, tape: Tape[Array], cotangent: Array, dtype: torch.dtype | None = None
     ) -> Iterator[tuple[int, Array]]:
-        """As `Chain.walk`: (layer, cotangents [b, k, n] of its pre-activation), last first; in the network's dtype."""
+        """As `TorchBackprop.cotangents`, in the network's dtype: (layer, cotangents [b, k, n] of its outputs)."""
         rows = cotangent
         for index in reversed(self.parametrised):
             yield index, rows
@@ -46,7 +46,7 @@ class DenseChain(Passes[Array]):
                 else:
                     rows = rows * mask
 
-    def write(self, tape: Tape[Array], index: int, delta: Array, out: Mapping[str, Array]) -> None:
+    def write_gradients(self, tape: Tape[Array], index: int, delta: Array, out: Mapping[str, Array]) -> None:
         """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its pre-activation."""
         np.dot(delta.T, tape.inputs[index], out=out[self.names[index] + "weight"])
         np.add.reduce(delta, 0, out=out[self.names[index] + "bias"])

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from coop.learner.edl.backprop import Chain
-from coop.learner.edl.passes import Passes, Range, Tape, UnsupportedLayerError
+from coop.learner.edl.backprop import Backprop, Subspace, Tape, UnsupportedLayerError
+from coop.learner.edl.torch_backprop import TorchBackprop
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class Layer:
 
     name: str
     module: nn.Module
-    range: Range | None = None
+    range: Subspace | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class GraphTape(Tape[Tensor]):
     root: Tensor
     outputs: list[Tensor]
     x: Tensor
-    graph: Graph
+    graph: AutogradBackprop
 
     def head(self, batch: int) -> GraphTape:
         """The tape of the first `batch` samples, recorded again: backward passes go through whole graphs only."""
@@ -73,7 +73,7 @@ class GraphTape(Tape[Tensor]):
         return self.outputs[index]
 
 
-class Graph(Passes[Tensor]):
+class AutogradBackprop(Backprop[Tensor]):
     """The passes of a module; its steps are layers that take feedback, all other parameters are the rest."""
 
     def __init__(self, module: nn.Module, layers: Sequence[Layer] = (), *, ends: bool = False) -> None:
@@ -102,10 +102,10 @@ class Graph(Passes[Tensor]):
             root.detach(), [step.input.detach() for step in steps], root, [step.output for step in steps], x, self
         )
 
-    def walk(
+    def cotangents(
         self, tape: Tape[Tensor], cotangent: Tensor, dtype: torch.dtype | None = None
     ) -> Iterator[tuple[int, Tensor]]:
-        """As `Passes.walk`, in the network's dtype, with outputs flattened: [b, k, n]."""
+        """As `Backprop.cotangents`, in the network's dtype, with outputs flattened: [b, k, n]."""
         tape = _recorded(tape)
         inner = self.parametrised
         if self._ends:
@@ -122,7 +122,7 @@ class Graph(Passes[Tensor]):
         for index, gradient in zip(reversed(inner), reversed(found), strict=True):
             yield index, gradient.movedim(0, 1).flatten(2)
 
-    def write(self, tape: Tape[Tensor], index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
+    def write_gradients(self, tape: Tape[Tensor], index: int, delta: Tensor, out: Mapping[str, Tensor]) -> None:
         """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its output."""
         layer, output, name = self._layers[index].module, tape.output_of(index), self.names[index]
         if isinstance(layer, nn.Linear):  # its products cost less than autograd's calls
@@ -139,12 +139,12 @@ class Graph(Passes[Tensor]):
         if self._rest:
             _write_gradients(_recorded(tape).root, self._rest, error, out)
 
-    def range_of(self, index: int) -> Range | None:
+    def range_of(self, index: int) -> Subspace | None:
         """The range of T of layer `index`."""
         return self._layers[index].range
 
-    gram = staticmethod(Chain.gram)
-    combine = staticmethod(Chain.combine)
+    gram = staticmethod(TorchBackprop.gram)
+    combine = staticmethod(TorchBackprop.combine)
 
 
 def _recorded(tape: Tape[Tensor]) -> GraphTape:
