@@ -13,6 +13,7 @@ from typing import Any
 
 from coop.common.errors import RunError
 from coop.common.process.notices import warn
+from coop.common.process.untrusted import read_bytes
 from coop.records.checkpoints import (
     Damaged,
     check_record,
@@ -53,7 +54,7 @@ def read_lines(path: Path) -> list[str]:
         FileNotFoundError: there is none.
     """
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except FileNotFoundError:
         raise
     except OSError as error:

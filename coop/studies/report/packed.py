@@ -26,7 +26,7 @@ from coop.common.errors import RunError, UsageError
 from coop.common.numbers import exact
 from coop.common.process.files import sync_folder, write_atomic
 from coop.common.process.notices import warn
-from coop.common.process.untrusted import check_links, check_run_name
+from coop.common.process.untrusted import MAX_SETTINGS, check_links, check_run_name, page_sizes, read_text
 from coop.records.evaluations import EVALUATIONS
 from coop.records.summaries import parse_summary, summary_text
 from coop.studies.report.columns import (
@@ -237,12 +237,14 @@ def _read_bounded(content: bytes) -> pa.Table:
     with pq.ParquetFile(pa.BufferReader(content)) as file:
         meta, leaves = file.metadata, file.schema
         columns = range(meta.num_columns)
-        values = sum(
-            meta.row_group(group).column(n).num_values for group in range(meta.num_row_groups) for n in columns
-        )
-        packed = sum(meta.row_group(group).total_byte_size for group in range(meta.num_row_groups))
+        values = packed = 0
+        for column in (meta.row_group(group).column(n) for group in range(meta.num_row_groups) for n in columns):
+            start = column.dictionary_page_offset or column.data_page_offset
+            pages = list(page_sizes(content, start, column.total_compressed_size))
+            values += max(column.num_values, sum(held for _, held in pages))
+            packed += sum(size for size, _ in pages)
         if 8 * values + packed > MAX_STUDY:
-            raise ValueError(f"{values:,} values; a study has at most {MAX_STUDY // 8:,}")
+            raise ValueError(f"{values:,} values, {packed:,} bytes; a study has at most {MAX_STUDY:,} bytes")
         texts = [leaves.column(n).path for n in columns if leaves.column(n).physical_type == "BYTE_ARRAY"]
     table = pq.ParquetFile(pa.BufferReader(content), read_dictionary=texts, page_checksum_verification=True).read()
     spread = sum(map(_spread, table.columns))
@@ -329,7 +331,7 @@ def check_content(path: Path, content: bytes) -> None:
             raise UsageError(f"{path}: wrong checksum: not what was packed")
         return
     sums = path.with_name(SUMS)
-    lines = sums.read_text(encoding="utf-8").splitlines() if sums.exists() else []
+    lines = read_text(sums, MAX_SETTINGS).splitlines() if sums.exists() else []
     listed = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
     if path.name not in listed:
         warn(f"{path}: has no checksum, as earlier versions wrote it")
