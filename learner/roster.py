@@ -17,6 +17,7 @@ from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.join import Join
 from coop.common.messaging.presence import LEASE
 from coop.common.process.files import sealed, unsealed, write_atomic
+from coop.common.process.untrusted import MAX_SETTINGS, read_bytes
 from coop.records.run_ids import check_owner
 
 ROSTER = "roster.json"
@@ -68,10 +69,10 @@ class Roster:
         self._actors: dict[int, int] = {}  # numbers of the actors known to this learner, by incarnation
         try:
             if self._path is not None and self._path.exists():
-                self._entries = _Entries(**json.loads(unsealed(self._path.read_bytes())))
+                self._entries = _Entries(**json.loads(unsealed(read_bytes(self._path, MAX_SETTINGS))))
                 check_owner(self._path, self._entries.run, run_id)
                 self._given = self._entries.actors
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError, RecursionError) as error:
             raise RunError(f"{self._path}: {error}") from error
 
     @property

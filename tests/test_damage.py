@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -28,11 +29,13 @@ from coop.evaluation.evaluate import evaluate_checkpoint
 from coop.evaluation.export import export
 from coop.records import checkpoints, resumption
 from coop.records.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, write_manifest
+from coop.records.locks import _place
 from coop.records.reading import read_csv, read_jsonl, read_lines
 from coop.records.resumption import survey
 from coop.replay.core import ReplayCore, Wait
 from coop.replay.persistence.epochs import ReplayEpochs
-from coop.replay.persistence.journal import HEADER_BYTES, Journal
+from coop.replay.persistence.journal import HEADER_BYTES, SEGMENT, Header, Journal
+from coop.replay.persistence.journal import _packed as packed_header
 from coop.replay.persistence.recovery import recover
 from coop.studies.report.packed import PackedStudy
 from coop.studies.report.packing import pack
@@ -77,7 +80,10 @@ def resume(run: Path, *flags: str) -> subprocess.CompletedProcess[str]:
 
 
 def lose(run: Path, what: str) -> None:
-    """Make every checkpoint unreadable in one way."""
+    """Make every checkpoint of a run that was killed unreadable in one way."""
+    for role in ("learner", "replay"):
+        with (run / f".{role}.lock").open("r+b") as lock:
+            lock.write(f"coop-lockstep on this host (pid 7)\n{'0' * 32}\n{_place(lock.fileno())}\n".encode())
     for folder in (run / "checkpoints").iterdir():
         match what:
             case "bit":
@@ -417,6 +423,26 @@ def test_a_damaged_record_costs_only_itself_and_is_counted(
     third = ReplayCore(AHEAD, spec)
     recover(third, tmp_path, 1, 5)
     assert (third.table.inserted, third.lost) == (28 - lost, lost), "the same loss, once"
+
+
+@pytest.mark.parametrize("length", [1 << 40, (1 << 28) + 1])
+def test_a_record_is_no_longer_than_a_message(length: int, spec: EnvSpec, tmp_path: Path) -> None:
+    """Whatever its header declares, and however much of nothing the file holds."""
+    path = tmp_path / "00000001.log"
+    _, at = _journal(spec, tmp_path)
+    header = Header(0, SEGMENT, 1, 3, 12, length)
+    with path.open("r+b") as file:
+        file.seek(at[2])
+        file.write(packed_header(header))
+        file.truncate(1 << 41)
+    tracemalloc.start()
+    twin = ReplayCore(AHEAD, spec)
+    _, told = recover(twin, tmp_path, 1, 5)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (twin.table.inserted, twin.lost) == (20, 4)
+    assert f"record 3 at byte {at[2]:,}, a segment, is damaged" in told[1]
+    assert most < 1 << 25
 
 
 def test_a_page_of_zeros_costs_what_it_covers(spec: EnvSpec, tmp_path: Path) -> None:

@@ -85,6 +85,16 @@ def test_a_roster_that_can_t_be_kept_or_read(tmp_path: Path) -> None:
     roster = Roster(tmp_path / "gone")
     with pytest.raises(RunError, match=r"roster\.json"):
         roster.actor(actor(1))
-    (tmp_path / "roster.json").write_text("{}x")
+    file = tmp_path / "roster.json"
+    file.write_text("{}x")
     with pytest.raises(RunError, match=r"roster\.json"):
         Roster(tmp_path)
+    file.unlink()
+    Roster(tmp_path).replay(replay(1), 0.0, {1})
+    content = file.read_text()
+    for damaged in (content.replace('"replays": 1', '"replays": 3'), content.replace("host1", "host2"), "{}"):
+        assert damaged != content
+        file.write_text(damaged)
+        with pytest.raises(RunError, match=r"roster\.json: wrong checksum"):
+            Roster(tmp_path)
+        assert file.read_text() == damaged

@@ -7,12 +7,14 @@ import shutil
 import sys
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import msgpack
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from commands import run_command
@@ -22,7 +24,7 @@ from coop.common.errors import RunError, UsageError
 from coop.common.imports import hand_over, import_module, permit, remember
 from coop.common.process import untrusted
 from coop.common.process.files import LineFile, measure, write_atomic
-from coop.common.process.untrusted import check_links, check_run_name, check_torch_file, load_array
+from coop.common.process.untrusted import check_links, check_run_name, check_torch_file, load_array, page_sizes
 from coop.common.settings.tables import sealed_toml
 from coop.records.checkpoints import read_manifest, write_manifest
 from coop.records.summaries import SUMMARY, read_summary, summary_text
@@ -277,8 +279,22 @@ def test_one_s_own_run_is_known_again(tmp_path: Path, monkeypatch: pytest.Monkey
         import_module("my_trained", "env.id")
 
 
+def rewritten_as(path: Path, how: int) -> None:
+    """Write an archive anew, with another compression."""
+    with zipfile.ZipFile(path) as whole:
+        entries = {entry.filename: whole.read(entry) for entry in whole.infolist()}
+    with zipfile.ZipFile(path, "w", how) as archive:
+        archive.writestr("filling", os.urandom(1 << 18), zipfile.ZIP_STORED)
+        for name, content in entries.items():
+            archive.writestr(name, content)
+
+
 def test_a_checkpoint_asks_for_no_more_than_it_holds(tmp_path: Path) -> None:
     path = tmp_path / "learner.pt"
+    torch.save({"networks": [torch.rand(1 << 16)]}, path)
+    rewritten_as(path, zipfile.ZIP_DEFLATED)
+    with pytest.raises(RunError, match="compressed"):  # although no entry is larger than the file
+        check_torch_file(path)
     torch.save({"networks": [torch.zeros(1 << 16)], "rest": (1, 2.5, None, "x", True)}, path)
     check_torch_file(path)
     with zipfile.ZipFile(path) as whole:
@@ -327,7 +343,7 @@ def test_a_study_is_measured_before_it_is_spread_out(tmp_path: Path, monkeypatch
     PackedStudy(path)
     monkeypatch.setattr(packed, "MAX_STUDY", 1 << 20)
     assert path.stat().st_size < 10_000
-    with pytest.raises(UsageError, match=r"not a packed study: 200,001 values"):
+    with pytest.raises(UsageError, match=r"not a packed study: 200,00\d values, \d+ bytes; a study has at most"):
         PackedStudy(path)
     texts = pa.array([["x" * 100_000] * 1_000], pa.list_(pa.string()))
     path.write_bytes(study_file(pa.table({"run": ["a"], "episodes.csv/actor": texts})))
@@ -338,13 +354,93 @@ def test_a_study_is_measured_before_it_is_spread_out(tmp_path: Path, monkeypatch
 
 def test_a_text_is_measured_before_it_is_read(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = a_copy(trained, tmp_path / "runs" / "one")
-    monkeypatch.setattr(untrusted.read_text, "__defaults__", (1 << 20,))
+    monkeypatch.setattr(untrusted, "MAX_TEXT", 1 << 20)
     with (run / "episodes.csv").open("r+b") as file:
         file.truncate(1 << 40)  # takes no space: such a file comes out of a small archive
     source = open_source(tmp_path / "runs")
     with pytest.raises(RunError, match="allowed: at most"):
         source.text("one", "episodes.csv")
     assert msgpack.packb(json.loads((run / "summary.json").read_text()))
+
+
+SPARSE = 1 << 40  # bytes that take no space
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("config.toml", "config.toml: has .* bytes; allowed: at most"),
+        ("run-id", "belongs to another run"),
+        ("evaluations.csv", "evaluations.csv: has .* bytes; allowed: at most"),
+        ("checkpoints/*/DONE", "DONE: .* bytes; allowed: at most"),
+        ("checkpoints/*/learner.pt", f"learner.pt: has {SPARSE:,} bytes instead of"),
+        ("checkpoints/*/replay/frames.npy", f"frames.npy: has {SPARSE:,} bytes instead of"),
+        ("metrics.jsonl", ""),  # cut back to what the checkpoint seals
+        ("summary.json", ""),  # not read where a checkpoint is
+    ],
+)
+def test_a_file_larger_than_memory_is_not_read(trained: Path, tmp_path: Path, place: str, said: str) -> None:
+    run = a_copy(trained, tmp_path / "runs" / "run")
+    (path,) = run.glob(place)
+    os.truncate(path, SPARSE)
+    done = run_command("coop-report", run.parent, "--out", tmp_path / "out")
+    assert "Traceback" not in done.stderr
+    done = run_command("coop-lockstep", "--resume", "--run-dir", run, "--total-steps", "300")
+    assert re.search(said, done.stderr), done.stderr
+    assert (done.returncode > 0, done.stderr.count("\n")) == (bool(said), int(bool(said))), done.stderr
+    assert path.stat().st_size == SPARSE or not said
+
+
+def varint(number: int, size: int) -> bytes:
+    """A positive integer in Thrift's compact protocol, in `size` bytes."""
+    sevens = [(2 * number >> 7 * place) & 127 | 128 for place in range(size)]
+    return bytes([*sevens[:-1], sevens[-1] & 127])
+
+
+@pytest.mark.parametrize(("field", "claimed"), [("size", 2**31 - 1), ("values", 2**27 - 1)])
+def test_a_page_is_no_larger_than_a_study(tmp_path: Path, field: str, claimed: int) -> None:
+    """Whatever the footer says: memory is taken for what a page's own header declares."""
+    path, count = tmp_path / "study.parquet", 40_000_000  # a number as long as the one that is claimed
+    lists = pa.LargeListArray.from_arrays([0, count], pa.array(np.zeros(count, np.int8))).cast(
+        pa.large_list(pa.int32())
+    )
+    table = pa.table({"run": ["a"], "metrics.jsonl/x": lists})
+    pq.write_table(
+        table, path, compression="zstd", use_dictionary=False, data_page_size=1 << 30, write_statistics=False
+    )
+    PackedStudy(path)
+    content = path.read_bytes()
+    size = next(size for size, held in pages(content) if held == count)
+    now, digits = (size, 5) if field == "size" else (count, 4)
+    old, new = varint(now, digits), varint(claimed, digits)
+    place = content.index(b"\x15" + old)
+    path.write_bytes(content[: place + 1] + new + content[place + 1 + len(old) :])
+    with pytest.raises(UsageError, match=r"not a packed study: [\d,]+ values, [\d,]+ bytes; a study has at most"):
+        PackedStudy(path)
+
+
+def pages(content: bytes) -> list[tuple[int, int]]:
+    """The pages of a study's last column."""
+    column = pq.ParquetFile(pa.BufferReader(content)).metadata.row_group(0).column(1)
+    start = column.dictionary_page_offset or column.data_page_offset
+    return list(page_sizes(content, start, column.total_compressed_size))
+
+
+def test_pages_that_are_none(tmp_path: Path) -> None:
+    path = tmp_path / "study.parquet"
+    pq.write_table(pa.table({"run": ["a"], "metrics.jsonl/x": [[1, 2, 3]]}), path)
+    content = path.read_bytes()
+    assert sum(held for _, held in pages(content)[-1:]) == 3
+    with pytest.raises(ValueError, match="outside of the file"):
+        list(page_sizes(content, 4, len(content)))
+    rng = np.random.default_rng(0)
+    for _ in range(3_000):
+        data = rng.integers(0, 256, 60, np.uint8).tobytes()
+        with suppress(ValueError):
+            list(page_sizes(data, 0, len(data)))
+    for bad in (b"\x15\x00\x15\x01\x15\x00\x00", b"\x15\x00\x15\x02\x15\x01\x00"):  # sizes of -1
+        with pytest.raises(ValueError, match="negative"):
+            list(page_sizes(bad, 0, len(bad)))
 
 
 def test_neither_a_pipe_nor_a_device_is_opened(trained: Path, tmp_path: Path) -> None:

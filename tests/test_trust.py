@@ -201,12 +201,18 @@ def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys
 IDLE = 500
 
 
+HELLO = bytes.fromhex("16030100cd010000c90303") + bytes(40)  # the beginning of a ClientHello of 210 bytes
+
+
 @contextmanager
-def idle(at: str, count: int = IDLE) -> Iterator[list[socket.socket]]:
-    """Connections that say nothing."""
+def idle(at: str, count: int = IDLE, words: bytes = b"") -> Iterator[list[socket.socket]]:
+    """Connections that say nothing, or no more than some words."""
     place = "127.0.0.1", int(at.rpartition(":")[2])
     with ExitStack() as stack:
-        yield [stack.enter_context(socket.create_connection(place)) for _ in range(count)]
+        silent = [stack.enter_context(socket.create_connection(place)) for _ in range(count)]
+        for each in silent:
+            each.sendall(words)
+        yield silent
 
 
 def seconds_to_join(run: tuple[str, str], config: Path | None) -> float:
@@ -220,12 +226,13 @@ def seconds_to_join(run: tuple[str, str], config: Path | None) -> float:
         return time.monotonic() - began
 
 
-def test_idle_connections_keep_nobody_out(run: tuple[str, str], keys: Path) -> None:
+@pytest.mark.parametrize("words", [b"", HELLO[:1], HELLO[:11], HELLO])
+def test_idle_connections_keep_nobody_out(words: bytes, run: tuple[str, str], keys: Path) -> None:
     """Neither while they are there, nor when their handshakes have taken too long, nor when they go."""
     with joined(run, keys / "replay.json5", "watch") as inside:
         with ExitStack() as stack:
             for at in run:
-                stack.enter_context(idle(at))
+                stack.enter_context(idle(at, words=words))
             assert seconds_to_join(run, keys / "actor.json5") < 5
             time.sleep(11)  # Zenoh gives a handshake 10 s
             assert seconds_to_join(run, keys / "actor.json5") < 5

@@ -35,22 +35,45 @@ _LINGER_OFF = struct.pack("ii", 0, 0)
 SILENCE = 3600  # seconds for which a connection may say nothing before the kernel hands it on all the same
 WAITING = 1 << 16  # connections that may wait so, as far as the system permits (net.core.somaxconn)
 _SO_ATTACH_FILTER, _SO_DETACH_FILTER = 26, 27
-# A filter of the listening socket's segments: it drops those that end a connection and carry nothing, which would also
-# hand the connection on. (code, jump if true, jump if false, operand) of classic BPF; byte 0 is the TCP header's first.
-_NO_SILENT_END = (
+# Filters of the listening socket's segments, as (code, jump if true, jump if false, operand) of classic BPF; byte 0 is
+# the TCP header's first. They drop what would hand a connection on that has nothing to say: an end without words, and
+# at a TLS listener also a ClientHello that is not all there, unless it is longer than a segment may be.
+_A_HELLO = 512  # bytes: what each link carries in one segment
+_WORDS = (  # of a segment: the header's length to X, that of the rest to A
+    (0x30, 0, 0, 12),
+    (0x74, 0, 0, 4),
+    (0x64, 0, 0, 2),  # four-byte words in bytes
+    (0x07, 0, 0, 0),
+    (0x80, 0, 0, 0),
+    (0x1C, 0, 0, 0),
+)
+_END = (
     (0x30, 0, 0, 13),  # load the flags
     (0x54, 0, 0, 1),  # FIN alone
-    (0x15, 7, 0, 0),  # not set: keep
-    (0x30, 0, 0, 12),  # load the header's length,
-    (0x74, 0, 0, 4),  # in words,
-    (0x64, 0, 0, 2),  # in bytes
-    (0x07, 0, 0, 0),
-    (0x80, 0, 0, 0),  # load the segment's length
-    (0x1C, 0, 0, 0),  # less the header's
-    (0x15, 1, 0, 0),  # nothing left: drop
+    (0x15, 0, 1, 0),  # set: drop
     (0x06, 0, 0, 0xFFFFFFFF),  # keep
     (0x06, 0, 0, 0),  # drop
 )
+_HELLO = (
+    (0x02, 0, 0, 0),  # store the length of the words
+    (0x50, 0, 0, 0),  # their first byte:
+    (0x15, 0, 14, 0x16),  # another than a handshake's: keep
+    (0x60, 0, 0, 0),
+    (0x35, 0, 13, 6),  # too short to say which one: drop
+    (0x50, 0, 0, 5),
+    (0x15, 0, 10, 1),  # no ClientHello: keep
+    (0x60, 0, 0, 0),
+    (0x35, 8, 0, _A_HELLO),  # keep
+    (0x48, 0, 0, 3),  # load the record's length
+    (0x04, 0, 0, 5),  # with its header
+    (0x07, 0, 0, 0),
+    (0x60, 0, 0, 0),
+    (0x3D, 3, 4, 0),  # not all there: drop
+)
+_FILTERS = {
+    "tcp": (*_WORDS, (0x15, 0, 3, 0), *_END),  # words: keep
+    "tls": (*_WORDS, (0x15, len(_HELLO), 0, 0), *_HELLO, *_END),
+}
 
 
 def described(session: zenoh.Session, mode: str = "peer") -> dict[str, Any]:
@@ -78,20 +101,21 @@ class _Instruction(ctypes.Structure):
 
 
 def wait_for_words(session: zenoh.Session, mode: str) -> None:
-    """Make the kernel keep new TCP connections to a session until their clients have sent something."""
-    ports = {int(at.rpartition(":")[2]) for at in described(session, mode).get("locators", ()) if _is_tcp(at)}
-    program = (_Instruction * len(_NO_SILENT_END))(*(_Instruction(*each) for each in _NO_SILENT_END))
-    packed = struct.pack("HP", len(program), ctypes.addressof(program))
+    """Make the kernel keep new TCP connections to a session until their clients have sent something.
+
+    Of TLS, what begins a handshake: all of a ClientHello.
+    """
+    places = (str(at).partition("/") for at in described(session, mode).get("locators", ()))
+    ports = {int(at.rpartition(":")[2]): _FILTERS[protocol] for protocol, _, at in places if protocol in _FILTERS}
     for opened in _tcp_sockets():
-        with contextlib.suppress(OSError):  # a kernel without these
-            if _listens(opened) and opened.getsockname()[1] in ports:
+        with contextlib.suppress(OSError, KeyError):  # a kernel without these, another's port
+            if _listens(opened):
+                filters = ports[opened.getsockname()[1]]
+                program = (_Instruction * len(filters))(*(_Instruction(*each) for each in filters))
+                packed = struct.pack("HP", len(program), ctypes.addressof(program))
                 opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
                 opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENCE)
                 opened.listen(WAITING)
-
-
-def _is_tcp(locator: str) -> bool:
-    return str(locator).partition("/")[0] in {"tcp", "tls"}
 
 
 def _listens(opened: socket.socket) -> bool:

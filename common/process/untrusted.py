@@ -6,6 +6,7 @@ compared with the bytes that are there before memory is taken for it.
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
 import re
@@ -124,12 +125,21 @@ def no_links(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
-def read_text(path: Path, most: int = MAX_TEXT) -> str:
-    """The text of a file; raises OSError, and RunError for a file of more than `most` bytes, before it is read."""
-    size = path.stat().st_size
+def read_bytes(path: Path, most: int | None = None) -> bytes:
+    """The content of a file of at most `most` bytes, MAX_TEXT by default.
+
+    Raises OSError, and RunError for a larger file before it is read: one that is empty for the most part takes no
+    space on a disk, or in an archive.
+    """
+    size, most = path.stat().st_size, MAX_TEXT if most is None else most
     if size > most:
         raise RunError(f"{path}: has {size:,} bytes; allowed: at most {most:,}")
-    return path.read_text(encoding="utf-8")
+    return path.read_bytes()
+
+
+def read_text(path: Path, most: int | None = None) -> str:
+    """The text of a file, with newlines as Python has them; raises as `read_bytes`, and UnicodeDecodeError."""
+    return io.TextIOWrapper(io.BytesIO(read_bytes(path, most)), encoding="utf-8").read()
 
 
 def load_array(path: Path, small: int) -> Array:
@@ -197,3 +207,73 @@ class _Described(pickle._Unpickler):  # in Python: it takes no memory in advance
 
 def _nothing(*_: Any) -> None:  # noqa: ANN401 (the arguments that make a tensor or the like)
     return None
+
+
+def page_sizes(content: bytes, start: int, length: int) -> Iterator[tuple[int, int]]:
+    """Bytes, once decompressed, and values of each page of a column in a Parquet file, as the page declares them.
+
+    start, length: of the column's pages in the file, in bytes. The file's footer says the same of whole columns, but
+    it is by the pages that memory is taken.
+
+    Raises ValueError if a page's header is none, or there are more than `MAX_ENTRIES` pages.
+    """
+    end = start + length
+    if not 0 <= start <= end <= len(content):
+        raise ValueError("a column outside of the file")
+    for _ in range(MAX_ENTRIES):
+        if start >= end:
+            return
+        try:
+            fields, start = _thrift(content, start)
+            size, packed = fields[2], fields[3]
+            values = sum(fields[kind].get(1, 0) for kind in (5, 7, 8) if kind in fields)
+        except (IndexError, KeyError, AttributeError, TypeError) as error:
+            raise ValueError("a page without a header") from error
+        if min(size, packed, values) < 0:
+            raise ValueError("a page of negative size")
+        yield size, values
+        start += packed
+    raise ValueError(f"more than {MAX_ENTRIES:,} pages in a column")
+
+
+def _thrift(content: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+    """The fields of a structure in Thrift's compact protocol, by number, and the place after it.
+
+    Integers and structures only: texts, which statistics have, are passed over, and lists no page's header has.
+    """
+    fields: dict[int, Any] = {}
+    number = 0
+    while code := content[at]:
+        at += 1
+        if code >> 4:
+            number += code >> 4
+        else:
+            number, at = _zigzag(content, at)
+        kind = code & 15
+        if kind in {4, 5, 6}:
+            fields[number], at = _zigzag(content, at)
+        elif kind == 8:
+            size, at = _varint(content, at)
+            at += size
+        elif kind == 12 and depth < 3:
+            fields[number], at = _thrift(content, at, depth + 1)
+        elif kind == 3:
+            at += 1
+        elif kind not in {1, 2}:  # booleans have no more bytes
+            raise ValueError("a page's header that is none")
+    return fields, at + 1
+
+
+def _varint(content: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while shift < 64:
+        byte = content[at]
+        value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
+        if byte < 128:
+            return value, at
+    raise ValueError("a number without an end")
+
+
+def _zigzag(content: bytes, at: int) -> tuple[int, int]:
+    value, at = _varint(content, at)
+    return value >> 1 ^ -(value & 1), at

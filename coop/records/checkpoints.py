@@ -29,6 +29,7 @@ from coop.common.process.files import (
     unsealed,
     write_atomic,
 )
+from coop.common.process.untrusted import MAX_SETTINGS, read_bytes
 from coop.records.summaries import SUMMARY, read_summary
 
 FOLDER = "checkpoints"
@@ -93,14 +94,14 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def read_manifest(folder: Path) -> Manifest:
     """Read `DONE`; raises Damaged."""
     try:
-        tables = json.loads(unsealed((folder / DONE).read_bytes()))
+        tables = json.loads(unsealed(read_bytes(folder / DONE, MAX_SETTINGS)))
         version = tables.pop("format")
         if version != FORMAT:
             raise Damaged(f"{DONE}: written by another version, format {version}; this one reads {FORMAT}")
         manifest = msgspec.convert(tables, Manifest)
     except FileNotFoundError:
         raise Damaged("not finished" if (folder / WRITING).exists() else f"{DONE} is missing") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, RunError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise Damaged(f"{DONE}: {reason(error)}") from error
     if strange := [name for name in manifest.files if not _FILE.fullmatch(name)]:
         raise Damaged(f"{DONE}: names {strange[0]!r}, which is no file of a checkpoint")
@@ -122,11 +123,12 @@ def check_part(folder: Path, number: int, run_id: int | None) -> Manifest:
         raise Damaged(f"{DONE}: belongs to another run")
     for name, written in manifest.files.items():
         try:
-            found = measure(folder / name)
+            size = (folder / name).stat().st_size
+            found = measure(folder / name, written.size)
         except OSError as error:
             raise Damaged(f"{name}: {reason(error)}") from error
-        if found.size != written.size:
-            raise Damaged(f"{name}: has {found.size:,} bytes instead of {written.size:,}")
+        if size != written.size:
+            raise Damaged(f"{name}: has {size:,} bytes instead of {written.size:,}")
         if found != written:
             raise Damaged(f"{name}: wrong checksum")
     return manifest

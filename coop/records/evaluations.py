@@ -13,6 +13,7 @@ from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.numbers import exact
 from coop.common.process.console import say
 from coop.common.process.files import LineFile, aside_folder
+from coop.common.process.untrusted import read_bytes
 
 EVALUATIONS = "evaluations.csv"
 Floats = NDArray[np.float64]
@@ -70,7 +71,7 @@ def _rows(path: Path, env_step: int) -> tuple[list[list[str]], list[int]]:
     if not path.exists():
         return [], []
     kept, bad = [], []
-    lines = path.read_bytes().decode(errors="replace").rpartition("\n")[0].splitlines()
+    lines = read_bytes(path).decode(errors="replace").rpartition("\n")[0].splitlines()
     for number, row in enumerate(list(csv.reader(lines))[1:], 2):
         if len(row) == len(FIELDS) and row[0].isdecimal():
             kept += [row] if int(row[0]) <= env_step else []

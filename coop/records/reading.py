@@ -13,7 +13,7 @@ from typing import Any
 
 from coop.common.errors import RunError, UsageError
 from coop.common.process.notices import warn
-from coop.common.process.untrusted import MAX_SETTINGS, read_text
+from coop.common.process.untrusted import MAX_SETTINGS, read_bytes, read_text
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import CONFIG, parse_run_config
 from coop.records.checkpoints import (
@@ -57,7 +57,7 @@ def read_lines(path: Path) -> list[str]:
         FileNotFoundError: there is none.
     """
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except FileNotFoundError:
         raise
     except OSError as error:

@@ -18,7 +18,7 @@ import msgspec
 
 from coop.common.errors import RunError, UsageError
 from coop.common.process.files import Measured, aside_folder, measure, move_aside, truncate
-from coop.common.process.untrusted import LEFT
+from coop.common.process.untrusted import LEFT, MAX_SETTINGS, read_bytes
 from coop.records.checkpoints import (
     DONE,
     EVALUATIONS,
@@ -296,7 +296,7 @@ def keep_from(run_dir: Path, number: int) -> str:
             record = run_dir / name
             record.touch()
             shutil.copy2(record, to / name)
-            lines = record.read_bytes()[: written.size]
+            lines = read_bytes(record)[: written.size]
             truncate(record, lines.rfind(b"\n") + 1)
             kept[name] = measure(record)
         fallback = f"checkpoint {number}: {'; '.join(problems)}"
@@ -343,7 +343,7 @@ def _has_lines(run_dir: Path) -> bool:
     for name in RECORDS:
         with suppress(OSError), (run_dir / name).open("rb") as file:
             if name.endswith(".csv"):
-                file.readline()
+                file.readline(MAX_SETTINGS)
             if file.read(1):
                 return True
     return False

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from coop.common.errors import RunError
 from coop.common.process.files import make_folder, write_atomic
+from coop.common.process.untrusted import MAX_SETTINGS, read_text
 
 RUN_ID = "run-id"
 
@@ -19,7 +20,7 @@ def read_run_id(folder: Path) -> int:
     """Read the id of the run in a directory; raises RunError."""
     path = folder / RUN_ID
     try:
-        return int(path.read_text(encoding="utf-8"))
+        return int(read_text(path, MAX_SETTINGS))
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: {error}") from error
 

@@ -12,6 +12,7 @@ from typing import Any
 from coop.common.errors import RunError
 from coop.common.numbers import finite, strict_json
 from coop.common.process.console import averaged_over
+from coop.common.process.untrusted import MAX_SETTINGS, read_text
 
 SUMMARY = "summary.json"
 _SEAL = "crc32"  # the last field
@@ -79,7 +80,7 @@ def read_summary(run_dir: Path) -> dict[str, Any]:
     """The contents of a run's summary.json; empty if the run has not ended. Raises RunError."""
     path = run_dir / SUMMARY
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, MAX_SETTINGS)
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError) as error:

@@ -18,6 +18,7 @@ from tensorboard.compat.proto.types_pb2 import DT_STRING
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 from coop.common.process.files import LineFile, write_atomic
+from coop.common.process.untrusted import read_bytes
 
 TAGS = {
     "env_steps_per_s": "charts/SPS",
@@ -151,7 +152,7 @@ def _cut_back(folder: Path, kept: Kept) -> None:
     """Drop what this run's earlier processes wrote and `kept` does not include, and records that a kill has torn."""
     counts, most = {EPISODE: 0, ROW: 0}, {EPISODE: kept.episodes, ROW: kept.rows}
     for path in sorted(folder.glob("events.out.tfevents.*")):
-        content = path.read_bytes()
+        content = read_bytes(path)
         events = list(_events(content))
         if all(tag != SETTINGS for _, tag, _ in events):
             continue  # somebody else's

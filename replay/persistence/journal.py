@@ -28,6 +28,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.process.files import check_guards, make_folder, sync_file, sync_folder
@@ -40,6 +41,7 @@ KINDS = ("the one that names it", "a segment", "a batch", "settings of the limit
 BEGIN_BYTES = 64  # more than the record that names a file
 ROLL_AT = 1 << 28  # bytes after which the next file begins
 SEARCHED = 1 << 20  # bytes at once
+LONGEST = ROLL_AT + 2 * MAX_PAYLOAD  # bytes of a file; what follows is none of this program's
 
 _MARK = b"\xc6coop\xf0rj"
 _FIELDS = struct.Struct("<IIIQQQ")  # of a Header
@@ -229,7 +231,7 @@ def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record | Lost]
     path = _path(folder, number)
     try:
         with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
+            size = min(os.fstat(file.fileno()).st_size, LONGEST)
             at = expected = 0
             while True:
                 header = _read_header(file, at, number)
@@ -242,7 +244,8 @@ def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record | Lost]
                     at, header = found
                 if header.place > expected:
                     yield Lost(f"{path}: {_places(expected, header.place)} before byte {at:,} can't be read")
-                payload = file.read(header.length) if at + HEADER_BYTES + header.length <= size else b""
+                fits = header.length <= MAX_PAYLOAD and at + HEADER_BYTES + header.length <= size
+                payload = file.read(header.length) if fits else b""
                 if len(payload) == header.length and _checksum(payload) == header.payload_checksum:
                     if header.kind == BEGIN:
                         _check_begin(path, payload, run_id)
@@ -304,7 +307,7 @@ def _find_header(file: BinaryIO, start: int, number: int, expected: int) -> tupl
             if header is not None and header.place >= expected:
                 return start + at, header
             at = piece.find(_MARK, at + 1)
-        if len(piece) < SEARCHED:
+        if len(piece) < SEARCHED or start > LONGEST:
             return None
         start += SEARCHED - len(_MARK) + 1
 

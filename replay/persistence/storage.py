@@ -18,7 +18,7 @@ from coop.common.errors import BadMessage, CoopError
 from coop.common.messaging import wire
 from coop.common.messaging.messages.sample import BatchReader, encode_batch
 from coop.common.process.files import PIECE, Measured, SyncedFile, make_folder, sync_folder
-from coop.common.process.untrusted import load_array
+from coop.common.process.untrusted import load_array, read_bytes
 from coop.common.types import Array, EpisodeEnd, EpisodeRecord
 from coop.records.checkpoints import Damaged, Manifest, check_part, read_manifest, remove, write_manifest
 from coop.records.run_ids import check_owner
@@ -103,7 +103,7 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int, number: int) -> Mar
     manifest = check_part(path, number, run_id)
     read = BatchReader(core.table.spec)
     try:
-        state: dict[str, Any] = msgpack.unpackb((path / STATE).read_bytes(), strict_map_key=False)
+        state: dict[str, Any] = msgpack.unpackb(read_bytes(path / STATE), strict_map_key=False)
         names = [name for name in manifest.files if name != STATE]
         arrays = {name.removesuffix(".npy"): _read_array(path / name) for name in names}
         replies = [read(wire.decode(payload)) for payload in state["replies"]]

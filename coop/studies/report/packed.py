@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from coop.common.errors import UsageError
-from coop.common.process.untrusted import check_run_name
+from coop.common.process.untrusted import check_run_name, page_sizes
 from coop.records.evaluations import EVALUATIONS
 
 SWEEP, CONFIG, SUMMARY, EPISODES, METRICS = "sweep.toml", "config.toml", "summary.json", "episodes.csv", "metrics.jsonl"
@@ -106,12 +106,14 @@ def _read_bounded(content: bytes) -> pa.Table:
     with pq.ParquetFile(pa.BufferReader(content)) as file:
         meta, leaves = file.metadata, file.schema
         columns = range(meta.num_columns)
-        values = sum(
-            meta.row_group(group).column(n).num_values for group in range(meta.num_row_groups) for n in columns
-        )
-        packed = sum(meta.row_group(group).total_byte_size for group in range(meta.num_row_groups))
+        values = packed = 0
+        for column in (meta.row_group(group).column(n) for group in range(meta.num_row_groups) for n in columns):
+            start = column.dictionary_page_offset or column.data_page_offset
+            pages = list(page_sizes(content, start, column.total_compressed_size))
+            values += max(column.num_values, sum(held for _, held in pages))
+            packed += sum(size for size, _ in pages)
         if 8 * values + packed > MAX_STUDY:
-            raise ValueError(f"{values:,} values; a study has at most {MAX_STUDY // 8:,}")
+            raise ValueError(f"{values:,} values, {packed:,} bytes; a study has at most {MAX_STUDY:,} bytes")
         texts = [leaves.column(n).path for n in columns if leaves.column(n).physical_type == "BYTE_ARRAY"]
     table = pq.ParquetFile(pa.BufferReader(content), read_dictionary=texts, page_checksum_verification=True).read()
     spread = sum(map(_spread, table.columns))

@@ -85,7 +85,7 @@ class CellFolder:
         """Read the progress from the end of episodes.csv; zeros before the first episode's end, or if it is damaged."""
         try:
             with (self.path / "episodes.csv").open("rb") as file:
-                header = file.readline().decode()
+                header = file.readline(TAIL).decode()
                 file.seek(max(len(header), os.fstat(file.fileno()).st_size - TAIL))
                 # The first and the last line of the tail may be incomplete.
                 lines = file.read().decode().rpartition("\n")[0].splitlines()[-RETURN_WINDOW:]
