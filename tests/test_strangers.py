@@ -405,16 +405,18 @@ def test_a_page_is_no_larger_than_a_study(tmp_path: Path, field: str, claimed: i
         pa.large_list(pa.int32())
     )
     table = pa.table({"run": ["a"], "metrics.jsonl/x": lists})
+    table = table.replace_schema_metadata({packed.SEAL: packed.UNSEALED})
     pq.write_table(
         table, path, compression="zstd", use_dictionary=False, data_page_size=1 << 30, write_statistics=False
     )
-    PackedStudy(path)
     content = path.read_bytes()
+    path.write_bytes(packed.sealed(content))
+    PackedStudy(path)
     size = next(size for size, held in pages(content) if held == count)
     now, digits = (size, 5) if field == "size" else (count, 4)
     old, new = varint(now, digits), varint(claimed, digits)
     place = content.index(b"\x15" + old)
-    path.write_bytes(content[: place + 1] + new + content[place + 1 + len(old) :])
+    path.write_bytes(packed.sealed(content[: place + 1] + new + content[place + 1 + len(old) :]))
     with pytest.raises(UsageError, match=r"not a packed study: [\d,]+ values, [\d,]+ bytes; a study has at most"):
         PackedStudy(path)
 
