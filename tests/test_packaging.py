@@ -2,6 +2,8 @@
 
 import os
 import re
+import subprocess
+import sys
 import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
@@ -35,6 +37,29 @@ def test_every_folder_of_the_package_is_installed_and_no_other_name() -> None:
     modules = [Path(folder, name) for folder, _, names in os.walk(ROOT / "coop", followlinks=True) for name in names]
     here = {path.parent.relative_to(ROOT).as_posix() for path in modules if path.suffix == ".py"}
     assert folders == here
+
+
+RESEARCH = """
+import common, experiments.study, learner, replay
+import coop
+run = coop.train(total_steps=60, run_dir="run")
+run.wait()
+print(common.WHOSE, experiments.study.WHOSE, learner.WHOSE, replay.WHOSE, sorted(set(sys.modules) & NAMES))
+print(coop.load("run").summary["exit"])
+"""
+
+
+def test_a_research_folder_with_the_names_of_rooms_works_beside_the_package(tmp_path: Path) -> None:
+    """Neither side imports the other's modules, and a folder named coop hides nothing."""
+    for name in ("common.py", "learner.py", "experiments/study.py", "replay/__init__.py", "actors.py", "deploy.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("WHOSE = 'ours'\n" if name[0] not in "ad" else "raise ValueError('theirs')\n")
+    (tmp_path / "coop").mkdir()
+    (tmp_path / "research.py").write_text(f"import sys\nNAMES = {{'actors', 'deploy'}}\n{RESEARCH}")
+    done = subprocess.run(
+        [sys.executable, "research.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
+    )
+    assert done.stdout.splitlines()[-2:] == ["ours ours ours ours []", "complete"], done.stderr
 
 
 def test_every_data_file_is_installed() -> None:

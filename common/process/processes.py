@@ -152,7 +152,7 @@ def command(name: str, *flags: str) -> list[str]:
     """
     path = Path(sysconfig.get_path("scripts")) / name
     found = str(path) if path.exists() else shutil.which(name)
-    return [*([found] if found else [sys.executable, "-m", "coop.deploy.commands", name]), *flags]
+    return [*([found] if found else [sys.executable, "-P", "-m", "coop.deploy.commands", name]), *flags]
 
 
 def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
