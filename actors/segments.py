@@ -52,6 +52,11 @@ class SegmentAssembler:
         self._sequences = [0] * num_envs
         self._steps = 0
 
+    @property
+    def waiting(self) -> int:
+        """Steps of each stream since the last flush."""
+        return self._steps
+
     def begin(self, obs: Array) -> None:
         """Store the first observations of all streams, <frame_dtype>[envs, *obs_shape]; call once, before `add`."""
         self._frames.restart(range(self._num_envs), obs)

@@ -17,7 +17,7 @@ from coop.common.settings.config import LearnerSettings
 from coop.learner.edl import kernels
 from coop.learner.edl.arrays import ArrayT, Namespace, assign, namespace
 
-_TINY = 1e-37  # below any square that matters, above the denormals
+TINY = 1e-37  # below any square that matters, above the denormals
 
 
 @dataclass(eq=False)
@@ -127,7 +127,7 @@ class Optimizer(ABC, Generic[ArrayT]):
 
     def _root(self, square: ArrayT) -> ArrayT:
         """sqrt(square) in the scratch memory; avoids 0 and denormals, whose roots take many times as long."""
-        scratch: ArrayT = self._xp.add(square, _TINY, out=self._scratch)
+        scratch: ArrayT = self._xp.add(square, TINY, out=self._scratch)
         return self._xp.sqrt(scratch, out=scratch)
 
 

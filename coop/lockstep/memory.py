@@ -80,6 +80,11 @@ class TableMemory:
         self.update_priorities = self.table.update_priorities
         self.begin = self._segments.begin
 
+    @property
+    def waiting(self) -> int:
+        """Steps since the last segment's end, which the table does not hold yet."""
+        return self._segments.waiting
+
     def add(self, turn: Turn, step: int) -> None:
         """See `Experience`."""
         for segment in self._cut(turn, turn.version, step):

@@ -29,7 +29,7 @@ PROGRESS_EVERY = 5.0  # seconds
 class LockstepRun:
     """A run that holds its directory's locks until `close`.
 
-    told: lines that say what it goes on from, and what was passed over or moved aside.
+    run: where it is. told: lines that say what it goes on from, and what was passed over or moved aside.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class LockstepRun:
         self._wandb = wandb
         if config.video_every:
             check_filmed(config.env)
-        self._run = Lockstep(config)
+        self.run = Lockstep(config)
         try:
             self._lock = RunLock(path, program, ("learner", "replay"))
         except RunError:
-            self._run.env.close()
+            self.run.env.close()
             raise
         try:
             settings = settings_digest(config)
@@ -68,9 +68,9 @@ class LockstepRun:
             )
             self._lock.sign()
             if self._found.newest is None:
-                load_initial_networks(self._run.agent)
+                load_initial_networks(self.run.agent)
             else:
-                self._run.restore(self._found.newest, replaying)
+                self.run.restore(self._found.newest, replaying)
                 self._found.newest.state.clear()  # only its memory
         except BaseException:
             self.close()
@@ -83,21 +83,25 @@ class LockstepRun:
             RunError: there is no space for the closing epoch or the summary.
             UsageError: Weights & Biases refuses.
         """
-        run, newest = self._run, self._found.newest
-        number = None if newest is None else newest.number
-        with RunDirectory(self.path, run.config, self._found, number, run.step, wandb=self._wandb) as directory:
+        with self.files() as directory:
             if directory.aside:
                 progress(directory.aside)
-            return play_lockstep(self._run, directory, stop, progress)
+            return play_lockstep(self.run, directory, stop, progress)
+
+    def files(self) -> RunDirectory:
+        """Open the run's files, to go on from where it is; raises as `RunDirectory`."""
+        run, newest = self.run, self._found.newest
+        number = None if newest is None else newest.number
+        return RunDirectory(self.path, run.config, self._found, number, run.step, wandb=self._wandb)
 
     @property
     def diverged(self) -> str:
         """How the run has diverged; empty if it has not."""
-        return self._run.trainer.diverged
+        return self.run.trainer.diverged
 
     def close(self) -> None:
         """Free the emulator and the locks."""
-        self._run.env.close()
+        self.run.env.close()
         self._lock.release()
 
 

@@ -28,7 +28,7 @@ class _Limits:
     ratio: float
 
 
-_LIMITS = {4: _Limits(1e-31, 3e2, 1e-11), 8: _Limits(1e-292, 1e6, 1e-9)}  # by bytes per number
+LIMITS = {4: _Limits(1e-31, 3e2, 1e-11), 8: _Limits(1e-292, 1e6, 1e-9)}  # by bytes per number
 
 
 def whitened(gram: ArrayT, e: ArrayT) -> tuple[ArrayT, ArrayT | None]:
@@ -40,7 +40,7 @@ def whitened(gram: ArrayT, e: ArrayT) -> tuple[ArrayT, ArrayT | None]:
     eps |C^(-1)| <= eps sum_i (C^(-1))_ii: rows of very different length do no harm, nearly parallel rows do.
     These sums are the variance inflation factors of statistics.
     """
-    limits = _LIMITS[gram.itemsize]
+    limits = LIMITS[gram.itemsize]
     if gram.shape[-1] == 2:
         white, doubtful = _whitened_pairs(gram, e, limits)
     else:

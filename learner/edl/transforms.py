@@ -14,7 +14,7 @@ from coop.learner.edl.backprop import Backprop, Tape
 from coop.learner.edl.completed import Jacobians
 from coop.learner.edl.polar import polar_by_svd, whitened
 
-_SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
+SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
 
 
 class Transforms(Generic[ArrayT]):
@@ -139,7 +139,7 @@ def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
     if isinstance(output, Tensor):
         return _mean_first(actions, output.dtype, output.device)
     if actions == 2:
-        return convert_like(_SUM_AND_DIFFERENCE, output)
+        return convert_like(SUM_AND_DIFFERENCE, output)
     if actions == 3 or output_weight is None:
         return convert_like(_reflection(actions), output)
     xp, w = namespace(output), widened(output_weight)
@@ -151,7 +151,7 @@ def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
 @cache
 def _mean_first(actions: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Q [A, A] on its device, where it is copied once."""
-    return (_SUM_AND_DIFFERENCE if actions == 2 else _reflection(actions)).to(device, dtype)
+    return (SUM_AND_DIFFERENCE if actions == 2 else _reflection(actions)).to(device, dtype)
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +17,10 @@ from coop.common.process.cli import parse
 from coop.common.process.console import say
 from coop.common.process.extras import check_extra
 from coop.common.process.lifecycle import Stop, run_main
+from coop.common.process.limits import cores
 from coop.common.suggestions import closest, refusal
 from coop.studies.sweep import slurm
+from coop.studies.sweep.beside import side_by_side
 from coop.studies.sweep.display import SweepDisplay
 from coop.studies.sweep.executor import Executor
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
@@ -37,7 +40,10 @@ class SweepOptions:
     quick: bool = False
     """Use the grid's small version, for two cores."""
     jobs: int | None = None
-    """Number of cells to run concurrently; the number of cores, or of the workers' threads, if not given."""
+    """Number of processes to run concurrently; the number of cores, or of the workers' threads, if not given."""
+    stack: int | None = None
+    """Seeds that one process plays side by side, to the byte as each by itself, where their settings allow that (extra
+    `fast`); 1: none; as many as keep all jobs busy if not given."""
     dir: Path | None = None
     """Folder of the sweep; runs/sweeps/GRID if not given."""
     cell: str | None = None
@@ -57,6 +63,8 @@ def _run() -> None:
     options = parse(SweepOptions, "coop-sweep", "Run every cell of a grid once.")
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: must be at least 1")
+    if options.stack is not None and options.stack < 1:
+        raise UsageError(f"--stack {options.stack}: must be at least 1")
     if options.dask is not None:
         if options.slurm:
             raise UsageError("--dask and --slurm: give one of them")
@@ -65,17 +73,22 @@ def _run() -> None:
     folder = options.dir or absolute(default_folder(options.grid, options.quick))
     cells = chosen(options, grid, folder)
     claim_folder(grid, cells, folder)
+    if (options.slurm or options.dask is not None) and (options.stack or 1) > 1:
+        say("--stack: on this machine only; each cell runs by itself")
     if options.slurm:
         left = [cell.cell.name for cell in cells if cell.ending() is None]
         print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
         return
-    with _executor(options, grid.file) as executor:
+    with _executor(options, grid.file, cells) as executor:
         _work(Runner(cells, executor), folder)
 
 
-def _executor(options: SweepOptions, grid: GridFile) -> AbstractContextManager[Executor]:
+def _executor(options: SweepOptions, grid: GridFile, folders: Sequence[CellFolder]) -> AbstractContextManager[Executor]:
     if options.dask is None:
-        return nullcontext(LocalProcesses(grid, options.jobs))
+        beside, reasons = side_by_side(grid, folders, options.jobs or cores(), options.stack)
+        for line in reasons if (options.stack or 1) > 1 else ():
+            say(f"--stack: {line}")
+        return nullcontext(LocalProcesses(grid, options.jobs, beside=beside))
     from coop.studies.sweep.dask import workers_at  # noqa: PLC0415 - takes a second, and may not be installed
 
     return workers_at(options.dask, grid, options.jobs)

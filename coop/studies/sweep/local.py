@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from types import MappingProxyType
 
+from coop.common.errors import RunError
 from coop.common.process.limits import cores
 from coop.common.process.processes import ChildProcess, command
 from coop.records.locks import RunLock
+from coop.studies.sweep.beside import Beside
 from coop.studies.sweep.folder import CellFolder, Ending
 from coop.studies.sweep.grid import GridFile
 
+TOGETHER = "coop.studies.stacked.together"  # the module that plays several cells
 # By default, the libraries that a run uses start a thread per core, and concurrent runs would starve each other.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -31,61 +37,104 @@ class LocalProcesses:
     Of several GPUs each cell with `learner.device = "cuda"` sees one, that with the fewest cells.
 
     Args:
-        jobs: number of cells to run concurrently; the number of cores of this job if None.
+        jobs: number of processes to run concurrently; the number of cores of this job if None.
+        beside: the cells that a cell's process plays side by side (see `side_by_side`).
         directory: working directory of the cells, where they find users' own modules; this process's if None.
     """
 
-    def __init__(self, grid: GridFile, jobs: int | None, directory: Path | None = None) -> None:
+    def __init__(
+        self,
+        grid: GridFile,
+        jobs: int | None,
+        directory: Path | None = None,
+        beside: Beside = MappingProxyType({}),
+    ) -> None:
         self._grid = grid
         self._jobs = jobs or cores()
         self._directory = directory
+        self._beside = beside
         self._processes: dict[str, ChildProcess] = {}
         self._locks: dict[str, RunLock] = {}
         self._cards: dict[str, str] = {}
 
     def slots(self) -> int:
         """See `Executor`."""
-        return self._jobs
+        return self._jobs + len(self._processes) - len(self._running())
+
+    def _running(self) -> set[ChildProcess]:
+        return set(self._processes.values())
 
     def start(self, folder: CellFolder) -> bool:
-        """See `Executor`."""
+        """See `Executor`. A cell that the process of another one has taken along counts as started."""
         name = folder.cell.name
-        lock = folder.lock()
-        if lock is None:
+        if name in self._processes:
+            return True
+        if len(self._running()) >= self._jobs:
             return False
+        locks: dict[str, RunLock] = {}
         try:
-            if folder.ending() is not None:
-                lock.release()
+            if not self._take(folder, locks):
                 return False
-            folder.prepare()
-            log, command = folder.path / "run.log", self._command(folder)
-            process = ChildProcess(name, command, log, lock.descriptors, self._environment(folder), self._directory)
+            taken = [folder, *(cell for cell in self._mates(name) if self._taken_along(cell, locks))]
+            log, inherited = folder.path / "run.log", tuple(d for lock in locks.values() for d in lock.descriptors)
+            environment = self._environment(folder)
+            process = ChildProcess(name, self._command(taken), log, inherited, environment, self._directory)
             process.start()
         except BaseException:
-            lock.release()
+            for lock in locks.values():
+                lock.release()
             raise
-        self._processes[name], self._locks[name] = process, lock
+        self._processes |= dict.fromkeys(locks, process)
+        self._locks |= locks
+        return True
+
+    def _mates(self, name: str) -> list[CellFolder]:
+        """The other cells that the process of a cell may play."""
+        return [cell for cell in self._beside.get(name, ()) if cell.cell.name not in (name, *self._processes)]
+
+    def _taken_along(self, folder: CellFolder, locks: dict[str, RunLock]) -> bool:
+        """As `_take`, but leave a cell that fails: it says why once it is started itself."""
+        try:
+            return self._take(folder, locks)
+        except (OSError, RunError):
+            if (lock := locks.pop(folder.cell.name, None)) is not None:
+                lock.release()
+            return False
+
+    def _take(self, folder: CellFolder, locks: dict[str, RunLock]) -> bool:
+        """Lock and prepare a cell; False if another process holds it or has ended it."""
+        lock = None if folder.ending() is not None else folder.lock()
+        if lock is None:
+            return False
+        locks[folder.cell.name] = lock
+        if folder.ending() is not None:
+            locks.pop(folder.cell.name).release()
+            return False
+        folder.prepare()
         return True
 
     def ending(self, folder: CellFolder) -> Ending | None:
         """See `Executor`."""
-        process = self._processes[folder.cell.name]
+        name = folder.cell.name
+        process = self._processes[name]
         status = process.exit_status()
         if status is None:
             return None
-        self._ended(folder.cell.name)
+        self._ended(name)
         ending = folder.ending()
-        if ending is None or (ending.kind == "finished" and status):
+        alone = name not in self._beside  # otherwise the status may be that of another cell
+        if ending is None or (ending.kind == "finished" and status and alone):
             why = process.why() if status else f"stopped early: {folder.outcome() or 'no summary.json'}"
             return Ending("failed", why)
         return ending
 
     def stop(self, seconds: float) -> None:
         """See `Executor`."""
-        for process in self._processes.values():
+        running = self._running()
+        for process in running:
             process.interrupt()
         deadline = time.monotonic() + seconds
-        for process in self._processes.values():
+        for process in running:
             process.end(max(0.0, deadline - time.monotonic()))
         for name in list(self._processes):
             self._ended(name)
@@ -107,7 +156,10 @@ class LocalProcesses:
         lock, status = self._locks.pop(name), self._processes.pop(name).exit_status()
         lock.release() if status is not None and status >= 0 else lock.hand_over()
 
-    def _command(self, folder: CellFolder) -> list[str]:
+    def _command(self, cells: Sequence[CellFolder]) -> list[str]:
+        if len(cells) > 1:
+            return [sys.executable, "-m", TOGETHER, *(str(cell.path) for cell in cells)]
+        (folder,) = cells
         # --resume also at the first start, so that a restarted run continues from its newest checkpoint.
         flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}", "--resume"]
         modules = [path.partition(":")[0] for path in folder.cell.config.imports.values()]

@@ -13,8 +13,10 @@ import tomli_w
 
 from coop.common.errors import UsageError
 from coop.common.places import absolute
+from coop.common.process.limits import cores
 from coop.common.settings.config import value_of
 from coop.records.summaries import read_summary
+from coop.studies.sweep.beside import side_by_side
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
 from coop.studies.sweep.grid import load_grid, parse_grid
 from coop.studies.sweep.local import LocalProcesses
@@ -45,13 +47,15 @@ def sweep(
     *,
     jobs: int | None = None,
     quick: bool = False,
+    stack: int | None = None,
 ) -> SweepResult:
     """Run every cell of a grid once, and wait; cells that were finished before are not repeated.
 
     Args:
         grid: name of a grid that comes with the package, path of a TOML file, or the contents of one.
         folder: of the sweep; runs/sweeps/GRID if not given.
-        jobs: cells to run concurrently; the number of cores if None.
+        jobs: processes to run concurrently; the number of cores if None.
+        stack: seeds that a process plays side by side, where their settings allow that; see `coop-sweep --stack`.
         quick: use the grid's small version.
 
     Raises:
@@ -59,6 +63,8 @@ def sweep(
     """
     if jobs is not None and jobs < 1:
         raise UsageError(f"jobs = {jobs}: must be at least 1")
+    if stack is not None and stack < 1:
+        raise UsageError(f"stack = {stack}: must be at least 1")
     if isinstance(grid, Mapping):
         if folder is None:
             raise UsageError("folder: a grid without a name needs one")
@@ -68,7 +74,8 @@ def sweep(
         path = absolute(default_folder(grid, quick) if folder is None else folder, "folder")
     cells = [CellFolder(path, cell) for cell in checked.cells]
     claim_folder(checked, cells, path)
-    runner = Runner(cells, LocalProcesses(checked.file, jobs))
+    beside, _ = side_by_side(checked.file, cells, jobs or cores(), stack)
+    runner = Runner(cells, LocalProcesses(checked.file, jobs, beside=beside))
     try:
         while not runner.done:
             runner.tick()

@@ -1,0 +1,333 @@
+"""The loops between the products of K updates, compiled by numba: the arithmetic of lockstep's numpy, to the bit.
+
+Each function works on a block of runs, the first axis. All numbers are float32 unless said otherwise, and every
+operation rounds on its own: numba contracts nothing without `fastmath`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+
+from coop.common.types import Array
+
+Loop = TypeVar("Loop", bound=Callable[..., Any])
+
+
+def _jit(loop: Loop) -> Loop:
+    """Compile a function at its first call; the result is kept on the disk."""
+    return cast(Loop, numba.njit(cache=True, error_model="numpy")(loop))
+
+
+@_jit
+def gather(
+    obs: Array,
+    next_obs: Array,
+    actions: Array,
+    terminated: Array,
+    versions: Array,
+    ids: Array,
+    reuse: Array,
+    rows: Array,
+    powers: Array,
+    x: Array,
+    taken: Array,
+    discounts: Array,
+    seen: Array,
+    now: Array,
+) -> None:
+    """Read a batch of each table, and count the draws.
+
+    obs, next_obs: [n, capacity, 4], and the other columns [n, capacity]. rows: int64 [n, batch]. x: [n, 2 batch, 4],
+    written, obs before next_obs. taken: int64 [n, batch], and discounts [n, batch], powers of gamma, written.
+    seen: int64 [n, 4, batch], written: ids, ages, draws and weight lags. now: int64 [2], transitions and updates.
+    """
+    for k in range(rows.shape[0]):
+        size = rows.shape[1]
+        for b in range(size):
+            reuse[k, rows[k, b]] += 1
+        for b in range(size):
+            row = rows[k, b]
+            for j in range(4):
+                x[k, b, j] = obs[k, row, j]
+                x[k, size + b, j] = next_obs[k, row, j]
+            taken[k, b] = actions[k, row]
+            discounts[k, b] = powers[1] * (np.float32(0) if terminated[k, row] else np.float32(1))
+            seen[k, 0, b] = ids[k, row]
+            seen[k, 1, b] = now[0] - 1 - ids[k, row]
+            seen[k, 2, b] = reuse[k, row]
+            seen[k, 3, b] = now[1] - versions[k, row]
+
+
+@_jit
+def insert(
+    rows: Array,
+    new_obs: Array,
+    new_next: Array,
+    new_actions: Array,
+    terminal: Array,
+    version: int,
+    number: int,
+    capacity: int,
+    obs: Array,
+    next_obs: Array,
+    actions: Array,
+    terminated: Array,
+    versions: Array,
+    ids: Array,
+    reuse: Array,
+    evicted: Array,
+    held: Array,
+) -> None:
+    """Put a transition of each run into its row, int64 [K], -1 for none; the columns are as `gather` has them.
+
+    new_obs, new_next: [K, 4]. new_actions, terminal: [K]. version, number: of the transition. evicted: int64 [K,
+    buckets], evicted transitions by the bit length of their draws. held: int64 [K], terminal transitions held.
+    """
+    for k in range(rows.shape[0]):
+        row = rows[k]
+        if row < 0:
+            evicted[k, 0] += 1
+            continue
+        if number >= capacity:
+            bucket, draws = 0, reuse[k, row]
+            while draws > 0 and bucket < evicted.shape[1] - 1:
+                draws >>= 1
+                bucket += 1
+            evicted[k, bucket] += 1
+        held[k] += int(terminal[k]) - int(terminated[k, row])
+        for j in range(4):
+            obs[k, row, j] = new_obs[k, j]
+            next_obs[k, row, j] = new_next[k, j]
+        actions[k, row] = new_actions[k]
+        terminated[k, row] = terminal[k]
+        versions[k, row] = version
+        ids[k, row] = number
+        reuse[k, row] = 0
+
+
+@_jit
+def rectify(
+    columns: Array,
+    bias: Array,
+) -> None:
+    """Columns [n, units, batch] <- max(columns + bias, 0), bias [n, units]; nan stays nan."""
+    zero = np.float32(0)
+    for k in range(columns.shape[0]):
+        for i in range(columns.shape[1]):
+            shift, line = bias[k, i], columns[k, i]
+            for b in range(line.shape[0]):
+                value = line[b] + shift
+                line[b] = zero if value <= zero else value
+
+
+@_jit
+def rectify_both(
+    columns: Array,
+    bias: Array,
+    h: Array,
+) -> None:
+    """As `rectify`; h [n, rows, units] becomes the transpose of its first columns."""
+    zero = np.float32(0)
+    rows, units = h.shape[1], h.shape[2]
+    for k in range(columns.shape[0]):
+        for start in range(0, units, 16):
+            stop = min(start + 16, units)
+            for i in range(start, stop):
+                shift, line = bias[k, i], columns[k, i]
+                for b in range(line.shape[0]):
+                    value = line[b] + shift
+                    line[b] = zero if value <= zero else value
+            for b in range(rows):
+                for i in range(start, stop):
+                    h[k, b, i] = columns[k, i, b]
+
+
+@_jit
+def shift(
+    columns: Array,
+    bias: Array,
+) -> None:
+    """Columns [n, actions, batch] <- columns + bias."""
+    for k in range(columns.shape[0]):
+        for i in range(columns.shape[1]):
+            for b in range(columns.shape[2]):
+                columns[k, i, b] += bias[k, i]
+
+
+@_jit
+def temporal(
+    values: Array,
+    next_values: Array,
+    preferred: Array,
+    taken: Array,
+    discounts: Array,
+    bound: np.float32,
+    loss: int,
+    errors: Array,
+    out: Array,
+) -> None:
+    """The TD errors [n, batch], and the output error [n, 2, batch], both written.
+
+    values, next_values, preferred: [n, 2, batch]. bound: of the values, 0: none. loss: 0 squared, 1 mse, 2 huber.
+    """
+    one, zero = np.float32(1), np.float32(0)
+    size = taken.shape[1]
+    count = np.float32(size)
+    for k in range(taken.shape[0]):
+        for b in range(size):
+            first, second = preferred[k, 0, b], preferred[k, 1, b]
+            best = 1 if second > first or (np.isnan(second) and not np.isnan(first)) else 0  # as argmax
+            value = next_values[k, best, b]
+            if bound > zero:
+                value = -bound if value < -bound else bound if value > bound else value
+            error = values[k, taken[k, b], b] - (one + discounts[k, b] * value)
+            errors[k, b] = error
+            slope = error
+            if loss == 1:
+                slope = np.float32(2) * error
+            elif loss == 2:
+                slope = -one if error < -one else one if error > one else error
+            out[k, 0, b] = zero
+            out[k, 1, b] = zero
+            out[k, taken[k, b], b] = slope / count
+
+
+@_jit
+def masked(
+    delta: Array,
+    h: Array,
+    bias: Array,
+) -> None:
+    """Delta [n, batch, units] <- delta * (h > 0); bias [n, units] <- its sums over the batch."""
+    zero, one = np.float32(0), np.float32(1)
+    for k in range(delta.shape[0]):
+        sums = bias[k]
+        for b in range(delta.shape[1]):
+            line, active = delta[k, b], h[k, b]
+            for i in range(line.shape[0]):
+                line[i] *= one if active[i] > zero else zero
+            if b == 0:
+                for i in range(line.shape[0]):
+                    sums[i] = line[i]
+            else:
+                for i in range(line.shape[0]):
+                    sums[i] += line[i]
+
+
+@_jit
+def summed(
+    delta: Array,
+    bias: Array,
+) -> None:
+    """Bias [n, units] <- the sums of delta [n, batch, units] over the batch."""
+    for k in range(delta.shape[0]):
+        sums = bias[k]
+        for i in range(sums.shape[0]):
+            sums[i] = delta[k, 0, i]
+        for b in range(1, delta.shape[1]):
+            line = delta[k, b]
+            for i in range(sums.shape[0]):
+                sums[i] += line[i]
+
+
+@_jit
+def spread(
+    shared: Array,
+    h: Array,
+    t: Array,
+) -> None:
+    """T [n, 2, batch, units] <- shared [n, 2, 1, units] * (h > 0)."""
+    zero, one = np.float32(0), np.float32(1)
+    for k in range(t.shape[0]):
+        for a in range(2):
+            source = shared[k, a, 0]
+            for b in range(t.shape[2]):
+                line, active = t[k, a, b], h[k, b]
+                for i in range(line.shape[0]):
+                    line[i] = source[i] * (one if active[i] > zero else zero)
+
+
+@_jit
+def muted(
+    t: Array,
+    h: Array,
+) -> None:
+    """T [n, 2, batch, units] <- t * (h > 0)."""
+    zero, one = np.float32(0), np.float32(1)
+    for k in range(t.shape[0]):
+        for a in range(2):
+            for b in range(t.shape[2]):
+                line, active = t[k, a, b], h[k, b]
+                for i in range(line.shape[0]):
+                    line[i] *= one if active[i] > zero else zero
+
+
+@_jit
+def whiten(
+    grams: Array,
+    e: Array,
+    s: Array,
+    limit: np.float32,
+    square: np.float32,
+    weights: Array,
+    doubtful: Array,
+) -> bool:
+    """Weights [layers, n, batch, 2] <- e + s G^(-1/2) e, as `coop.learner.edl.polar` has it for 2 x 2.
+
+    grams: [3, layers, n, batch], G's a, b and c. e: [n, batch, 2]. s: [n]. limit, square: of G. doubtful: bool [layers,
+    n, batch], written: where G^(-1/2) e counts as 0.
+    """
+    zero, two = np.float32(0), np.float32(2)
+    any_doubt = False
+    for i in range(grams.shape[1]):
+        for k in range(grams.shape[2]):
+            for m in range(grams.shape[3]):
+                a, b, c = grams[0, i, k, m], grams[1, i, k, m], grams[2, i, k, m]
+                first, second = e[k, m, 0], e[k, m, 1]
+                product, trace = a * b, a + b
+                determinant = product - c * c
+                margin = determinant - limit * product - square * trace
+                sound = margin > zero
+                doubtful[i, k, m] = not sound
+                d = np.sqrt(determinant)
+                scale = d * np.sqrt(trace + two * d)
+                top = ((b + d) * first - c * second) / scale
+                low = ((a + d) * second - c * first) / scale
+                if not sound:
+                    top = low = zero
+                    any_doubt = True
+                weights[i, k, m, 0] = first + s[k] * top
+                weights[i, k, m, 1] = second + s[k] * low
+    return any_doubt
+
+
+@_jit
+def adam(
+    theta: Array,
+    gradient: Array,
+    mean: Array,
+    square: Array,
+    decay1: np.float32,
+    rest1: np.float32,
+    decay2: np.float32,
+    rest2: np.float32,
+    tiny: np.float32,
+    eps: np.float32,
+    rate: np.float32,
+    finite: Array,
+) -> None:
+    """A step of `coop.learner.optimizers.Adam` for each run, arrays [n, P]; finite: bool [n], written: theta's."""
+    for k in range(theta.shape[0]):
+        t, g, m, v = theta[k], gradient[k], mean[k], square[k]
+        for i in range(t.shape[0]):
+            m[i] = m[i] * decay1 + g[i] * rest1
+            v[i] = v[i] * decay2 + (g[i] * g[i]) * rest2
+            t[i] -= (m[i] / (np.sqrt(v[i] + tiny) + eps)) * rate
+        good = True
+        for i in range(t.shape[0]):
+            good &= np.abs(t[i]) <= np.float32(3.4028235e38)
+        finite[k] = good

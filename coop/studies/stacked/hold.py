@@ -1,0 +1,230 @@
+"""The study of results/cartpole/hold/plan.md: why two networks hold on CartPole.
+
+    python -m coop.studies.stacked.hold runs/hold     # plays what is not there yet, and goes on where it stopped
+    python -m coop.studies.stacked.hold runs/hold --pack results/cartpole/hold/hold.parquet
+
+The seeds of a cell are played side by side, each in a run directory as `coop-lockstep` leaves it; once all are over,
+they become one file of the cell. A packed row is a run, with all its returns; a return of CartPole is the length of its
+episode. The schema's metadata hold the SHA-256 of the plan, and of the grid.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import hashlib
+import json
+import math
+import shutil
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from coop.common.errors import RunError, UsageError
+from coop.common.process.console import say
+from coop.common.process.lifecycle import Stop, run_main
+from coop.common.settings.config import RunConfig
+from coop.common.settings.overrides import merged
+from coop.common.settings.tables import load_tables, resolve
+from coop.lockstep.run import LockstepRun
+from coop.records.resumption import Start
+from coop.records.summaries import read_summary
+from coop.studies.stacked.packed import summary
+from coop.studies.stacked.together import play_together
+
+HERE = Path("results/cartpole/hold")
+PLAN, GRID, FILE = HERE / "plan.md", HERE / "grid.toml", HERE / "hold.parquet"
+SEAL = b"hold"
+_KEPT = ("update", "policy_churn", "q_abs_mean", "q_bound")  # of metrics.jsonl
+
+
+@dataclass(frozen=True)
+class HoldCell:
+    """A cell of the plan; player: index of the network that always acts, None: the one that is trained."""
+
+    variant: str
+    double: bool
+    eviction: str
+    capacity: int
+    config: RunConfig
+    player: int | None
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.variant}-{self.eviction}-{self.capacity}-{'double' if self.double else 'single'}"
+
+
+@dataclass(frozen=True)
+class HoldGrid:
+    """The cells in the plan's order, each once, and the seeds."""
+
+    cells: tuple[HoldCell, ...]
+    seeds: tuple[int, ...]
+
+
+def read_grid(path: Path = GRID) -> HoldGrid:
+    """Read a grid's file."""
+    tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    preset, first_last = load_tables(tables["preset"], None), tables["seeds"]
+    cells: dict[str, HoldCell] = {}
+    for block in tables["blocks"]:
+        axes = (block[name] for name in ("double", "eviction", "capacity", "variants"))
+        for double, eviction, capacity, variant in product(*axes):
+            own: Mapping[str, Any] = tables["variants"][variant]
+            settings = {name: value for name, value in own.items() if name not in ("method", "player")}
+            cell = {"learner": {"double": double}, "replay": {"eviction": eviction, "capacity": capacity}}
+            config = resolve(merged(merged(merged(preset, tables["fixed"]), cell), settings), own["method"])
+            player = own["player"] - 1 if "player" in own else None
+            found = HoldCell(variant, double, eviction, capacity, config, player)
+            cells.setdefault(found.name, found)
+    return HoldGrid(tuple(cells.values()), tuple(range(first_last[0], first_last[1] + 1)))
+
+
+def play(grid: HoldGrid, out: Path, stop: Stop, steps: int | None = None) -> None:
+    """Play every cell that has no file yet; steps: of each run, in place of the grid's."""
+    out.mkdir(parents=True, exist_ok=True)
+    for cell in grid.cells:
+        if stop.is_set():
+            return
+        if not (out / f"{cell.name}.npz").exists():
+            config = cell.config if steps is None else replace(cell.config, total_steps=steps)
+            play_cell(cell, config, grid.seeds, out, stop)
+
+
+def play_cell(cell: HoldCell, config: RunConfig, seeds: tuple[int, ...], out: Path, stop: Stop) -> None:
+    """Play a cell's seeds, and write its file if all of them are over."""
+    folder = out / cell.name
+    paths = {seed: folder / f"seed-{seed}" for seed in seeds}
+    with ExitStack() as stack:
+        runs = []
+        for seed, path in paths.items():
+            if not _over(path):
+                path.mkdir(parents=True, exist_ok=True)
+                run = LockstepRun(replace(config, seed=seed), path, "coop.studies.stacked.hold", Start(resume=True))
+                stack.callback(run.close)
+                runs.append(run)
+        if runs:
+            play_together(runs, stop, cell.player, lambda line: say(f"{cell.name}: {line}"))
+    if not all(map(_over, paths.values())):
+        say(f"{cell.name}: stopped; the same command goes on")
+        return
+    _write(out / f"{cell.name}.npz", [_kept(seed, path) for seed, path in paths.items()])
+    shutil.rmtree(folder)
+    say(f"{cell.name}: done")
+
+
+def _over(path: Path) -> bool:
+    """Whether a run has ended for good."""
+    try:
+        return str(read_summary(path).get("exit", "")).startswith(("complete", "diverged"))
+    except RunError:
+        return False
+
+
+def _kept(seed: int, path: Path) -> dict[str, Any]:
+    """What is kept of a run."""
+    with (path / "episodes.csv").open(encoding="utf-8") as file:
+        returns = [int(float(row["return"])) for row in csv.DictReader(file)]
+    with (path / "metrics.jsonl").open(encoding="utf-8") as file:
+        rows = [[json.loads(line).get(name, np.nan) for name in _KEPT] for line in file]
+    about = read_summary(path)
+    finite, steps = str(about["exit"]).startswith("complete"), int(about["env_steps"])
+    return {"seed": seed, "finite": finite, "steps": steps, "returns": returns, "rows": rows}
+
+
+def _write(path: Path, runs: list[dict[str, Any]]) -> None:
+    part = path.with_suffix(".part.npz")
+    each: dict[str, Any] = {name: np.array([run[name] for run in runs]) for name in ("seed", "finite", "steps")}
+    np.savez_compressed(
+        part,
+        **each,
+        episodes=np.array([len(run["returns"]) for run in runs]),
+        returns=np.concatenate([run["returns"] for run in runs]).astype(np.int16),
+        counts=np.array([len(run["rows"]) for run in runs]),
+        rows=np.concatenate([np.array(run["rows"], np.float32).reshape(-1, len(_KEPT)) for run in runs]),
+    )
+    part.replace(path)
+
+
+def rows_of(cell: HoldCell, path: Path) -> Iterator[dict[str, Any]]:
+    """A row for each run of a cell's file.
+
+    churn: share of states whose greedy action changes, for each 100 updates of a network, mean over the run; q_share:
+    the greatest mean |Q| as a share of its bound.
+    """
+    with np.load(path) as held:
+        data = {name: held[name] for name in held.files}
+    each = 100 if cell.config.two_networks else 200  # updates of a network between two rows
+    returns = np.split(data["returns"], np.cumsum(data["episodes"])[:-1])
+    rows = np.split(data["rows"], np.cumsum(data["counts"])[:-1])
+    for k, seed in enumerate(data["seed"].tolist()):
+        values = returns[k].astype(float)
+        finite, steps = bool(data["finite"][k]), int(data["steps"][k])
+        found = summary(np.cumsum(values), values, cell.config.total_steps, None if finite else steps)
+        churn, size, bound = rows[k].T[1:]
+        yield {
+            "variant": cell.variant, "double": cell.double, "eviction": cell.eviction, "capacity": cell.capacity,
+            "seed": seed, "finite": finite, "area": found["area"], "last": found["last"],
+            "collapses": found["collapses"], "churn": _of(np.mean, churn) * 100 / each,
+            "q_share": _of(np.max, size / bound), "returns": returns[k],
+        }  # fmt: skip
+
+
+def _of(statistic: Callable[[Any], Any], values: NDArray[np.float32]) -> float:
+    """A statistic of the values that are finite; nan if there are none, as in a run that diverged at once."""
+    found = values[np.isfinite(values)]
+    return float(statistic(found)) if len(found) else math.nan
+
+
+def sealed(plan: Path = PLAN, grid: Path = GRID) -> dict[str, str]:
+    """The SHA-256 of the plan as it began, and of the grid; what changes in the plan later stands below its heading."""
+    begun = plan.read_bytes().split(b"\n## Changes")[0]
+    return {"plan": hashlib.sha256(begun).hexdigest(), "grid": hashlib.sha256(grid.read_bytes()).hexdigest()}
+
+
+def pack(grid: HoldGrid, out: Path, path: Path) -> int:
+    """Write the complete cells of the folder `out` into one Parquet file; return their number. Raises UsageError."""
+    done = [cell for cell in grid.cells if (out / f"{cell.name}.npz").exists()]
+    if not done:
+        raise UsageError(f"{out}: no cell is complete")
+    frame = pd.DataFrame([row for cell in done for row in rows_of(cell, out / f"{cell.name}.npz")])
+    frame = frame.astype(dict.fromkeys(("area", "last", "churn", "q_share"), np.float32))
+    table = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata({SEAL: json.dumps(sealed())})
+    pq.write_table(table, path, compression="zstd", compression_level=22)
+    return len(done)
+
+
+def main() -> None:
+    """Entry point."""
+    run_main("coop.studies.stacked.hold", _run)
+
+
+def _run() -> None:
+    parser = argparse.ArgumentParser("python -m coop.studies.stacked.hold", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("out", type=Path, help="folder of the cells")
+    parser.add_argument("--pack", type=Path, metavar="FILE", help="write the complete cells as Parquet, and play none")
+    args = parser.parse_args()
+    grid = read_grid()
+    if args.pack is not None:
+        say(f"{pack(grid, args.out, args.pack)} of {len(grid.cells)} cells in {args.pack}")
+        return
+    stop = Stop()
+    stop.on_signals()
+    play(grid, args.out, stop)
+    if stop.is_set():
+        stop.leave()
+
+
+if __name__ == "__main__":
+    main()

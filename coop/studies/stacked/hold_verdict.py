@@ -1,0 +1,204 @@
+"""The rules of results/cartpole/hold/plan.md, applied to its packed runs: E, P and the answer.
+
+`python -m coop.studies.stacked.hold_verdict` prints the tables of the complete cells as Markdown; a rule whose
+cells are not says so. The plan and the grid must be those whose SHA-256 the packed file holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterable
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple, TypeGuard
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from scipy.special import betaincinv, stdtr
+from scipy.stats import binomtest
+
+from coop.studies.report.intervals import over_seeds
+from coop.studies.stacked.hold import FILE, SEAL, sealed
+from coop.studies.stacked.verdict import holm, printed
+
+ENDS_WELL, LEVEL, MARGIN = 195, 0.05, 0.5  # the margin in settings of eight
+SIZES = (50, 100, 300, 1000, 2000, 5000)
+EVICTIONS = ("fifo", "reservoir")
+PAIRS = (("g-coop", "dqn"), ("coop", "edql"))  # two networks, one network
+OTHERS = ("dqn", "half", "slow", "copy-acts", "one-actor")
+SETTINGS = tuple(product(EVICTIONS, (300, 5000), (True, False)))
+SAYS = {
+    "copy-acts": "a second network is not needed: acting by older weights is enough",
+    "half": "fewer updates are enough",
+    "slow": "a slower target is enough",
+}
+CELL = ["variant", "double", "eviction", "capacity"]
+
+Floats = NDArray[np.float64]
+
+
+def load(path: Path = FILE) -> pd.DataFrame:
+    """A row for each run, with `well`: it ends well. Raises ValueError if plan or grid are not those of the file."""
+    table = pq.read_table(path)
+    if json.loads(table.schema.metadata[SEAL]) != sealed():
+        raise ValueError(f"{path}: of another plan or grid; changes of the plan go below its last heading")
+    runs: pd.DataFrame = table.to_pandas()
+    return runs.assign(well=runs["last"] >= ENDS_WELL, collapsed=runs["collapses"] > 0)
+
+
+def exact(hits: int, count: int) -> tuple[float, float]:
+    """The exact (Clopper-Pearson) 95 % interval of a share."""
+    low = 0.0 if hits == 0 else float(betaincinv(hits, count - hits + 1, LEVEL / 2))
+    high = 1.0 if hits == count else float(betaincinv(hits + 1, count - hits, 1 - LEVEL / 2))
+    return low, high
+
+
+def mcnemar(one: Iterable[bool], other: Iterable[bool]) -> float:
+    """The exact two-sided McNemar test of paired outcomes."""
+    pairs = np.array([list(one), list(other)], bool)
+    ups, downs = int((pairs[0] & ~pairs[1]).sum()), int((~pairs[0] & pairs[1]).sum())
+    return float(binomtest(ups, ups + downs).pvalue) if ups + downs else 1.0
+
+
+def cells(runs: pd.DataFrame) -> pd.DataFrame:
+    """A row for each cell: shares with exact intervals, and what stands beside them without a rule."""
+    rows = []
+    for key, part in runs.groupby(CELL, sort=False):
+        row: dict[str, object] = dict(zip(CELL, key, strict=True)) | {"seeds": len(part)}
+        for name in ("well", "collapsed"):
+            hits = int(part[name].sum())
+            row |= {name: hits / len(part)} | dict(
+                zip((f"{name}_low", f"{name}_high"), exact(hits, len(part)), strict=True)
+            )
+        area = over_seeds(part["area"].to_numpy(np.float64))
+        row |= dict(zip(("area", "area_low", "area_high"), area, strict=True))
+        row |= {
+            "churn": part["churn"].mean(),
+            "q_share": part["q_share"].mean(),
+            "diverged": int((~part["finite"]).sum()),
+        }
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def by_seed(runs: pd.DataFrame, variant: str, settings: Iterable[tuple[str, int, bool]]) -> pd.Series | None:
+    """In how many of the settings (eviction, capacity, double) each seed ends well; None if a cell is missing."""
+    found = []
+    for eviction, capacity, double in settings:
+        where = (runs["variant"] == variant) & (runs["eviction"] == eviction)
+        part = runs[where & (runs["capacity"] == capacity) & (runs["double"] == double)]
+        if part.empty:
+            return None
+        found.append(part.set_index("seed")["well"].astype(float))
+    return pd.concat(found, axis=1, join="inner").sum(axis=1)
+
+
+class Test(NamedTuple):
+    """A mean over seeds with its 95 % t interval; p of the t test against 0, and of equivalence within MARGIN."""
+
+    mean: float
+    low: float
+    high: float
+    p: float
+    equivalent: float
+    seeds: int
+
+
+def tested(values: Floats) -> Test:
+    """Two-sided t test, and two one-sided ones (TOST), of which the larger p counts."""
+    count = len(values)
+    mean, low, high = (float(each) for each in over_seeds(values))
+    error = float(values.std(ddof=1)) / math.sqrt(count)
+    if error == 0:
+        return Test(mean, mean, mean, float(mean == 0), 0.0 if abs(mean) < MARGIN else 1.0, count)
+    below, above = stdtr(count - 1, (mean - MARGIN) / error), stdtr(count - 1, -(mean + MARGIN) / error)
+    return Test(mean, low, high, float(2 * stdtr(count - 1, -abs(mean) / error)), float(max(below, above)), count)
+
+
+def _all(counts: dict[str, pd.Series | None]) -> TypeGuard[dict[str, pd.Series]]:
+    return all(count is not None for count in counts.values())
+
+
+def evictions(runs: pd.DataFrame) -> pd.DataFrame | None:
+    """Rule E: by eviction, two networks minus one in sizes of six, mean of both pairs; and fifo minus reservoir.
+
+    Holm over the three; None if a cell of part 1 is missing.
+    """
+    differences = {}
+    for eviction in EVICTIONS:
+        settings = [(eviction, size, True) for size in SIZES]
+        counts = {name: by_seed(runs, name, settings) for pair in PAIRS for name in pair}
+        if not _all(counts):
+            return None
+        pairs = [counts[two] - counts[one] for two, one in PAIRS]
+        differences[eviction] = sum(pairs[1:], pairs[0]) / len(pairs)
+    differences["fifo - reservoir"] = differences["fifo"] - differences["reservoir"]
+    table = pd.DataFrame([{"rule": name, **tested(each.to_numpy())._asdict()} for name, each in differences.items()])
+    table["p"] = holm(table["p"])
+    holds = (table["p"] < LEVEL) & (table["mean"] > 0)
+    return table.drop(columns="equivalent").assign(outcome=np.where(holds, "two networks hold", "not shown"))
+
+
+def parts(runs: pd.DataFrame, settings: Iterable[tuple[str, int, bool]] = SETTINGS) -> pd.DataFrame | None:
+    """Rule P: g-coop minus each of the others, in settings of eight; Holm over five. None if a cell is missing."""
+    settings = list(settings)
+    counts = {name: by_seed(runs, name, settings) for name in ("g-coop", *OTHERS)}
+    if not _all(counts):
+        return None
+    rows = [{"g-coop minus": name, **tested((counts["g-coop"] - counts[name]).to_numpy())._asdict()} for name in OTHERS]
+    table = pd.DataFrame(rows)
+    table["p"] = holm(table["p"])
+    different = np.where(table["mean"] > 0, "g-coop ends well more often", "g-coop ends well less often")
+    outcome = np.where(table["p"] < LEVEL, different, "not shown")
+    return table.assign(outcome=np.where(table["equivalent"] < LEVEL, "as good", outcome))
+
+
+def answer(table: pd.DataFrame) -> list[str]:
+    """The plan's sentences, from rule P's table."""
+    rows = table.set_index("g-coop minus")
+    as_good = set(rows.index[rows["equivalent"] < LEVEL])
+    found = [text for name, text in SAYS.items() if name in as_good]
+    actor = rows.loc["one-actor"]
+    if actor["p"] < LEVEL and actor["mean"] > 0 and "copy-acts" in as_good:
+        found.append("it is who acts")
+    return found or ["it takes two networks"]
+
+
+def settings_of(runs: pd.DataFrame) -> pd.DataFrame:
+    """A row for each complete setting of part 2 and other variant: exact McNemar tests of g-coop against it."""
+    rows = []
+    for (eviction, capacity, double), name in product(SETTINGS, OTHERS):
+        one, other = (by_seed(runs, each, [(eviction, capacity, double)]) for each in ("g-coop", name))
+        if one is not None and other is not None:
+            both = pd.concat((one, other), axis=1, join="inner").to_numpy().astype(bool)
+            rows.append(
+                {
+                    "eviction": eviction, "capacity": capacity, "double": double, "g-coop against": name,
+                    "g-coop": both[:, 0].mean(), "other": both[:, 1].mean(), "p": mcnemar(both[:, 0], both[:, 1]),
+                }
+            )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def main() -> None:
+    """Print the tables and the answer."""
+    parser = argparse.ArgumentParser(
+        "python -m coop.studies.stacked.hold_verdict", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("--file", type=Path, default=FILE)
+    runs = load(parser.parse_args().file)
+    for name, table in {"cells": cells(runs), "settings of part 2": settings_of(runs)}.items():
+        print(f"\n{name}\n\n{printed(table)}")
+    for name, rule in {"E": evictions(runs), "P": parts(runs)}.items():
+        print(f"\n{name}\n\n{'not all of its cells are complete' if rule is None else printed(rule)}")
+    rule = parts(runs)
+    if rule is not None:
+        print(f"\nThe answer: {'; '.join(answer(rule))}.")
+
+
+if __name__ == "__main__":
+    main()

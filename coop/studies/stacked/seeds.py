@@ -1,0 +1,354 @@
+"""Lockstep runs that differ in their seeds, side by side in one process, each to the bit as by itself.
+
+    runs = [Lockstep(replace(config, seed=seed)) for seed in range(30)]
+    seeds = Seeds(runs)
+    while seeds.step < config.total_steps:
+        for told in seeds.play(200): ...
+    seeds.save_into(0)         # now runs[0] is where its seed is, for Lockstep.save
+
+What chance decides depends on no network, so it is drawn for a block of steps ahead, from the runs' own generators.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from coop.common.numbers import METRICS_EVERY
+from coop.common.types import EpisodeEnd, EpisodeRecord, EpisodeRow
+from coop.learner.agent import Agent
+from coop.learner.diagnostics import ARCHIVED
+from coop.lockstep.lockstep import Lockstep
+from coop.lockstep.memory import TableMemory
+from coop.studies.stacked.carts import Carts, cart_of
+
+Ints = NDArray[np.int64]
+
+MOST = 400  # steps of a block
+_SHOWN = np.dtype([("obs", np.float32, 4), ("reward", np.float64), ("terminated", np.bool_)])
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a block of steps tells of one run: rows for episodes.csv and metrics.jsonl, in order."""
+
+    run: Lockstep
+    episodes: Sequence[EpisodeRow]
+    metrics: Sequence[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class _Block:
+    """What chance decides for n steps.
+
+    cut, due: whether a segment ends at a step, and whether an update follows it. rows: int64 [n, K], where a step's
+    transition goes, -1: nowhere. batch: int64 [n, K, batch]. action: int64 [n, K], -1: the greedy one. s: float64 [n,
+    K]. epsilon: before each step.
+    """
+
+    cut: list[bool]
+    due: list[bool]
+    rows: Ints
+    batch: Ints
+    action: Ints
+    s: NDArray[np.float64]
+    epsilon: list[float]
+
+
+class Seeds:
+    """Runs of one config but for their seeds, all at the same step, of which the last one ended a segment.
+
+    Args:
+        runs: which are not to be played otherwise meanwhile. player: index of the network that always acts, 0 or 1;
+            None: the one that is trained, as in Algorithm 1.
+
+    Attributes:
+        runs: those that have not diverged. step: environment steps done, of each.
+    """
+
+    def __init__(self, runs: Sequence[Lockstep], player: int | None = None) -> None:
+        from coop.studies.stacked.passes import Networks  # noqa: PLC0415 (numba takes a second, and may not be there)
+        from coop.studies.stacked.tables import Tables  # noqa: PLC0415
+
+        self.runs, self._player, self.config = list(runs), player, runs[0].config
+        self._agents = [run.agent for run in runs if isinstance(run.agent, Agent)]
+        agent = self._agents[0]
+        self.step, self.updates, self._role, self._versions = runs[0].step, agent.updates, agent.acting, agent.versions
+        carts, limits = zip(*(cart_of(run.env) for run in runs), strict=True)
+        self._carts = Carts(carts, [int(run._player._lengths[0]) for run in runs], limits[0])
+        memories = [run.memory for run in runs]
+        self._tables = Tables.of([memory for memory in memories if isinstance(memory, TableMemory)], self.config)
+        self._nets = Networks(self.config, len(runs))
+        for k, agent in enumerate(self._agents):
+            for number, network in enumerate(agent.networks):
+                self._nets.theta[number, k] = network.flat.numpy()
+            for number, optimizer in enumerate(agent.optimizers):
+                self._nets.steps[number] = optimizer.steps
+                for name, buffer in self._nets.buffers.items():
+                    buffer[number, k] = optimizer.buffers[name]
+        self._waiting: list[tuple[Any, ...]] = []  # steps since the last segment's end
+
+    def play(self, most: int) -> list[Told]:
+        """Play some steps, at least 1 and about `most`, to the end of a segment; those runs that diverge are dropped.
+
+        A row of metrics, or a due checkpoint, ends a block.
+        """
+        block = self._drawn(self._length(most))
+        episodes: list[list[EpisodeRow]] = [[] for _ in self.runs]
+        metrics: list[list[dict[str, Any]]] = [[] for _ in self.runs]
+        with np.errstate(all="ignore"), torch.inference_mode():
+            self._play(block, episodes, metrics)
+        told = [Told(*each) for each in zip(self.runs, episodes, metrics, strict=True)]
+        alive = np.array([k for k, run in enumerate(self.runs) if not run.trainer.diverged], np.intp)
+        if len(alive) < len(self.runs):
+            self._keep(alive)
+        return told
+
+    def _keep(self, runs: NDArray[np.intp]) -> None:
+        self.runs, self._agents = [self.runs[k] for k in runs], [self._agents[k] for k in runs]
+        if not self.runs:
+            return
+        self._carts, self._tables, self._nets = self._carts.kept(runs), self._tables.kept(runs), self._nets.kept(runs)
+
+    def _updates_by(self, step: int) -> int:
+        """As `TableMemory` has it."""
+        return math.floor(self.config.replay.ratio * max(0, step - self.config.replay.learning_starts))
+
+    def _length(self, most: int) -> int:
+        """Steps of the next block."""
+        every, last = self.config.checkpoint_every or math.inf, min(self.step + MOST, self.config.total_steps)
+        step, waiting = self.step, 0
+        while True:
+            step += 1
+            waiting = (waiting + 1) % self.config.actor.segment_steps
+            updates = self._updates_by(step)
+            new = updates > self._updates_by(step - 1)
+            waiting *= not new
+            ends = new and (updates % METRICS_EVERY == 0 or updates % every == 0)
+            if step == self.config.total_steps or (not waiting and (ends or step >= min(last, self.step + most))):
+                return step - self.step
+
+    def _drawn(self, count: int) -> _Block:
+        """Draw what chance decides for some steps, in the order in which the runs would."""
+        config, agent = self.config, self._agents[0]
+        steps = range(self.step + 1, self.step + count + 1)
+        due = [self._updates_by(step) > self._updates_by(step - 1) for step in steps]
+        cut, lengths, waiting = [], [], 0
+        for one in due:
+            waiting += 1
+            cut.append(one or waiting == config.actor.segment_steps)
+            lengths.append(waiting if cut[-1] else 0)
+            waiting *= not cut[-1]
+        epsilon = [agent.epsilon(step - 1) for step in steps]
+        runs, size = len(self.runs), config.learner.batch_size
+        rows, action = np.full((count, runs), -1), np.full((count, runs), -1)
+        batch, s = np.zeros((count, runs, size), np.int64), np.zeros((count, runs))
+        scales = self._scales(due)
+        for k, run in enumerate(self.runs):
+            uniform, choose, noise = (
+                run._policy_rng.random,
+                run._policy_rng.integers,
+                self._agents[k]._noise.standard_normal,
+            )
+            for place, step in enumerate(steps):
+                if uniform() < epsilon[place]:
+                    action[place, k] = choose(2, size=1, dtype=np.int32)[0]
+                if lengths[place]:
+                    first = place + 1 - lengths[place]
+                    rows[first : place + 1, k] = self._tables.rows(k, step - lengths[place], lengths[place])
+                if due[place]:
+                    batch[place, k] = self._tables.drawn(k, step)
+                    scale = scales[place]
+                    normal = config.edl.noise == "normal" and scale
+                    s[place, k] = scale * float(noise()) if normal else scale
+        return _Block(cut, due, rows, batch, action, s, epsilon)
+
+    def _scales(self, due: Sequence[bool]) -> list[float]:
+        """The scale of s in the update after each step."""
+        agent, before = self._agents[0], self.updates
+        found = []
+        for one in due:
+            agent.updates = before
+            found.append(agent.feedback_scale() if one else 0.0)
+            before += one
+        agent.updates = self.updates
+        return found
+
+    def _play(self, block: _Block, episodes: list[list[EpisodeRow]], metrics: list[list[dict[str, Any]]]) -> None:
+        config, carts, nets, everyone = self.config, self._carts, self._nets, slice(0, len(self.runs))
+        count, size = len(block.due), config.learner.batch_size
+        shown = np.zeros((count, len(self.runs)), _SHOWN)
+        shown["reward"] = 1
+        restarts: list[list[tuple[int, bytes]]] = [[] for _ in self.runs]
+        actions = np.zeros((count, len(self.runs)), np.int64)
+        self._errors = np.zeros((sum(block.due), len(self.runs), size), np.float32)
+        self._seen = np.zeros((sum(block.due), len(self.runs), 4, size), np.int64)
+        done = 0
+        for place in range(count):
+            player = self._role if self._player is None else self._player
+            obs = carts.obs
+            greedy = nets.values(player, everyone, obs).argmax(1)
+            actions[place] = action = np.where(block.action[place] < 0, greedy, block.action[place])
+            fell, over = carts.move(action)
+            next_obs = carts.obs
+            terminal = over if config.env.time_limit_terminal else fell
+            shown["obs"][place], shown["terminated"][place] = next_obs, terminal
+            self.step += 1
+            ended = self._ended(over, next_obs, block.epsilon[place]) if over.any() else []
+            self._waiting.append((block.rows[place], obs, next_obs, action, terminal, self.updates))
+            for k, _ in ended:
+                if carts.obs is next_obs:
+                    carts.obs = next_obs.copy()
+                carts.restart(k)
+                restarts[k].append((place, carts.obs[k].tobytes()))
+            if block.cut[place]:
+                for transition in self._waiting:
+                    self._tables.insert(*transition)
+                self._waiting = []
+            if block.due[place]:
+                self._update(block, place, done)
+                done += 1
+            self._record(ended, episodes)
+            if block.due[place] and self.updates % METRICS_EVERY == 0:
+                self._rows(done, metrics)
+        self._follow(actions, shown, restarts)
+        self._push(done)
+
+    def _ended(self, over: NDArray[np.bool_], obs: NDArray[np.float32], epsilon: float) -> list[tuple[int, EpisodeEnd]]:
+        """The episodes that a step has ended, by run."""
+        found = []
+        for k in np.flatnonzero(over).tolist():
+            run, length = slice(k, k + 1), int(self._carts.lengths[k])
+            means = np.array([float(self._nets.values(role, run, obs[run]).mean()) for role in (0, 1)])
+            q1, q2 = np.nan_to_num(means).tolist()
+            found.append((k, EpisodeEnd(0, float(length), length, epsilon, q1, q2, self.updates)))
+        return found
+
+    def _update(self, block: _Block, place: int, number: int) -> None:
+        """Do update `number` of the block, that of step `place`, in every run; change roles if it is time."""
+        from coop.studies.stacked import passes  # noqa: PLC0415
+
+        nets, learner, role = self._nets, self.config.learner, self._role
+        rate = self._agents[0]._learning_rate()
+        for start in range(0, len(self.runs), passes.BLOCK):
+            runs = slice(start, min(start + passes.BLOCK, len(self.runs)))
+            n = runs.stop - start
+            taken, discounts = (
+                np.empty((n, learner.batch_size), np.int64),
+                np.empty((n, learner.batch_size), np.float32),
+            )
+            seen, rows = self._seen[number, runs], block.batch[place, runs]
+            self._tables.read(runs, rows, self.updates + 1, nets.x[:n], taken, discounts, seen)
+            nets.update(role, runs, taken, discounts, block.s[place, runs], rate, self._errors[number, runs])
+        nets.count(role)
+        self._tables.batches += 1
+        self.updates += 1
+        self._versions[role] = self.updates
+        swapped = self.updates % self.config.swap_period == 0
+        if swapped and self.config.two_networks:
+            self._role = 1 - role
+        elif swapped:
+            nets.theta[1] = nets.theta[0]
+            self._versions[1] = self.updates
+        self._archive(block, place, number)
+        for run, agent in zip(self.runs, self._agents, strict=True):
+            if not run.trainer.diverged:
+                agent.updates = self.updates
+        finite = np.isfinite(self._errors[number]).all(1)
+        if not finite.all():
+            self._diverge(finite, "TD errors")
+        if (swapped or self.updates % learner.publish_every == 0) and not nets.finite.all():
+            self._diverge(nets.finite, "parameters")
+
+    def _diverge(self, finite: NDArray[np.bool_], what: str) -> None:
+        for k in np.flatnonzero(~finite).tolist():
+            run = self.runs[k]
+            if not run.trainer.diverged:
+                run.trainer.diverged = f"diverged: {what} are not finite at update {self.updates}"
+                run.step = self.step
+                self.save_counters(k)
+
+    def _archive(self, block: _Block, place: int, number: int) -> None:
+        """Give the diagnostics their first transitions."""
+        for k, run in enumerate(self.runs):
+            telemetry = run.trainer.telemetry
+            archive = telemetry.diagnostics.archive
+            if archive is not None and len(archive) >= ARCHIVED:
+                return
+            batch = self._tables.batch(k, block.batch[place, k], self._seen[number, k])
+            telemetry.diagnostics.add(batch)
+            telemetry.largest_reward = 1.0
+
+    def _record(self, ended: Sequence[tuple[int, EpisodeEnd]], episodes: list[list[EpisodeRow]]) -> None:
+        """Number the episodes that have ended."""
+        for k, end in ended:
+            run = self.runs[k]
+            if not run.trainer.diverged or run.step == self.step:
+                number = run.trainer.telemetry.episode(end.episode_return)
+                row = EpisodeRow(number, EpisodeRecord(self.step, 0, 0, end), self.updates, run.agent.feedback_scale())
+                episodes[k].append(row)
+
+    def _rows(self, done: int, metrics: list[list[dict[str, Any]]]) -> None:
+        """Make the rows of metrics of the interval that ends with the block."""
+        self._push(done)
+        for k, run in enumerate(self.runs):
+            if not run.trainer.diverged:
+                self.save_networks(k)
+                self.save_counters(k)
+                row = run.trainer._metrics(time.monotonic())
+                metrics[k] += [] if row is None else [row]
+                run.step = self.step
+
+    def _push(self, done: int) -> None:
+        """Hand the updates of the block to the telemetry."""
+        for k, run in enumerate(self.runs):
+            for number in range(len(self._errors[:done])):
+                ids, age, reuse, lag = self._seen[number, k]
+                run.trainer.telemetry.add_errors(self._errors[number, k])
+                run.trainer.telemetry._batches.append((age, reuse, lag, ids))
+        self._errors, self._seen = self._errors[done:], self._seen[done:]
+
+    def _follow(self, actions: Ints, shown: NDArray[Any], restarts: Sequence[Sequence[tuple[int, bytes]]]) -> None:
+        """Note the actions of a block, and what the emulators answered, as `Lockstep` does step by step."""
+        for k, run in enumerate(self.runs):
+            start, seen = 0, run._seen
+            for place, first in restarts[k]:
+                seen = zlib.crc32(first, zlib.crc32(shown[start : place + 1, k].tobytes(), seen))
+                start = place + 1
+            run._actions += actions[:, k].tolist()
+            run._seen = zlib.crc32(shown[start:, k].tobytes(), seen)
+
+    def save_into(self, k: int) -> None:
+        """Bring run k to where its seed is, so that `Lockstep.save` saves it; it is not to be played on otherwise."""
+        run = self.runs[k]
+        self.save_networks(k)
+        self.save_counters(k)
+        run.memory = self._tables.memory(k, run.env.spec)
+        for number, optimizer in enumerate(self._agents[k].optimizers):
+            means = {name: torch.from_numpy(buffer[number, k]) for name, buffer in self._nets.buffers.items()}
+            optimizer.load_state({"steps": self._nets.steps[number], **means})
+
+    def save_networks(self, k: int) -> None:
+        """Write run k's networks and its role into its agent."""
+        agent = self._agents[k]
+        for network, flat in zip(agent.networks, self._nets.theta[:, k], strict=True):
+            network.load(flat)
+        agent.acting, agent.versions = self._role, list(self._versions)
+
+    def save_counters(self, k: int) -> None:
+        """Write run k's counters into its trainer."""
+        run = self.runs[k]
+        run.step = self.step
+        self._agents[k].updates = self.updates
+        run.trainer.drawn = msgspec.structs.replace(
+            run.trainer.drawn, inserted=self.step, **self._tables.counters(k), episodes=()
+        )  # fmt: skip

@@ -1,0 +1,133 @@
+"""The study of two networks on CartPole: its cells are the plan's, and its rules say what the plan says."""
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from coop.common.process.lifecycle import Stop
+from coop.studies.stacked import hold, hold_verdict
+
+SEEDS = range(500, 530)
+
+
+def test_the_grid_is_the_plans() -> None:
+    grid = hold.read_grid()
+    assert grid.seeds == tuple(SEEDS)
+    cells = {(cell.variant, cell.eviction, cell.capacity, cell.double): cell for cell in grid.cells}
+    sizes, methods = (50, 100, 300, 1000, 2000, 5000), ("dqn", "edql", "g-coop", "coop")
+    first = set(product(methods, ("fifo", "reservoir"), sizes, (True,)))
+    second = set(product(("g-coop", *hold_verdict.OTHERS), ("fifo", "reservoir"), (300, 5000), (True, False)))
+    assert len(grid.cells) == len(cells) == 88
+    assert set(cells) == first | second
+    for (variant, eviction, capacity, double), cell in cells.items():
+        config = cell.config
+        assert (config.replay.eviction, config.replay.capacity, config.learner.double) == (eviction, capacity, double)
+        assert (config.total_steps, config.replay.learning_starts, config.learner.gamma) == (50_000, 50, 0.95)
+        assert config.replay.ratio == (0.5 if variant == "half" else 1)
+        assert config.swap_period == {"half": 50, "slow": 200}.get(variant, 100)
+        assert config.method == {"one-actor": "g-coop"}.get(variant, variant if variant in methods else "dqn")
+        assert cell.player == {"copy-acts": 1, "one-actor": 0}.get(variant)
+    begun = [cell.name for cell in grid.cells[:12]]
+    assert all("-reservoir-" in name and name.endswith("-double") for name in begun)
+
+
+def runs_of(well: dict[str, float]) -> pd.DataFrame:
+    """Runs of part 2 of which the share `well` of a variant's seeds ends well in every setting."""
+    rows = [
+        {"variant": name, "eviction": eviction, "capacity": capacity, "double": double, "seed": seed,
+         "well": (seed * 7 + capacity) % 30 < 30 * share}
+        for name, share in well.items()
+        for eviction, capacity, double in hold_verdict.SETTINGS
+        for seed in SEEDS
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+BAD, GOOD = 0.5, 1.0
+
+
+@pytest.mark.parametrize(
+    ("good", "answer"),
+    [
+        ((), ["it takes two networks"]),
+        (("one-actor",), ["it takes two networks"]),
+        (("copy-acts",), [hold_verdict.SAYS["copy-acts"], "it is who acts"]),
+        (("copy-acts", "one-actor", "half"), [hold_verdict.SAYS["copy-acts"], hold_verdict.SAYS["half"]]),
+        (("slow", "one-actor"), [hold_verdict.SAYS["slow"]]),
+    ],
+)
+def test_the_answer_names_what_is_as_good_as_two_networks(good: tuple[str, ...], answer: list[str]) -> None:
+    shares = {name: GOOD if name in good else BAD for name in hold_verdict.OTHERS} | {"g-coop": GOOD}
+    table = hold_verdict.parts(runs_of(shares))
+    assert table is not None
+    assert hold_verdict.answer(table) == answer
+    outcomes = dict(zip(table["g-coop minus"], table["outcome"], strict=True))
+    assert {name for name, outcome in outcomes.items() if outcome == "as good"} == set(good)
+    assert set(outcomes.values()) <= {"as good", "g-coop ends well more often"}
+
+
+def test_a_rule_whose_cells_are_not_complete_says_nothing() -> None:
+    runs = runs_of({"g-coop": GOOD, "dqn": BAD})
+    assert hold_verdict.parts(runs) is None
+    assert hold_verdict.evictions(runs) is None
+
+
+def test_evictions_count_sizes_that_end_well_by_seed_and_pair() -> None:
+    shares = {("g-coop", "fifo"): 0.5, ("dqn", "fifo"): 0.5, ("g-coop", "reservoir"): 1.0, ("dqn", "reservoir"): 0.2}
+    shares |= {("coop", eviction): 0.5 for eviction in hold_verdict.EVICTIONS}
+    shares |= {("edql", eviction): 0.5 for eviction in hold_verdict.EVICTIONS}
+    rng = np.random.default_rng(0)
+    rows = [
+        {"variant": name, "eviction": eviction, "capacity": size, "double": True, "seed": seed,
+         "well": bool(rng.random() < share)}
+        for (name, eviction), share in shares.items()
+        for size, seed in product(hold_verdict.SIZES, SEEDS)
+    ]  # fmt: skip
+    runs = pd.DataFrame(rows)
+    table = hold_verdict.evictions(runs)
+    assert table is not None
+    found = table.set_index("rule")
+    assert found["outcome"].to_dict()["reservoir"] == "two networks hold"
+    assert found["outcome"].to_dict()["fifo"] == "not shown"
+    wells = runs.groupby(["variant", "eviction"])["well"].sum() / len(SEEDS)
+    mean = (wells["g-coop", "reservoir"] - wells["dqn", "reservoir"] + wells["coop", "reservoir"] - wells["edql", "reservoir"]) / 2  # fmt: skip  # noqa: E501
+    assert found["mean"]["reservoir"] == pytest.approx(mean)
+    assert found["mean"]["fifo - reservoir"] == pytest.approx(found["mean"]["fifo"] - found["mean"]["reservoir"])
+
+
+@pytest.mark.parametrize(("hits", "count"), [(0, 30), (1, 30), (17, 30), (30, 30)])
+def test_intervals_of_shares_are_exact(hits: int, count: int) -> None:
+    interval = binomtest(hits, count).proportion_ci(method="exact")
+    assert hold_verdict.exact(hits, count) == pytest.approx(tuple(interval))
+
+
+def test_mcnemar_counts_the_pairs_that_differ() -> None:
+    one, other = [True] * 8 + [False, True, False], [False] * 8 + [True, True, False]
+    assert hold_verdict.mcnemar(one, other) == pytest.approx(20 / 512)
+    assert hold_verdict.mcnemar([True], [True]) == 1
+
+
+@pytest.mark.timeout(300)
+def test_a_study_goes_on_where_it_stopped_and_is_packed(tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    whole = hold.read_grid()
+    by_name = {cell.name: cell for cell in whole.cells}
+    cells = (by_name["copy-acts-reservoir-300-double"], by_name["half-fifo-300-single"])
+    grid, stop = hold.HoldGrid(cells, (500, 501)), Stop()
+    stop.set("stopped")
+    hold.play_cell(cells[0], cells[0].config, grid.seeds, tmp_path, stop)
+    assert not list(tmp_path.glob("*.npz")), "no run is over"
+    hold.play(grid, tmp_path, Stop(), steps=450)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{cell.name}.npz" for cell in cells]
+    assert hold.pack(grid, tmp_path, tmp_path / "packed.parquet") == 2
+    runs = hold_verdict.load(tmp_path / "packed.parquet")
+    assert list(runs["seed"]) == [500, 501] * 2
+    assert all(400 < sum(returns) <= 450 for returns in runs["returns"])
+    assert runs["last"].to_list() == pytest.approx([np.mean(returns) for returns in runs["returns"]])
+    assert not runs["well"].any()
+    assert runs["finite"].all()
+    assert len(hold_verdict.cells(runs)) == 2

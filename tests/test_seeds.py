@@ -1,0 +1,235 @@
+"""Lockstep runs side by side: each is to the bit what it is by itself."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from coop.common.process.lifecycle import Stop
+from coop.common.settings.config import RunConfig
+from coop.common.settings.overrides import merged
+from coop.common.settings.tables import load_tables, resolve
+from coop.learner.trainer import EpisodeRow
+from coop.lockstep.lockstep import Lockstep
+from coop.lockstep.memory import TableMemory
+from coop.lockstep.run import LockstepRun
+from coop.records.resumption import Start
+from coop.records.summaries import read_summary
+from coop.studies.stacked.eligible import why_not
+from coop.studies.stacked.seeds import Seeds
+from coop.studies.stacked.together import play_together
+
+pytest.importorskip("numba")
+
+OF_TIME = ("time", "updates_per_s", "env_steps_per_s")
+SMALL: dict[str, Any] = {"replay": {"capacity": 100, "learning_starts": 50}, "total_steps": 2000}
+
+
+def config_of(method: str, *changes: dict[str, Any]) -> RunConfig:
+    tables = merged(load_tables("cartpole", None), SMALL)
+    for each in changes:
+        tables = merged(tables, each)
+    return resolve(tables, method)
+
+
+def fixed(run: Lockstep, player: int) -> Lockstep:
+    """The run with one network that always acts."""
+    always = {"acting": property(lambda _: player, lambda *_: None)}
+    run._policy.__class__ = type("FixedPolicy", (type(run._policy),), always)
+    return run
+
+
+def alone(run: Lockstep, steps: int) -> tuple[list[EpisodeRow], list[dict[str, Any]]]:
+    episodes, metrics = [], []
+    while run.step < steps:
+        for effects in run.play():
+            episodes += effects.episodes
+            metrics += [effects.metrics] if effects.metrics else []
+    return episodes, metrics
+
+
+def untimed(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{name: value for name, value in row.items() if name not in OF_TIME} for row in rows]
+
+
+def assert_same(one: Lockstep, other: Lockstep) -> None:
+    for mine, its in zip(one.agent.networks, other.agent.networks, strict=True):
+        assert torch.equal(mine.flat, its.flat)
+    for left, right in zip(one.agent.optimizers, other.agent.optimizers, strict=True):
+        a, b = left.state(), right.state()
+        assert a.keys() == b.keys()
+        assert all(torch.equal(torch.as_tensor(a[name]), torch.as_tensor(b[name])) for name in a)
+    for name in ("acting", "versions", "updates", "noise"):
+        assert one.agent.state()[name] == other.agent.state()[name], name
+    assert one.trainer.drawn == other.trainer.drawn
+    assert (one._actions, one._seen) == (other._actions, other._seen)
+    assert one._policy_rng.bit_generator.state == other._policy_rng.bit_generator.state
+    assert isinstance(one.memory, TableMemory)
+    assert isinstance(other.memory, TableMemory)
+    first, second = one.memory.table.snapshot(), other.memory.table.snapshot()
+    assert {**first.meta, "streams": 0} == {**second.meta, "streams": 0}
+    for name in first.arrays.keys() - {"slots", "tails"}:
+        np.testing.assert_array_equal(first.arrays[name], second.arrays[name], name)
+    frames = [snapshot.frames.read()[snapshot.arrays["slots"]] for snapshot in (first, second)]
+    np.testing.assert_array_equal(*frames)
+
+
+CASES = {
+    "dqn": ("dqn",),
+    "coop": ("coop",),
+    "edql, other layers, s constant": ("edql", {"network": {"hidden": [48, 32]}, "edl": {"noise": "constant"}}),
+    "g-coop, fifo, single": ("g-coop", {"learner": {"double": False, "loss": "huber"}, "replay": {"eviction": "fifo"}}),
+    "half of the updates": ("dqn", {"replay": {"ratio": 0.5}, "learner": {"swap_every": 50}}),
+    "dead units": ("coop", {"network": {"hidden": [8, 4]}, "learner": {"learning_rate": 0.05}}),
+    "rmsprop, mse": ("coop", {"learner": {"optimizer": "rmsprop", "loss": "mse", "reward_bound": None}}),
+    "sgd, time limit": ("dqn", {"learner": {"optimizer": "sgd"}, "env": {"max_episode_steps": 15}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_run_is_to_the_bit_what_it_is_by_itself(case: str) -> None:
+    config, steps = config_of(*CASES[case]), 500
+    assert not why_not(config)
+    configs = [replace(config, seed=seed) for seed in (3, 4, 5, 6, 7)]
+    runs = [Lockstep(each) for each in configs]
+    seeds = Seeds(runs)
+    told: dict[Lockstep, tuple[list[EpisodeRow], list[dict[str, Any]]]] = {run: ([], []) for run in runs}
+    while seeds.step < steps:
+        for each in seeds.play(steps - seeds.step):
+            told[each.run][0].extend(each.episodes)
+            told[each.run][1].extend(each.metrics)
+    for k in (0, 4):
+        own = Lockstep(configs[k])
+        episodes, metrics = alone(own, seeds.step)
+        assert told[runs[k]][0] == episodes
+        assert untimed(told[runs[k]][1]) == untimed(metrics)
+        assert len(episodes) > 5
+        assert metrics
+        seeds.save_into(k)
+        assert_same(own, runs[k])
+
+
+@pytest.mark.parametrize(("method", "player"), [("dqn", 1), ("g-coop", 0)])
+def test_a_fixed_player_acts_as_one_that_lockstep_is_given(method: str, player: int) -> None:
+    config = config_of(method)
+    own, runs = fixed(Lockstep(config), player), [Lockstep(replace(config, seed=seed)) for seed in (config.seed, 1)]
+    seeds = Seeds(runs, player)
+    while seeds.step < 400:
+        seeds.play(400 - seeds.step)
+    alone(own, seeds.step)
+    seeds.save_into(0)
+    assert_same(own, runs[0])
+    other = Lockstep(config)
+    alone(other, seeds.step)
+    assert other._actions != own._actions
+
+
+WILD = (
+    "g-coop",
+    {
+        "network": {"hidden": [16, 16]},
+        "learner": {"optimizer": "sgd", "learning_rate": 4.0, "gamma": 0.99, "reward_bound": None},
+        "total_steps": 400,
+    },
+)
+
+
+def files_of(config: RunConfig, seeds: list[int], folder: Path, stop: Stop, *, together: bool) -> None:
+    """Play runs in their directories, which they may have begun in."""
+    with ExitStack() as stack:
+        runs = []
+        for seed in seeds:
+            runs.append(LockstepRun(replace(config, seed=seed), folder / str(seed), "test", Start(resume=True)))
+            stack.callback(runs[-1].close)
+        if together:
+            play_together(runs, stop)
+        else:
+            for run in runs:
+                run.play(stop)
+
+
+OF_STATE = (
+    "env_step",
+    "update",
+    "acting",
+    "q_gap",
+    "archive_td_error",
+    "policy_churn",
+    "terminal_share",
+    "effective_rank",
+)
+
+
+def assert_same_files(one: Path, other: Path, *, resumed: bool = False) -> None:
+    """resumed: an interval of metrics begins anew where a run goes on, whatever plays it."""
+    for name in ("config.toml", "episodes.csv"):
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    texts = [(path / "metrics.jsonl").read_text().splitlines() for path in (one, other)]
+    rows = [untimed([json.loads(line) for line in lines]) for lines in texts]
+    if resumed:
+        rows = [[{name: row.get(name) for name in OF_STATE} for row in lines] for lines in rows]
+    assert rows[0] == rows[1]
+    left, right = read_summary(one), read_summary(other)
+    names = left.keys() - {"wall_seconds", "records"}
+    assert {name: left[name] for name in names} == {name: right[name] for name in names}
+
+
+def test_a_seed_that_diverges_is_marked_and_the_others_go_on(tmp_path: Path) -> None:
+    config = config_of(*WILD)
+    for name in ("together", "alone"):
+        files_of(config, [4, 5, 0], tmp_path / name, Stop(), together=name == "together")
+    exits = [read_summary(tmp_path / "together" / str(seed))["exit"] for seed in (4, 5, 0)]
+    assert exits[1].startswith("diverged: ")
+    assert exits[0] == exits[2] == "complete"
+    for seed in (4, 5, 0):
+        assert_same_files(tmp_path / "together" / str(seed), tmp_path / "alone" / str(seed))
+
+
+class StopAt(Stop):
+    """A stop after some blocks of steps."""
+
+    def __init__(self, blocks: int) -> None:
+        super().__init__()
+        self._left = blocks
+
+    def is_set(self) -> bool:
+        self._left -= 1
+        if self._left < 0:
+            self.set("stopped")
+        return super().is_set()
+
+
+@pytest.mark.parametrize("first", ["together", "alone"])
+def test_runs_go_on_where_they_stopped_whoever_had_begun_them(first: str, tmp_path: Path) -> None:
+    """Either way of playing goes on from the other's checkpoints; runs that are not equally far go on too."""
+    config = config_of("coop", {"total_steps": 600, "checkpoint_every": 130})
+    files_of(config, [1, 2], tmp_path / "whole", Stop(), together=False)
+    one = first == "together"
+    files_of(config, [1, 2], tmp_path / "parts", StopAt(2 if one else 123), together=one)
+    stopped = [read_summary(tmp_path / "parts" / str(seed)) for seed in (1, 2)]
+    assert stopped[0]["exit"] == "stopped"
+    assert 0 < stopped[0]["env_steps"] < 600
+    files_of(config, [1, 2], tmp_path / "parts", Stop(), together=not one)
+    for seed in (1, 2):
+        assert_same_files(tmp_path / "whole" / str(seed), tmp_path / "parts" / str(seed), resumed=True)
+
+
+REFUSED = {
+    "replay.sampling": {"replay": {"sampling": "prioritized"}}, "replay.ratio": {"replay": {"ratio": 2.0}},
+    "env": {"env": {"id": "Acrobot-v1"}}, "edl.feedback": {"edl": {"feedback": "random"}},
+    "eval_every": {"eval_every": 9},
+    "network.kind": {"network": {"hidden": []}}, "learner.weight_decay": {"learner": {"weight_decay": [0.1]}},
+    "target_return": {"target_return": 9.0}, "replay.n_step": {"replay": {"n_step": 3}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_can_not_be_played_side_by_side_says_why(name: str) -> None:
+    assert why_not(config_of("coop", REFUSED[name])).startswith(f"{name}: only ")
