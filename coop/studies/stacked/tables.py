@@ -128,6 +128,7 @@ class Tables:
             self.columns["actions"][k, rows].astype(np.int32), np.ones(size, np.float32),
             self.columns["terminated"][k, rows], np.ones(size, np.float32), ids=seen[0],
             param_version=self.columns["param_version"][k, rows], age=seen[1], reuse=seen[2].astype(np.int32),
+            span=np.ones(size, np.uint8),
         )  # fmt: skip
 
     def kept(self, runs: NDArray[np.intp]) -> Tables:
