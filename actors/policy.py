@@ -26,6 +26,7 @@ class Policy:
         actions = np.empty(len(obs), np.int32)
         random = (self._rng.random(len(obs)) < epsilon).nonzero()[0]
         if len(random) < len(obs):
+            # (greedy action)
             actions[:] = self.networks[self.acting].q_values(obs, self._spec).argmax(1)
         if len(random):
             actions[random] = self._rng.integers(self._spec.num_actions, size=len(random), dtype=np.int32)

@@ -130,6 +130,7 @@ class Agent:
 
         It stays with one array library on one device, and no value decides what it does.
         """
+        # (roles of the networks)
         online, target, settings = self._networks[acting], self._networks[1 - acting], self.config.learner
         inputs, size = online.inputs(given.frames, given.index), len(given.columns.actions)
         first = None
@@ -191,6 +192,7 @@ class Agent:
     def swap(self) -> None:
         """Change the acting role; for the one-network methods, copy the network to its target."""
         if self.config.two_networks:
+            # (swap)
             self.acting = 1 - self.acting
         else:
             self._networks[1].load(self.networks[0].flat)
@@ -237,6 +239,7 @@ class Agent:
 
     def _draw_s(self) -> float:
         s = self.feedback_scale()
+        # (draw of s)
         return s * float(self._noise.standard_normal()) if self.config.edl.noise == "normal" and s else s
 
     def _learning_rate(self) -> float:
@@ -247,6 +250,7 @@ class Agent:
         self.updates += 1
         self.versions[self.acting] = self.updates
         settings = self.config.learner
+        # (swap due)
         due = settings.swap_unit == "updates" and self.updates % self.config.swap_period == 0
         if due:
             self.swap()

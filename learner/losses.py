@@ -92,7 +92,9 @@ def td_errors(batch: Columns[ArrayT], values: ArrayT, bootstrap: ArrayT, value_b
     values: y = Q(x), float32 [batch, actions]. bootstrap: V(x'), float32 [batch], clipped to +-value_bound.
     """
     if value_bound is not None:
+        # (bound of targets)
         bootstrap = bootstrap.clip(-value_bound, value_bound)
+    # (td error)
     errors: ArrayT = chosen(values, batch.actions) - (batch.rewards + batch.discounts * bootstrap)
     return errors
 
@@ -104,6 +106,7 @@ def output_error(batch: Columns[ArrayT], slopes: ArrayT, outputs: ArrayT) -> Arr
 
     slopes: float32 [batch], of each transition's loss. outputs: an array of the result's shape and memory layout.
     """
+    # (cotangent of the output)
     return placed(slopes * batch.weights / len(slopes), batch.actions, outputs)
 
 

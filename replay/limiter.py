@@ -118,6 +118,7 @@ class RateLimiter:
     @property
     def slack(self) -> float:
         """Steps by which inserts may be ahead of updates, or behind them; see the promise above."""
+        # (slack)
         return max(self.tolerance, 0.5 / self.ratio)
 
     def measured(self, inserted: int, drawn: int) -> float | None:
@@ -129,6 +130,7 @@ class RateLimiter:
     def ahead(self, inserted: int, drawn: int) -> float:
         """Environment steps by which inserts are ahead of updates."""
         origin_inserted, origin_drawn = self.origin or (self.start, 0)
+        # (ahead)
         return (inserted - origin_inserted) - (drawn - origin_drawn) / self.ratio
 
     def _complete(self) -> str:

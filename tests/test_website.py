@@ -45,19 +45,30 @@ def test_every_command_and_preset_is_in_the_reference() -> None:
     assert "| `pong-small` | `pong` | 1,000,000 | 10,000 |" in reference.presets_reference()
 
 
-@pytest.mark.parametrize("page", [page for page in pages.page_names() if places.quotes(pages.read(page))])
-def test_quoted_lines_are_in_the_code(page: str) -> None:
-    for file, code in places.quotes(pages.read(page)):
-        line = places.line_of(file, code)
-        assert f"`{file}`, line {line}: `{code}`" in assembled(page)
-        assert code in (pages.ROOT / file).read_text(encoding="utf-8").splitlines()[line - 1]
+@pytest.mark.parametrize("page", [page for page in pages.page_names() if places.marks(pages.read(page))])
+def test_marked_lines_are_quoted(page: str) -> None:
+    for file, mark in places.marks(pages.read(page)):
+        number, code = places.marked(file, mark)
+        lines = (pages.ROOT / file).read_text(encoding="utf-8").splitlines()
+        assert (lines[number - 2].strip(), lines[number - 1].strip()) == (mark, code)
+        assert f"`{file}`, line {number}: `{code}`" in assembled(page)
 
 
-def test_a_quote_that_is_nowhere_or_twice_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"learner/agent\.py: 0 lines, not one, hold `acting = 2`"):
-        places.with_lines("`learner/agent.py`: `acting = 2`")
-    with pytest.raises(ValueError, match="lines, not one, hold `return`"):
-        places.with_lines("`learner/agent.py`: `return`")
+def test_every_mark_has_its_page() -> None:
+    named = {each for page in pages.page_names() for each in places.marks(pages.read(page))}
+    there = {
+        (path.relative_to(pages.ROOT).as_posix(), line.strip())
+        for top in ("actors", "common", "learner", "replay")
+        for path in (pages.ROOT / top).rglob("*.py")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if re.fullmatch(r"\s*# \([^)]+\)", line)
+    }
+    assert there == named
+
+
+def test_a_mark_that_is_nowhere_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"learner/agent\.py: 0 lines, not one, are `# \(acting\)`"):
+        places.with_lines("`learner/agent.py`: `# (acting)`")
 
 
 def test_generated_parts_are_filled_in() -> None:

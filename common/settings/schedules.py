@@ -13,6 +13,7 @@ def epsilon(settings: ActorSettings, env_step: int) -> float:
     """Probability of a random action after `env_step` environment steps."""
     start, final, progress = settings.epsilon_start, settings.epsilon_final, env_step / settings.epsilon_steps
     if settings.epsilon_decay == "exponential":
+        # (epsilon)
         return final + (start - final) * math.exp(-progress)
     return linear(start, final, progress)
 
@@ -25,6 +26,7 @@ def linear(start: float, final: float, progress: float) -> float:
 def feedback_scale(settings: EdlSettings, update: int) -> float:
     """The paper's s before any N(0, 1) draw: rate * decay^(update / decay_every), with integer powers if stepwise."""
     power = update // settings.decay_every if settings.decay_stepwise else update / settings.decay_every
+    # (decay of s)
     return settings.rate * float(settings.decay**power)
 
 

@@ -108,6 +108,7 @@ class _Layer:
             mixing = torch.diag_embed(lengths + _SHORT * longest)
         else:
             mixing = longest[:, :, None] * self._inside
+        # (independent rows)
         mixing = delta * mixing * ~independent(gram, self._limit)[:, None, None]
         crossed = self._t[:, :, : gram.shape[1]].double() @ mixing.mT
         return gram + crossed + crossed.mT + mixing @ mixing.mT, mixing

@@ -78,6 +78,7 @@ class FeedbackRule(Generic[ArrayT]):
             branches.run(partial(self.backprop.write_gradients, tape, index, delta, out), delta)
             if self.feedback == "weight-gradient" and _given(s):
                 gradient = out[self.backprop.names[index] + "weight"]
+                # (weight-gradient)
                 gradient += s * _polar_of_gradient(gradient, delta, tape.inputs[index], self._rng)
         branches.join()
         self.backprop.write_rest(tape, error, out)
@@ -102,6 +103,7 @@ class FeedbackRule(Generic[ArrayT]):
             generator = torch.Generator().manual_seed(self._seed * 1000 + layer)
             draw = torch.randn(error.shape[1], size, generator=generator, dtype=torch.float64) / math.sqrt(size)
             self._fixed[index] = convert_like(draw, error)
+        # (random feedback)
         delta: ArrayT = (error @ self._fixed[index]).reshape(shape)
         return delta
 

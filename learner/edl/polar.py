@@ -66,6 +66,7 @@ def _whitened_pairs(g: ArrayT, e: ArrayT, limits: _Limits) -> tuple[ArrayT, Arra
     doubtful = None if float(margin.min()) > 0 else ~(margin > 0)
     d = determinant**0.5
     scale = d * (trace + 2 * d) ** 0.5
+    # (inverse root of G)
     top: ArrayT = ((b + d) * first - c * second) / scale
     white = namespace(g).empty((*top.shape, 2), dtype=top.dtype, device=top.device)
     white[..., 0] = top

@@ -44,6 +44,7 @@ class Transforms(Generic[ArrayT]):
         self._batch, self._actions = tape.output.shape
         self._dtype = tape.output.dtype
         self._basis = _basis(backprop.output_weight, at_least_float32(tape.output))
+        # (cotangents of all actions)
         walk = backprop.cotangents(tape, in_dtype(self._basis[None], self._dtype))
         self._linear_end = next(walk)[0] if backprop.output_weight is not None else None
         # The layers held, last first: step, shape of its output, and T as [batch or 1, A, n].
@@ -61,6 +62,7 @@ class Transforms(Generic[ArrayT]):
         s: a number, or a tensor of one where the arrays are tensors.
         """
         if self._linear_end is not None:
+            # (last layer)
             yield self._linear_end, error * (1 + s)
         if not self._ts:
             return
@@ -71,11 +73,14 @@ class Transforms(Generic[ArrayT]):
                 yield index, in_dtype(_shaped(one, shape), self._dtype)
             return
         white, doubtful = whitened(self._grams(), e)
+        # (weights of T)
         weights = e + s * white
         for i, (index, shape) in enumerate(self._layers):
+            # (sigma)
             sigma = self._backprop.combine(weights[i], self._ts[i])
             if doubtful is not None and doubtful[i].any():
                 where = doubtful[i]
+                # (by SVD)
                 sigma[where] += s * (e[where][:, None] @ self._by_svd(i, where))[:, 0]
             yield index, in_dtype(_shaped(sigma, shape), self._dtype)
 

@@ -42,6 +42,7 @@ class UpdateRule:
         next_values: Q_target(x'), float32 [batch, actions]. preferred: float32 [batch, actions], the values by which
         the next action is chosen: the trained network's with `learner.double`, or `next_values`.
         """
+        # (double targets)
         return chosen(next_values, preferred.argmax(1))
 
     def add_cost(self, online: QNetwork, target: QNetwork, inputs: AnyArray, update: int) -> None:
