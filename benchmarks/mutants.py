@@ -57,7 +57,7 @@ def results() -> Iterator[tuple[str, dict[str, int | None]]]:
     for meta in sorted(Path("mutants").rglob("*.py.meta")):
         statuses = json.loads(meta.read_text(encoding="utf-8"))["exit_code_by_key"]
         if statuses:
-            yield str(meta.relative_to("mutants")).removesuffix(".meta"), statuses
+            yield str(meta.relative_to("mutants/coop")).removesuffix(".meta"), statuses
 
 
 def tally(file: str, statuses: dict[str, int | None], justified: set[Change]) -> Tally:
