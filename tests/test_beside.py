@@ -80,7 +80,9 @@ def test_a_cell_that_another_process_runs_is_not_taken_along(tmp_path: Path) -> 
         assert executor.start(cells[2]), "taken along"
         assert not executor.start(cells[1])
         assert executor.slots() == 2
-        arguments = Path(f"/proc/{executor._processes[cells[0].cell.name].pid}/cmdline").read_text().split("\0")
+        command, arguments = Path(f"/proc/{executor._processes[cells[0].cell.name].pid}/cmdline"), [""]
+        while not any("seed=" in each for each in arguments):  # until the process has become the command
+            arguments = command.read_text().split("\0")
         assert [Path(each).name for each in arguments if "seed=" in each] == ["dqn-seed=4", "dqn-seed=6"]
     finally:
         executor.stop(60)

@@ -81,22 +81,6 @@ def test_an_id_names_a_module_or_a_game() -> None:
     assert RunConfig(env=EnvSettings(id="my.envs:Room")).imports == {"env.id": "my.envs:Room"}
 
 
-def earlier(env_id: str) -> dict[str, Any]:
-    """A resolved config of the version before `env.grayscale`, whose default stack was 4."""
-    tables = to_tables(RunConfig(env=EnvSettings(id=env_id, stack=4)))
-    del tables["env"]["grayscale"], tables["env"]["kwargs"]
-    return tables
-
-
-@pytest.mark.parametrize(
-    ("env_id", "stack"), [("CartPole-v0", 1), ("coop/Corridor-v0", 1), ("coop/Catch-v0", 4), ("breakout", 4)]
-)
-def test_configs_of_earlier_versions_stacked_pictures_only(env_id: str, stack: int) -> None:
-    config = resolve(earlier(env_id))
-    assert config.env == EnvSettings(id=env_id, stack=stack)
-    assert resolve(to_tables(config)) == config
-
-
 def test_a_stack_of_vectors_is_kept_today() -> None:
     assert resolve({"env": {"id": "CartPole-v0", "stack": 4}}).env.stack == 4
     assert resolve(to_tables(RunConfig(env=EnvSettings(stack=4)))).env.stack == 4
