@@ -191,6 +191,5 @@ def test_sweeps_in_containers_that_look_alike_run_each_cell_once(tmp_path: Path)
     assert len(ran) == len(set(ran)) == 8, ran
     logs = [log.read_text() for log in (tmp_path / "d").glob("*/run.log")]
     assert sum(log.count("complete: 60 steps") for log in logs) == 8  # one process may play several cells
-    assert sum(log.count("starts in") for log in logs) == 8
     assert not list((tmp_path / "d").glob("sweep.toml.*"))
     until(lambda: not list((tmp_path / "d").glob("*.part")))
