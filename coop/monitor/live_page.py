@@ -43,7 +43,7 @@ class LivePage:
         self._notice, self._ended = "waiting for the learner", False
         self._asked_at = -math.inf
         self._told_end = threading.Event()
-        html = files("deploy").joinpath("page.html").read_bytes()
+        html = files("coop.monitor").joinpath("page.html").read_bytes()
         self._server = WebServer(
             "--web",
             address,
