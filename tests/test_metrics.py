@@ -28,6 +28,16 @@ from coop.records.run_directory import RunDirectory
 from coop.records.sources import base_config
 from website.assemble import assembled
 
+# Names that dashboards rely on; they stay. Those of metrics.jsonl are in tests/test_topology.py.
+PROMETHEUS = """env_steps_total updates_total episodes_total bad_messages_total faults_total return_mean_100 epsilon s
+    env_steps_per_s updates_per_s seconds acting size capacity ratio_target ratio_measured ratio_ahead ratio_least
+    ratio_most td_error loss q_gap q_abs_mean q_bound sample_age_mean sample_age_p95 reuse_mean evicted_unsampled
+    weight_lag_mean"""
+TAGS = """charts/SPS charts/updates_per_second charts/epsilon losses/td_loss losses/td_error train/update train/acting
+    train/s train/q_gap train/q1_mean train/q2_mean train/q_abs_mean train/archive_td_error train/archive_drift
+    train/policy_churn train/dormant_share train/effective_rank train/q_bound train/replay_size train/terminal_share
+    train/sample_age_mean train/sample_age_p95 train/reuse_mean train/distinct_share train/evicted_unsampled
+    train/weight_lag_mean"""
 LIVE = [metric for metric in METRICS if metric.field]
 
 
@@ -62,6 +72,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 def test_names_are_unique_and_those_of_the_messages() -> None:
     names = [metric.name for metric in METRICS]
     assert len(set(names)) == len(names)
+    assert {f"coop_{name}" for name in PROMETHEUS.split()} <= {metric.prometheus for metric in METRICS}
+    assert set(TAGS.split()) <= {metric.tensorboard for metric in METRICS}
     for metric in METRICS:
         assert metric.field in {"", metric.name, f"measured.{metric.name}", metric.name.replace("ratio_", "ratio.")}
         assert bool(metric.line) == bool(metric.words)
