@@ -16,6 +16,7 @@ AHEAD = "Steps by which acting is ahead of learning"
 ERRORS = "Mean |TD error| and loss"
 Q_VALUES = "Mean |Q| against its bound"
 AGE = "Age of the samples, environment steps"
+TERMINAL = "Share of terminal transitions"
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,10 @@ METRICS = (
         chart=AHEAD, curve="most", bound=True),
     _row("td_error", "mean absolute TD error", tag="losses/td_error", chart=ERRORS, curve="|TD error|"),
     _row("loss", "mean loss", tag="losses/td_loss", chart=ERRORS, curve="loss"),
-    _row("terminal_share", "share of terminal transitions in the replay table"),
+    _row("terminal_share", "share of terminal transitions in the replay table", line="table", words="{:.2%} terminal",
+        chart=TERMINAL, curve="in the table"),
+    _row("terminal_drawn_share", "share of terminal transitions among those drawn", line="table",
+        words=" ({:.2%} of those drawn)", chart=TERMINAL, curve="drawn"),
     _row("sample_age_mean", "mean age of the transitions drawn", "steps", line="table",
         words="samples {:,.0f} steps old", chart=AGE, curve="mean"),
     _row("sample_age_p95", "95th percentile of the age of the transitions drawn", "steps", line="table",
