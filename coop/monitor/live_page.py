@@ -60,7 +60,7 @@ class LivePage:
         self.url = self._server.url
 
     def show(self, status: LearnerStatus | None, events: Sequence[str], silent: float, ended: str) -> None:
-        """See `coop.monitor.status.Page`."""
+        """See `coop.monitor.watch.Page`."""
         with self._lock:
             if status is not None and status is not self._status:
                 self._curves.add(status)
