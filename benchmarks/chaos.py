@@ -16,7 +16,7 @@ from coop.common.messaging.transport import new_incarnation
 from coop.common.process import cli
 from coop.common.process.lifecycle import run_main
 from coop.common.process.processes import ChildProcess, command, free_endpoint
-from coop.monitor.status import RunStatus
+from coop.monitor.watch import RunStatus
 from coop.records.summaries import read_summary
 
 TICK = 0.05  # seconds

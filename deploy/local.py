@@ -21,7 +21,7 @@ from coop.common.settings.config import RunConfig, check_distributed
 from coop.common.settings.resuming import settings_digest
 from coop.common.settings.tables import to_toml
 from coop.deploy.supervisor import RestartPolicy
-from coop.monitor.status import Display, Page, RunStatus, live_page
+from coop.monitor.watch import Display, Page, RunStatus, live_page
 from coop.records.locks import RunLock
 from coop.records.run_options import LearnerRunOptions, parse_run
 

@@ -22,6 +22,8 @@ from coop.common.messaging.messages.status import (
 )
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import Node
+from coop.common.metrics import MEASURED
+from coop.common.numbers import finite
 from coop.common.process.console import Console
 from coop.common.process.rates import Rate
 from coop.learner.join_service import JoinService
@@ -88,7 +90,7 @@ class StatusReporter:
             size=size,
             capacity=config.replay.capacity,
             return_history=trainer.telemetry.history.values,
-            measured=None if metrics is None else _measured(metrics),
+            measured=None if metrics is None else measured(metrics),
             bad_messages=self._node.bad_messages,
             faults=self._node.faults.count,
             **members,
@@ -178,9 +180,9 @@ def _wait(who: str, other: str, share: float, reason: str) -> Wait:
     return Wait(who, other if serves else "the replay service", share, reason)
 
 
-def _measured(metrics: dict[str, Any]) -> Measured:
-    known = Measured.__struct_fields__
-    return Measured(**{name: value for name, value in metrics.items() if name in known})
+def measured(metrics: dict[str, Any]) -> Measured:
+    """What a status carries of a row of metrics.jsonl; a number that is not finite is not known."""
+    return Measured(**{name: finite(metrics[name]) for name in MEASURED if name in metrics})
 
 
 def _seconds(count: int, per_second: float) -> float:

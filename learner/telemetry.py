@@ -33,7 +33,7 @@ class Telemetry:
         self.largest_reward = 0.0
         self.q_abs_mean = 0.0
         self._errors: list[NDArray[np.float32]] = []
-        self._batches: list[tuple[Array, Array, Array, Array]] = []
+        self._batches: list[tuple[Array, ...]] = []
         self._began = (now, 0, 0)
 
     def add_errors(self, errors: Values) -> None:
@@ -46,12 +46,12 @@ class Telemetry:
         self.largest_reward = max(self.largest_reward, float(np.abs(batch.rewards).max()))
         # Copies, because views would keep a whole message alive.
         lag = agent.updates - batch.param_version
-        self._batches.append((batch.age.copy(), batch.reuse.copy(), lag, batch.ids.copy()))
+        self._batches.append((batch.age.copy(), batch.reuse.copy(), lag, batch.terminated.copy(), batch.ids.copy()))
 
     def row(self, agent: Agent, drawn: Drawn, epsilon: float, now: float) -> dict[str, Any]:
         """The metrics of the updates since the last row, of which there must be at least one."""
         errors = np.concatenate(self._errors)
-        age, reuse, lag = (np.concatenate([arrays[i] for arrays in self._batches]) for i in range(3))
+        age, reuse, lag, terminal = (np.concatenate([arrays[i] for arrays in self._batches]) for i in range(4))
         distinct = sum(len(set(ids.tolist())) for *_, ids in self._batches)
         began, updates, steps = self._began
         seconds = max(now - began, 1e-9)
@@ -73,6 +73,7 @@ class Telemetry:
             "env_steps_per_s": (drawn.inserted - steps) / seconds,
             "replay_size": drawn.size,
             "terminal_share": drawn.terminal / max(1, drawn.size),
+            "terminal_drawn_share": float(terminal.mean()),
             "sample_age_mean": float(age.mean()),
             "sample_age_p95": float(np.percentile(age, 95)),
             "sample_age_histogram": powers_of_two(age),

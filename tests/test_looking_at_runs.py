@@ -26,7 +26,7 @@ from commands import run_command
 from coop.common.messaging.messages.status import LearnerStatus
 from coop.common.messaging.transport import new_incarnation
 from coop.common.process.processes import free_endpoint
-from coop.monitor.status import RunStatus
+from coop.monitor.watch import RunStatus
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 # Unbuffered, Python drops what is left of a write that a signal has cut short.

@@ -20,8 +20,9 @@ from coop.common.process.processes import free_endpoint
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_directory import RunDirectory
 from coop.records.sources import base_config
+from website.assemble import assembled
 
-PAGE = (Path(__file__).parents[1] / "docs" / "watching.md").read_text(encoding="utf-8")
+PAGE = assembled("docs/watching.md")
 BLOCK, HEADER = 32768, 7  # bytes, of the log in which wandb keeps its records
 
 

@@ -18,6 +18,7 @@ import pytest
 import torch
 from commands import run_command
 
+from coop.common.metrics import COLUMNS
 from coop.lockstep.reexecute import reexecute
 from coop.records.kept import load_learner
 
@@ -101,9 +102,10 @@ def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, 
     assert len(rows) == summary["episodes"]
     assert [int(row["episode"]) for row in rows] == list(range(len(rows)))
     metrics = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    assert COLUMNS.issuperset(METRICS), "names stay"
     # What is compared with the last row begins with the second.
-    assert list(metrics[0]) == [name for name in METRICS if name not in {"archive_drift", "policy_churn"}]
-    assert all(list(row) == METRICS for row in metrics[1:])
+    assert metrics[0].keys() == COLUMNS - {"archive_drift", "policy_churn"}
+    assert all(row.keys() == COLUMNS for row in metrics[1:])
     assert list((path / "tb").iterdir())
     if outcome == "complete":
         env_steps, updates = summary["env_steps"], summary["updates"]

@@ -29,8 +29,9 @@ def batches() -> Iterator[Batch]:
     table = Table(SPEC, 100, rng=np.random.default_rng(0))
     for sequence in range(10):
         frames = np.random.default_rng(sequence).standard_normal((9, 4)).astype(np.float32)
-        versions = np.full(8, 3)
-        table.insert(make_segment(SPEC, sequence, 8, frames=frames, param_version=versions, carried=0))
+        versions, ends = np.full(8, 3), np.arange(8) == 7
+        segment = make_segment(SPEC, sequence, 8, frames=frames, param_version=versions, terminated=ends, carried=0)
+        table.insert(segment)
     while True:
         yield table.sample(32)
 
@@ -73,7 +74,8 @@ def test_a_row_of_metrics_every_200_updates() -> None:
     assert trainer.metrics is row
     assert Trainer(Agent(CONFIG, SPEC), 0.0).metrics is None
     source = batches()
-    errors = np.concatenate([reference.update(next(source)).td_errors for _ in range(400)][200:])
+    drawn_then = [next(source) for _ in range(400)]
+    errors = np.concatenate([reference.update(batch).td_errors for batch in drawn_then][200:])
     assert row["td_error"] == pytest.approx(np.abs(errors).mean(), rel=1e-5)
     assert row["loss"] == pytest.approx((0.5 * errors**2).mean(), rel=1e-5)
     assert (row["update"], row["env_step"], row["acting"]) == (400, 499, 1)
@@ -85,6 +87,8 @@ def test_a_row_of_metrics_every_200_updates() -> None:
     assert row["evicted_unsampled"] == 5 / 20
     assert row["replay_size"] == 80
     assert row["terminal_share"] == 8 / 80
+    ended = [batch.terminated.mean() for batch in drawn_then[200:]]
+    assert row["terminal_drawn_share"] == pytest.approx(np.mean(ended))
 
 
 def test_q1_and_q2_are_compared_on_the_first_64_states() -> None:

@@ -19,6 +19,7 @@ _PARTS = {
     "settings": reference.settings_reference,
     "presets": reference.presets_reference,
     "commands": reference.commands_reference,
+    "metrics": reference.metrics_reference,
 }
 _FILES = ("LICENSE", "CITATION.cff", "docs/**/*.svg", "results/**/*.png", "results/**/*.svg", "benchmarks/plots/*.png")
 

@@ -1,4 +1,4 @@
-"""The references of settings and of commands, as Markdown, from the settings' fields and the commands' parsers."""
+"""The references of settings, commands and metrics, as Markdown, from the code that defines them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pydantic
 
 from coop.actors.cli import ActorOptions
 from coop.common.bounds import MAX_INTEGER
+from coop.common.metrics import METRICS
 from coop.common.process.flags import Flag, sections
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS, table_of
@@ -81,6 +82,17 @@ def commands_reference() -> str:
         rows = [(_form(flag), _default(flag), flag.text) for flag in flags]
         parts.append(f"### `{command}`\n\n{also}" + _table(("flag", "default", "meaning"), rows))
     return "\n".join(parts)
+
+
+def metrics_reference() -> str:
+    """A table of the metrics: what each is, its unit, and its name wherever it is shown."""
+    head = ("metric", "what it is", "unit", "`metrics.jsonl`", "JSON", "Prometheus", "TensorBoard", "screen", "page")
+    rows = []
+    for each in METRICS:
+        names = (each.column, each.field, each.prometheus, each.tensorboard, each.line)
+        code = [f"`{name}`" if name else "" for name in names]
+        rows.append((f"`{each.name}`", each.meaning, each.unit, *code, each.chart))
+    return _table(head, rows)
 
 
 def field_name(flag: Flag) -> str:

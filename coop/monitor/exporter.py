@@ -3,54 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from coop.common.errors import UsageError
 from coop.common.messaging.messages.status import LearnerStatus
-from coop.common.process.ports import http_address
-
-COUNTERS = {
-    "env_steps": "environment steps",
-    "updates": "updates",
-    "episodes": "episodes that have ended",
-    "bad_messages": "messages that the learner refused",
-    "faults": "errors of this program that the learner survived",
-}
-GAUGES = {
-    "return_mean_100": "mean return of the last 100 episodes",
-    "epsilon": "share of random actions",
-    "s": "scale of s, the exploration of error-driven learning",
-    "env_steps_per_s": "environment steps per second",
-    "updates_per_s": "updates per second",
-    "seconds": "seconds that the run has taken",
-    "acting": "number of the network that acts and learns",
-    "size": "transitions in the replay table",
-    "capacity": "capacity of the replay table",
-}
-RATIO = {
-    "target": "replay ratio as set, updates per environment step",
-    "measured": "replay ratio since learning began",
-    "ahead": "environment steps by which acting is ahead of learning",
-    "least": "least value of coop_ratio_ahead that the limiter allows",
-    "most": "largest value of coop_ratio_ahead that the limiter allows",
-}
-MEASURED = {
-    "td_error": "mean absolute TD error",
-    "loss": "mean loss",
-    "q_gap": "mean distance between the two networks' Q-values",
-    "q_abs_mean": "mean absolute Q-value",
-    "q_bound": "largest absolute Q-value that the rewards seen allow",
-    "sample_age_mean": "mean age of the samples, environment steps",
-    "sample_age_p95": "95th percentile of the age of the samples",
-    "reuse_mean": "mean number of draws of a sample so far",
-    "evicted_unsampled": "share of transitions evicted without ever being drawn",
-    "weight_lag_mean": "updates by which the weights were old that played the samples",
-}
-
+from coop.common.metrics import METRICS
+from coop.monitor.facts import values
+from coop.monitor.web import Document, WebServer
 
 Values = dict[tuple[str, ...], float]  # by the values of the labels that a metric has of its own
 
@@ -67,19 +29,13 @@ class StatusCollector(Collector):
         if status is None:
             return
         labels = {"env": status.env, "method": status.method, "seed": str(status.seed)}
-        for name, text in COUNTERS.items():
-            counter = CounterMetricFamily(f"coop_{name}", text, labels=list(labels))
-            counter.add_metric(list(labels.values()), getattr(status, name))
-            yield counter
-        for source, prefix, told in (
-            (status, "", GAUGES),
-            (status.ratio, "ratio_", RATIO),
-            (status.measured, "", MEASURED),
-        ):
-            for name, text in told.items():
-                value = getattr(source, name, None)
-                if value is not None:
-                    yield _gauge(f"coop_{prefix}{name}", text, labels, {(): value})
+        known = values(status)
+        for metric in METRICS:
+            if metric.name in known:
+                family = CounterMetricFamily if metric.counter else GaugeMetricFamily
+                of_run = family(f"coop_{metric.name}", metric.meaning, labels=list(labels))
+                of_run.add_metric(list(labels.values()), known[metric.name])
+                yield of_run
         members: Values = {(role,): float(number) for role, number in status.connected.items()}
         yield _gauge("coop_members", "connected processes", labels, members, ("role",))
         yield _gauge(
@@ -90,15 +46,9 @@ class StatusCollector(Collector):
         yield _gauge("coop_wait_share", text, labels, waits, ("who", "for_whom"))
 
 
-def _gauge(
-    name: str,
-    text: str,
-    labels: dict[str, str],
-    values: Values,
-    keys: tuple[str, ...] = (),
-) -> GaugeMetricFamily:
+def _gauge(name: str, text: str, labels: dict[str, str], known: Values, keys: tuple[str, ...] = ()) -> Metric:
     gauge = GaugeMetricFamily(name, text, labels=[*labels, *keys])
-    for key, value in values.items():
+    for key, value in known.items():
         gauge.add_metric([*labels.values(), *key], value)
     return gauge
 
@@ -106,16 +56,8 @@ def _gauge(
 @contextmanager
 def exported(address: str, read: Callable[[], LearnerStatus | None]) -> Iterator[int]:
     """Serve the metrics at PORT or HOST:PORT; yield the port. Raises UsageError if that can't be done."""
-    host, port = http_address("--prometheus", address)
     registry = CollectorRegistry(auto_describe=False)
     registry.register(StatusCollector(read))
-    try:
-        server, thread = start_http_server(port, host, registry)
-    except OSError as error:
-        raise UsageError(f"--prometheus {address}: {error.strerror or error}") from error
-    try:
-        yield server.server_port
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    document = {path: lambda: Document(CONTENT_TYPE_LATEST, generate_latest(registry)) for path in ("/", "/metrics")}
+    with closing(WebServer("--prometheus", address, document)) as server:
+        yield server.port

@@ -2,33 +2,42 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from coop.common.messaging.messages.status import LearnerStatus, Member, Wait
+from coop.common.metrics import METRICS
 from coop.common.process.console import averaged_over, counted
 from coop.monitor.display import printable
 
 SILENT_AFTER = 3.0  # seconds without a status, after which displays say so
 
 
+def values(status: LearnerStatus) -> dict[str, float]:
+    """What is known of the metrics that a status carries, by name."""
+    found = {}
+    for metric in METRICS:
+        if metric.field:
+            value: Any = status
+            for name in metric.field.split("."):
+                value = getattr(value, name, None)
+            if value is not None:
+                found[metric.name] = value
+    return found
+
+
 def facts(status: LearnerStatus) -> dict[str, str]:
     """The figures of a run by their labels, in the order in which they are shown; lines end with a newline."""
-    episodes = status.episodes
+    lines, episodes = _lines(status), status.episodes
     returns = f"{status.return_mean_100:.1f}, mean of {averaged_over(episodes)}"
-    driven = f", s = {status.s:.3g} (error-driven)" if status.s else ""
     told = {
         "steps": f"{status.env_steps:,} of {status.total_steps:,}",
         "return": returns if episodes else "no episode has ended yet",
         "acting": _acting(status),
-        "exploration": f"{status.epsilon:.1%} random actions (epsilon){driven}",
-        "speed": f"{status.env_steps_per_s:,.0f} steps/s, {status.updates_per_s:,.0f} updates/s",
-        "table": _table(status),
+        **{label: lines.pop(label) for label in ("exploration", "speed", "table")},
         "ratio": _ratio(status),
         "waiting": "\n".join(map(_sentence, status.waits)) or "nobody",
+        **lines,
     }
-    if (measured := status.measured) is not None:
-        bound = "" if measured.q_bound is None else f" of at most {measured.q_bound:.4g}"
-        gap = f"; the networks differ by {measured.q_gap:.3g} (Q gap)" if status.two_networks else ""
-        told["weight lag"] = f"samples were played with weights {measured.weight_lag_mean:,.0f} updates old"
-        told["Q-values"] = f"mean |Q| {measured.q_abs_mean:.4g}{bound}{gap}"
     return told | ({"warning": printable(status.warning)} if status.warning else {})
 
 
@@ -76,11 +85,20 @@ def _acting(status: LearnerStatus) -> str:
     return f"the network is copied to its target in {phase}"
 
 
-def _table(status: LearnerStatus) -> str:
-    text = f"{status.size:,} of {status.capacity:,} transitions"
-    if (measured := status.measured) is None:
-        return text
-    return f"{text}; samples {measured.sample_age_mean:,.0f} steps old (p95 {measured.sample_age_p95:,.0f})"
+def _lines(status: LearnerStatus) -> dict[str, str]:
+    """The lines that the table of metrics describes, by label."""
+    known = values(status)
+    if not status.s:
+        del known["s"]
+    if not status.two_networks:
+        known.pop("q_gap", None)
+    lines: dict[str, str] = {}
+    for metric in METRICS:
+        if metric.line and metric.name in known:
+            words, before = metric.words.format(known[metric.name]), lines.get(metric.line, "")
+            joint = "; " if before and words[0] not in " ," else ""
+            lines[metric.line] = f"{before}{joint}{words}"
+    return lines
 
 
 def _ratio(status: LearnerStatus) -> str:

@@ -35,6 +35,7 @@ class WebServer:
         documents: functions that give the answers, by path; they are called from several threads.
 
     Attributes:
+        port: it listens there.
         url: of the path "/".
 
     Raises:
@@ -54,8 +55,9 @@ class WebServer:
             self._server = Server((host, port), Handler)
         except OSError as error:
             raise UsageError(f"{flag} {address}: {error.strerror or error}") from error
+        self.port: int = self._server.server_address[1]
         named = f"[{host}]" if ":" in host else host
-        self.url = f"http://{named}:{self._server.server_address[1]}/"
+        self.url = f"http://{named}:{self.port}/"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="web server")
         self._thread.start()
 

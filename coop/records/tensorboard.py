@@ -17,17 +17,10 @@ from tensorboard.compat.proto.tensor_pb2 import TensorProto
 from tensorboard.compat.proto.types_pb2 import DT_STRING
 from tensorboard.summary.writer.record_writer import RecordWriter
 
+from coop.common.metrics import TAGS
 from coop.common.process.files import LineFile, write_atomic
 from coop.common.process.untrusted import read_bytes
 
-TAGS = {
-    "env_steps_per_s": "charts/SPS",
-    "updates_per_s": "charts/updates_per_second",
-    "epsilon": "charts/epsilon",
-    "loss": "losses/td_loss",
-    "td_error": "losses/td_error",
-}
-"""Names of columns of metrics.jsonl; the other numbers are at train/NAME."""
 # The first tags of an episode, of a row of metrics and of the settings, with which each file begins.
 EPISODE, ROW, SETTINGS = "charts/episodic_return", "losses/q_values", "hyperparameters"
 _FRAME = struct.Struct("<Q4x")  # before a record: its length, and a checksum of that; another follows the record

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import msgspec
 from msgspec import Meta
@@ -14,6 +14,7 @@ from coop.common.messaging.members import ROLES
 from coop.common.messaging.messages.body import bad_field, check_kind
 from coop.common.messaging.messages.weights import Network
 from coop.common.messaging.wire import Message
+from coop.common.metrics import MEASURED
 
 KIND = "status"
 MAX_MEMBERS = 256  # listed in one status
@@ -113,19 +114,17 @@ class Wait(msgspec.Struct, frozen=True):
     reason: Text
 
 
-class Measured(msgspec.Struct, frozen=True):
-    """Columns of the newest row of metrics.jsonl."""
+if TYPE_CHECKING:
 
-    td_error: Real
-    loss: Real
-    q_gap: Real
-    q_abs_mean: Real
-    sample_age_mean: Real
-    sample_age_p95: Real
-    reuse_mean: Real
-    evicted_unsampled: Real
-    weight_lag_mean: Real
-    q_bound: Real | None = None
+    class Measured(msgspec.Struct, frozen=True):
+        """Columns of the newest row of metrics.jsonl, those of `coop.common.metrics.MEASURED`; null if not known."""
+
+        def __init__(self, **columns: float | None) -> None: ...
+
+else:
+    Measured = msgspec.defstruct(
+        "Measured", [(name, Real | None, None) for name in MEASURED], frozen=True, kw_only=True, module=__name__
+    )
 
 
 class LearnerStatus(Status, frozen=True):
