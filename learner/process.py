@@ -103,7 +103,7 @@ def _train(
             mirror=_mirror(config, spec, console),
         )
         steps = trainer.drawn.inserted
-        with RunDirectory(path, config, found, number or None, steps, wandb=options.wandb) as directory:
+        with RunDirectory(path, config, found, number or None, steps, log=options.log) as directory:
             if directory.aside:
                 console.event(directory.aside)
             checkpoints = Checkpoints(node, directory, samples, epochs, console.event)

@@ -28,6 +28,7 @@ from coop.records.checkpoints import LEARNER, RECORDS, checkpoint_numbers
 from coop.records.reading import read_run_config
 from coop.records.resumption import Start, holds_run
 from coop.records.run_ids import has_run_id, read_run_id
+from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.records.sources import base_config
 
 # What --help shows of a run's flags, in this order.
@@ -63,8 +64,9 @@ class RunOptions(RunConfig):
     """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
     allow_import: tuple[str, ...] = ()
     """Modules, such as my_envs, that may be imported even if they lie in the folder of a resumed run or beside it."""
-    wandb: bool = False
-    """Mirror TensorBoard's scalars to Weights & Biases, whose own variables (WANDB_MODE, WANDB_PROJECT) apply."""
+    log: str = DEFAULT_LOG
+    """Where metrics go beside the run's own tables, with commas: tensorboard; wandb and mlflow (extras), whose own
+    variables apply (WANDB_MODE, WANDB_PROJECT, MLFLOW_TRACKING_URI); none for nowhere."""
 
     def run_config(self) -> RunConfig:
         """The checked config of the run; raises UsageError."""
@@ -143,8 +145,7 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
         warn(f"--learner.swap-every: of {options.method}, the flag is --learner.target-update-every")
     for line in without_effect(options, given, lockstep=lockstep):
         warn(line)
-    if options.wandb:
-        check_extra("--wandb", "wandb", "wandb")
+    chosen_sinks(options.log)  # refuses
     if isinstance(options, LearnerRunOptions) and options.prometheus:
         check_extra("--prometheus", "prometheus", "prometheus_client")
     return options

@@ -17,6 +17,7 @@ from coop.common.process.console import say
 from coop.common.process.extras import check_extra
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.suggestions import closest, refusal
+from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.studies.sweep import slurm
 from coop.studies.sweep.display import SweepDisplay
 from coop.studies.sweep.executor import Executor
@@ -42,6 +43,8 @@ class SweepOptions:
     """Folder of the sweep; runs/sweeps/GRID if not given."""
     cell: str | None = None
     """Run only this cell: its name, or its number in the grid, from 0."""
+    log: str = DEFAULT_LOG
+    """Where the runs' metrics go, as --log of coop-lockstep: a group of Weights & Biases, an experiment of MLflow."""
     slurm: bool = False
     """Submit the cells as Slurm job arrays instead of running them on this machine."""
     dask: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
@@ -57,6 +60,7 @@ def _run() -> None:
     options = parse(SweepOptions, "coop-sweep", "Run every cell of a grid once.")
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: must be at least 1")
+    chosen_sinks(options.log)  # refuses
     if options.dask is not None:
         if options.slurm:
             raise UsageError("--dask and --slurm: give one of them")
@@ -67,7 +71,8 @@ def _run() -> None:
     claim_folder(grid, cells, folder)
     if options.slurm:
         left = [cell.cell.name for cell in cells if cell.ending() is None]
-        print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
+        submitted = slurm.submit(grid.file, folder, left, options.jobs, options.log) if left else []
+        print(*(submitted or ["every cell is finished"]), sep="\n")
         return
     with _executor(options, grid.file) as executor:
         _work(Runner(cells, executor), folder)
@@ -84,7 +89,8 @@ def _executor(options: SweepOptions, grid: GridFile) -> AbstractContextManager[E
 def chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
     """The cells that the options ask for; raises UsageError if there is none of that name or number."""
     asked = options.cell
-    cells = [CellFolder(folder, cell) for n, cell in enumerate(grid.cells) if asked in (None, cell.name, str(n))]
+    there = [cell for n, cell in enumerate(grid.cells) if asked in (None, cell.name, str(n))]
+    cells = [CellFolder(folder, cell, options.log) for cell in there]
     if not cells:
         names = [cell.name for cell in grid.cells]
         near = closest(str(options.cell), names)

@@ -109,7 +109,12 @@ class LocalProcesses:
 
     def _command(self, folder: CellFolder) -> list[str]:
         # --resume also at the first start, so that a restarted run continues from its newest checkpoint.
-        flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}", "--resume"]
+        flags = [
+            f"--config={folder.path / 'config.toml'}",
+            f"--run-dir={folder.path}",
+            "--resume",
+            f"--log={folder.log}",
+        ]
         modules = [path.partition(":")[0] for path in folder.cell.config.imports.values()]
         flags += ["--allow-import", *modules] if modules else []
         if self._grid.mode == "distributed":

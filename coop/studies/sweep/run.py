@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import tomli_w
 from coop.common.errors import UsageError
 from coop.common.places import absolute
 from coop.common.settings.config import value_of
+from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.records.summaries import read_summary
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
 from coop.studies.sweep.grid import load_grid, parse_grid
@@ -45,6 +46,7 @@ def sweep(
     *,
     jobs: int | None = None,
     quick: bool = False,
+    log: str | Iterable[str] = DEFAULT_LOG,
 ) -> SweepResult:
     """Run every cell of a grid once, and wait; cells that were finished before are not repeated.
 
@@ -53,12 +55,14 @@ def sweep(
         folder: of the sweep; runs/sweeps/GRID if not given.
         jobs: cells to run concurrently; the number of cores if None.
         quick: use the grid's small version.
+        log: where the runs' metrics go beside their files, as of `coop.train`.
 
     Raises:
         UsageError: the grid or a setting is invalid, or the folder holds other runs.
     """
     if jobs is not None and jobs < 1:
         raise UsageError(f"jobs = {jobs}: must be at least 1")
+    names = ",".join(chosen_sinks(log)) or "none"
     if isinstance(grid, Mapping):
         if folder is None:
             raise UsageError("folder: a grid without a name needs one")
@@ -66,7 +70,7 @@ def sweep(
     else:
         checked = load_grid(str(grid), quick)
         path = absolute(default_folder(grid, quick) if folder is None else folder, "folder")
-    cells = [CellFolder(path, cell) for cell in checked.cells]
+    cells = [CellFolder(path, cell, names) for cell in checked.cells]
     claim_folder(checked, cells, path)
     runner = Runner(cells, LocalProcesses(checked.file, jobs))
     try:
