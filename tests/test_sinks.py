@@ -93,7 +93,7 @@ def records(path: Path) -> Iterator[bytes]:
             record = b""
 
 
-def record(run: Lockstep, directory: RunDirectory, rows: int = 2) -> None:
+def play(run: Lockstep, directory: RunDirectory, rows: int = 2) -> None:
     """Play until there are some more rows of metrics."""
     while rows > 0:
         for effects in run.play():
@@ -114,7 +114,7 @@ def test_weights_and_biases_gets_tensorboards_scalars(tmp_path: Path, monkeypatc
     monkeypatch.setenv("WANDB_MODE", "offline")
     run = Lockstep(base_config(["--method", "coop"]))
     with RunDirectory(tmp_path, run.config, log="tensorboard,wandb") as directory:
-        record(run, directory)
+        play(run, directory)
     wandb.teardown()
     run.env.close()
     expected = scalars(tmp_path)
@@ -137,9 +137,9 @@ def test_mlflow_gets_tensorboards_scalars(tmp_path: Path) -> None:
     run, path = Lockstep(config), tmp_path / "run"
     with RunDirectory(path, config, log="tensorboard,mlflow") as directory:
         run_id = directory.run_id()
-        record(run, directory)
+        play(run, directory)
         run.save(directory)
-        record(run, directory)
+        play(run, directory)
     run.env.close()
     resumed = LockstepRun(config, path, "test", Start(resume=True), log="mlflow")
     resumed.play(Stop())
@@ -160,7 +160,7 @@ def test_mlflow_gets_tensorboards_scalars(tmp_path: Path) -> None:
     assert told == pytest.approx(expected), "what was behind the checkpoint was logged twice, with the same values"
 
 
-def mlflow_store(folder: Path) -> Any:  # noqa: ANN401 (of an extra)
+def mlflow_store(folder: Path) -> Any:
     from mlflow import MlflowClient  # noqa: PLC0415
 
     return MlflowClient(tracking_uri=folder.as_uri())
@@ -186,7 +186,7 @@ def test_tensorboards_hparams_show_settings_and_metrics(tmp_path: Path) -> None:
     run = Lockstep(base_config(["--method", "coop"]))
     for name in ("one", "two"):
         with RunDirectory(tmp_path / name, run.config) as directory:
-            record(run, directory, 1)
+            play(run, directory, 1)
     run.env.close()
     multiplexer = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
     context = Context(TBContext(data_provider=MultiplexerDataProvider(multiplexer, str(tmp_path))))
@@ -218,7 +218,7 @@ def test_a_sink_that_fails_does_not_end_the_run(
     monkeypatch.setattr("coop.records.sinks.SINKS", Registry("log", "coop.sinks", type, {"broken": Broken}))
     run = Lockstep(base_config(["--method", "coop"]))
     with RunDirectory(tmp_path / "run", run.config, log="broken") as directory:
-        record(run, directory)
+        play(run, directory)
         lines = capsys.readouterr().out
         assert (
             lines == f"{tmp_path}/run: --log broken: ConnectionError: the server is gone; the run goes on without it\n"
