@@ -29,9 +29,8 @@ from coop.lockstep.run import LockstepRun
 from coop.records.locks import RunLock
 from coop.records.reading import parse_row
 from coop.records.resumption import Start
-from coop.records.run_options import RunOptions
+from coop.records.run_options import RunOptions, chosen_config
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
-from coop.records.sources import chosen_config
 from coop.records.summaries import read_summary
 
 POLL = 0.1  # seconds

@@ -28,7 +28,7 @@ from coop.learner.service import LearnerService
 from coop.learner.shared_epochs import SharedEpochs
 from coop.learner.trainer import Trainer
 from coop.monitor.health import answering
-from coop.records.kept import fitting, load_learner
+from coop.records.learner_checkpoints import fitting, load_learner
 from coop.records.locks import RunLock
 from coop.records.resumption import Survey
 from coop.records.run_directory import RunDirectory, claim_run_directory

@@ -41,7 +41,7 @@ from coop.records.checkpoints import Manifest
 from coop.records.reading import returns_by_step
 from coop.records.resumption import Start, Survey, Whole
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 from coop.studies.report.figures import evaluations
 from coop.studies.report.packing import pack
 from coop.studies.report.study import load_study

@@ -33,8 +33,8 @@ from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
+from coop.records.run_options import base_config
 from coop.records.sinks import Kept, Sink, chosen_sinks
-from coop.records.sources import base_config
 
 PAGE = (Path(__file__).parents[1] / "docs" / "watching.md").read_text(encoding="utf-8")
 BLOCK, HEADER = 32768, 7  # bytes, of the log in which wandb keeps its records

@@ -25,7 +25,7 @@ from coop.common.settings.resuming import settings_digest
 from coop.common.types import Array, EnvSpec
 from coop.learner.qnetwork import make_network
 from coop.records.checkpoints import EVALUATIONS, RECORDS
-from coop.records.kept import fitting, newest_epoch
+from coop.records.learner_checkpoints import fitting, newest_epoch
 from coop.records.reading import check_records, read_frame, read_jsonl, read_run_config
 from coop.records.summaries import read_summary
 

@@ -17,7 +17,7 @@ from coop.evaluation.episodes import Evaluator
 from coop.learner.initial_networks import load_initial_networks
 from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep, Replaying
-from coop.records.kept import load_learner
+from coop.records.learner_checkpoints import load_learner
 from coop.records.locks import RunLock
 from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
