@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -55,8 +56,8 @@ class RunDirectory:
         self.fallbacks: list[str] = []
         self.aside = ""
         sealed: Mapping[str, Measured] = {}
+        opened = ExitStack()
         try:
-            (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
             newest = None if found is None or number is None else found.of(number)
             run_id = claim_run_directory(path, config, None if newest is None else newest.manifest.run)
             goes_on, names = number is not None, chosen_sinks(log)
@@ -64,6 +65,8 @@ class RunDirectory:
                 names = tuple(dict.fromkeys((*names, DEFAULT_LOG)))  # which has to be cut back as well
             run = Run(path, run_id, path.parent.name if (path.parent / SWEEP).exists() else "")
             self._sinks = ChosenSinks(run, names)
+            opened.callback(self._sinks.close)
+            (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
             if found is not None:
                 self.aside = go_back(found, number)
                 if newest is not None:
@@ -75,9 +78,13 @@ class RunDirectory:
             if goes_on:
                 kept = Kept(_lines(path / RECORDS[0]) - 1, _lines(path / RECORDS[1]), env_step)
             self._files = RecordFiles(run)
+            opened.callback(self._files.close)
             for sink in (self._files, self._sinks):
                 sink.begin({".".join(place): value for place, value in leaves(to_tables(config))}, kept)
-        except OSError as error:
+        except BaseException as error:
+            opened.close()
+            if not isinstance(error, OSError):
+                raise
             raise RunError(f"run directory {path}: {error.strerror or error}") from error
         self._problem = ""
 

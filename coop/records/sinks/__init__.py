@@ -62,7 +62,7 @@ class Sink:
     library: ClassVar[str] = ""
 
     def __init__(self, run: Run) -> None:
-        """Get ready. Whatever it raises refuses the run, before anything in the run directory has been changed."""
+        """Get ready. Whatever it raises refuses the run, before any record has been changed."""
 
     @property
     def problem(self) -> str:

@@ -30,6 +30,7 @@ class RecordFiles(Sink):
 
     def __init__(self, run: Run) -> None:
         self._path = run.path
+        self._files: tuple[LineFile, ...] = ()
 
     def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
         """Create the files, or continue those that a checkpoint seals, which are as long as it says; raises OSError."""
