@@ -208,7 +208,7 @@ class Broken(Sink):
 
     def episode(self, row: EpisodeRow) -> None:
         self.taken += 1
-        if self.taken == 2:
+        if self.taken >= 2:
             raise ConnectionError("the server is gone")
 
 
