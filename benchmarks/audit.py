@@ -12,7 +12,7 @@ import numpy as np
 from coop.common.errors import RunError
 from coop.common.types import Array
 from coop.records.checkpoints import REPLAY
-from coop.records.kept import newest_epoch
+from coop.records.learner_checkpoints import newest_epoch
 
 RESET = 0.05  # CartPole begins an episode with all four numbers within this
 

@@ -298,7 +298,7 @@ def restore(path: Path) -> None:
     """What `coop-local --resume` reads: its own check, the learner's state, the table and the journal."""
     from coop.common.envs.make import env_spec  # noqa: PLC0415
     from coop.learner.roster import Roster  # noqa: PLC0415
-    from coop.records.kept import load_learner  # noqa: PLC0415
+    from coop.records.learner_checkpoints import load_learner  # noqa: PLC0415
     from coop.records.reading import read_run_config  # noqa: PLC0415
     from coop.records.resumption import Start, go_back  # noqa: PLC0415
     from coop.records.run_ids import read_run_id  # noqa: PLC0415

@@ -16,7 +16,7 @@ from dataclasses import replace
 from coop.common.numbers import METRICS_EVERY
 from coop.common.process.threads import use_threads
 from coop.lockstep.lockstep import Lockstep
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 START = 300  # steps before the first update
 BATCHES = 20  # drawn before the measurements

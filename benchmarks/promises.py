@@ -27,7 +27,7 @@ from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.settings.environment import EnvSettings
 from coop.common.types import Array
 from coop.lockstep.lockstep import Lockstep
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 
 class Trusted(CheckedEnv):

@@ -6,7 +6,7 @@ import atexit
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -29,8 +29,8 @@ from coop.lockstep.run import LockstepRun
 from coop.records.locks import RunLock
 from coop.records.reading import parse_row
 from coop.records.resumption import Start
-from coop.records.run_options import RunOptions
-from coop.records.sources import chosen_config
+from coop.records.run_options import RunOptions, chosen_config
+from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.records.summaries import read_summary
 
 POLL = 0.1  # seconds
@@ -146,6 +146,7 @@ def train(
     resume_from: int | None = None,
     overwrite: bool = False,
     allow_import: Collection[str] = (),
+    log: str | Iterable[str] = DEFAULT_LOG,
     **settings: Any,  # noqa: ANN401 (the fields of a run, each checked)
 ) -> TrainingRun:
     """Start a run and return at once.
@@ -163,13 +164,15 @@ def train(
         overwrite: begin anew where `run_dir` holds a run, which is moved to its folder aside/.
         allow_import: modules of a resumed run's environment or network that may be imported even if they lie in its
             folder or beside it; those that `settings` name need not be listed.
+        log: where metrics go beside the run's own files: names of sinks in a list, or in a text with commas:
+            "tensorboard", "wandb", "mlflow" (extras of these names); "none" for nowhere.
         settings: fields of a run; a table as a mapping: `seed=1, total_steps=20_000, replay={"capacity": 500}`.
 
     Raises:
         UsageError: a setting is invalid, `run_dir` holds a run already, or one that can't be resumed.
         RunError: `run_dir` is in use.
     """
-    named = [*allow_import, *_named(settings)]
+    named, names = [*allow_import, *_named(settings)], chosen_sinks(log)
     permit(named)
     options = _options(preset, method, config, run_dir, Start(resume, resume_from, overwrite), settings)
     run_config = options.run_config()
@@ -179,14 +182,14 @@ def train(
         if actors != 1:
             raise UsageError(f"actors = {actors}: in distributed runs only; a lockstep run is one process")
         directory = options.directory()
-        run = LockstepRun(run_config, directory, "coop.train", options.start)
+        run = LockstepRun(run_config, directory, "coop.train", options.start, log=names)
         for line in run.told:
             say(line)
         return TrainingRun(run_config, directory, lambda stop: _play(run, stop))
     if actors < 1:
         raise UsageError(f"actors = {actors}: must be at least 1")
     check_distributed(run_config)
-    topology = _topology(run_config, options.directory(), actors, options.start, named)
+    topology = _topology(run_config, options.directory(), actors, options.start, named, names)
     return TrainingRun(run_config, topology.directory, topology.play)
 
 
@@ -250,7 +253,9 @@ def _named(settings: Mapping[str, Any]) -> list[str]:
     return [value.partition(":")[0] for value in values if isinstance(value, str) and ":" in value]
 
 
-def _topology(config: RunConfig, directory: Path, actors: int, start: Start, named: list[str]) -> _Topology:
+def _topology(
+    config: RunConfig, directory: Path, actors: int, start: Start, named: list[str], log: tuple[str, ...]
+) -> _Topology:
     check_links(directory)
     with RunLock(directory, "coop.train", ("learner", "replay")):  # the process takes it after this one
         start.prepare(directory, replay=True, settings=settings_digest(config))
@@ -265,6 +270,7 @@ def _topology(config: RunConfig, directory: Path, actors: int, start: Start, nam
         f"--config={file}",
         f"--run-dir={directory}",
         f"--actors={actors}",
+        f"--log={','.join(log) or 'none'}",
         *(["--resume"] if start.goes_on else []),
         *(["--allow-import", *named] if named else []),
     ]

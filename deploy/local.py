@@ -66,7 +66,7 @@ class Topology:
         # --resume also at the first start, so that a restarted role continues from the newest epoch.
         files = [f"--run-dir={directory}", "--resume", *common]
         learning = [f"--config={resolved}", "--listen", self.endpoint, *files]
-        learning += [flag for flag in ("--restart", "--wandb") if getattr(options, flag[2:])]
+        learning += [f"--log={options.log}", *(["--restart"] if options.restart else [])]
         modules = [path.partition(":")[0] for path in config.imports.values()]
         learning += ["--allow-import", *modules] if modules else []
         learning += [f"--prometheus={options.prometheus}"] if options.prometheus else []

@@ -17,7 +17,7 @@ from coop.common.messaging.wire import Message
 from coop.common.process.files import Measured
 from coop.learner.shared_epochs import SharedEpochs
 from coop.records.checkpoints import DONE, KEPT, checkpoint_numbers
-from coop.records.kept import save_epoch
+from coop.records.learner_checkpoints import save_epoch
 from coop.records.run_directory import RunDirectory
 
 PATIENCE = 5.0  # seconds to wait for the replay service's answer

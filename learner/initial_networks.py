@@ -6,7 +6,7 @@ from coop.common.errors import UsageError
 from coop.common.places import absolute
 from coop.common.process.untrusted import check_links
 from coop.learner.protocol import Agent
-from coop.records.kept import fitting, newest_epoch
+from coop.records.learner_checkpoints import fitting, newest_epoch
 
 
 def load_initial_networks(agent: Agent) -> None:

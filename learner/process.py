@@ -28,7 +28,7 @@ from coop.learner.service import LearnerService
 from coop.learner.shared_epochs import SharedEpochs
 from coop.learner.trainer import Trainer
 from coop.monitor.health import answering
-from coop.records.kept import fitting, load_learner
+from coop.records.learner_checkpoints import fitting, load_learner
 from coop.records.locks import RunLock
 from coop.records.resumption import Survey
 from coop.records.run_directory import RunDirectory, claim_run_directory
@@ -103,7 +103,7 @@ def _train(
             mirror=_mirror(config, spec, console),
         )
         steps = trainer.drawn.inserted
-        with RunDirectory(path, config, found, number or None, steps, wandb=options.wandb) as directory:
+        with RunDirectory(path, config, found, number or None, steps, log=options.log) as directory:
             if directory.aside:
                 console.event(directory.aside)
             checkpoints = Checkpoints(node, directory, samples, epochs, console.event)

@@ -122,7 +122,7 @@ class LearnerService:
             if isinstance(result, EvaluationRow):
                 self._directory.evaluation(result)
             else:
-                self._directory.video(result.gif.tobytes(), result.env_step)
+                self._directory.film(result.gif.tobytes(), result.env_step)
 
     def _publish_status(self) -> None:
         """Publish the status for displays, and repeat the role for actors that missed it."""

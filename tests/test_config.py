@@ -14,8 +14,7 @@ from coop.common.settings import schedules
 from coop.common.settings.capacity import check_messages
 from coop.common.settings.tables import first_difference, load_tables, preset_names, resolve, to_tables, to_toml
 from coop.common.types import EnvSpec
-from coop.records.run_options import RunOptions, parse_run
-from coop.records.sources import base_config
+from coop.records.run_options import RunOptions, base_config, parse_run
 
 
 @pytest.mark.parametrize("preset", preset_names())

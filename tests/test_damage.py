@@ -328,7 +328,7 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
         (tmp_path / name).write_text("a line\n")
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(Path, "replace", renamed)
-    from coop.records.kept import save_epoch  # noqa: PLC0415 (with what is patched)
+    from coop.records.learner_checkpoints import save_epoch  # noqa: PLC0415 (with what is patched)
 
     records = {name: measure(tmp_path / name) for name in checkpoints.RECORDS}
     save_epoch(tmp_path, 5, 100, {"a": 1}, lambda _: calls.append("replay"), records=records)

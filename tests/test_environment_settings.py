@@ -14,8 +14,7 @@ from coop.common.settings.environment import EnvSettings
 from coop.common.settings.resuming import check_resumed
 from coop.common.settings.tables import resolve, to_tables, to_toml
 from coop.common.types import EnvSpec
-from coop.records.run_options import RunOptions, parse_run
-from coop.records.sources import base_config
+from coop.records.run_options import RunOptions, base_config, parse_run
 
 TABLE = {"side": 12, "kind": "x y", "deep": {"rate": 0.5, "on": True}, "walls": [[1, 2], [3]], "none": {}}
 INLINE = "{side = 12, kind = 'x y', deep = {rate = 0.5, on = true}, walls = [[1, 2], [3]], none = {}}"

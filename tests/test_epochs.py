@@ -16,7 +16,7 @@ from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.types import EnvSpec, EpisodeRecord
 from coop.records.checkpoints import DONE, checkpoint_numbers
-from coop.records.kept import load_learner, newest_epoch, save_epoch
+from coop.records.learner_checkpoints import load_learner, newest_epoch, save_epoch
 from coop.records.resumption import go_back, survey
 from coop.replay.core import ReplayCore, Wait
 from coop.replay.episodes import MOST, EpisodeLog

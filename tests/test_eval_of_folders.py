@@ -24,7 +24,7 @@ from coop.evaluation.evaluate import Evaluation, evaluate_checkpoint, film_check
 from coop.evaluation.film import Film, short_gif, write_video
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 
 def run_with(path: Path, acting: int, action: int) -> None:

@@ -38,10 +38,10 @@ from coop.learner.broadcast import Broadcaster
 from coop.learner.evaluations import EvaluationInbox
 from coop.lockstep.run import LockstepRun
 from coop.records.checkpoints import Manifest
-from coop.records.evaluations import returns_by_step
+from coop.records.reading import returns_by_step
 from coop.records.resumption import Start, Survey, Whole
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 from coop.studies.report.figures import evaluations
 from coop.studies.report.packing import pack
 from coop.studies.report.study import load_study

@@ -20,7 +20,7 @@ from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.run import play_lockstep
 from coop.records.checkpoints import checkpoint_numbers
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 
 def _fill(disk: Path) -> Path:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from coop.common.errors import RunError
-from coop.records.kept import load_learner
+from coop.records.learner_checkpoints import load_learner
 
 FUZZ = Path(__file__).parents[1] / "benchmarks" / "fuzz.py"
 

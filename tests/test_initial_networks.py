@@ -9,7 +9,7 @@ from commands import run_command
 from torch import Tensor
 
 from coop.lockstep.reexecute import reexecute
-from coop.records.kept import newest_epoch
+from coop.records.learner_checkpoints import newest_epoch
 
 FLAGS = ("--learner.learning-rate", "1e-30")  # keeps the networks as they are
 SHORT = ("--total-steps", "300", "--replay.learning-starts", "100")

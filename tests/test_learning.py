@@ -18,7 +18,7 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import load_tables, resolve
 from coop.learner.agent import Agent
 from coop.lockstep.lockstep import Lockstep
-from coop.records.kept import newest_epoch
+from coop.records.learner_checkpoints import newest_epoch
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 

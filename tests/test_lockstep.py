@@ -14,9 +14,9 @@ from table_reference import whole_state
 
 from coop.common.settings.methods import METHODS
 from coop.lockstep.lockstep import Lockstep
-from coop.records.kept import newest_epoch
+from coop.records.learner_checkpoints import newest_epoch
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 

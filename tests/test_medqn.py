@@ -14,7 +14,7 @@ from coop.common.settings.tables import preset_names
 from coop.common.types import Batch, EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.methods.medqn import Consolidation
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 ONE = EnvSpec("one", (1,), "float32", 1, 2)
 

@@ -19,10 +19,10 @@ from coop.common.types import EnvSpec
 from coop.evaluation.evaluate import evaluate_checkpoint
 from coop.learner.edl.autograd_backprop import AutogradBackprop
 from coop.lockstep.lockstep import Lockstep
-from coop.records.kept import load_learner
+from coop.records.learner_checkpoints import load_learner
 from coop.records.resumption import survey
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 SPEC = EnvSpec("made-up", (4,), "float32", 1, 3)
 

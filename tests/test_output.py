@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from coop.common.process.lifecycle import Stop
-from coop.records.kept import newest_epoch
+from coop.records.learner_checkpoints import newest_epoch
 
 pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
 

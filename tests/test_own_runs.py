@@ -19,9 +19,9 @@ from coop.common.errors import RunError
 from coop.common.process.processes import free_endpoint
 from coop.common.settings.environment import EnvSettings
 from coop.lockstep.lockstep import Lockstep
-from coop.records.kept import newest_epoch
+from coop.records.learner_checkpoints import newest_epoch
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 SCRIPTS = Path(sysconfig.get_path("scripts"))

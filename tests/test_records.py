@@ -16,7 +16,7 @@ from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 from coop.records.summaries import SUMMARY, read_summary
 from coop.studies.report.packed import PackedStudy
 from coop.studies.report.packing import pack

@@ -10,8 +10,7 @@ from coop.common.settings.config import RunConfig, value_of
 from coop.common.settings.medqn import MedqnSettings
 from coop.common.settings.resuming import check_resumed
 from coop.common.settings.tables import load_tables, preset_names, resolve, to_tables, to_toml, validated
-from coop.records.run_options import RunOptions, parse_run
-from coop.records.sources import base_config
+from coop.records.run_options import RunOptions, base_config, parse_run
 
 METHODS = ["dqn", "edql", "g-coop", "coop", "medqn", "stream-q"]
 

@@ -27,7 +27,7 @@ from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import free_endpoint
 from coop.common.settings.config import RunConfig
 from coop.common.types import EnvSpec
-from coop.records.kept import newest_epoch
+from coop.records.learner_checkpoints import newest_epoch
 from coop.replay.core import ReplayCore
 from coop.replay.persistence.epochs import ReplayEpochs
 from coop.replay.service import ReplayService

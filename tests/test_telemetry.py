@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from coop.learner.telemetry import powers_of_two
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_directory import RunDirectory
-from coop.records.sources import base_config
+from coop.records.run_options import base_config
 
 
 @pytest.mark.parametrize(

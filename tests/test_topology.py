@@ -20,7 +20,7 @@ from commands import run_command
 
 from coop.common.metrics import COLUMNS
 from coop.lockstep.reexecute import reexecute
-from coop.records.kept import load_learner
+from coop.records.learner_checkpoints import load_learner
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 

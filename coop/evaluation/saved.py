@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,9 +24,9 @@ from coop.common.settings.environment import EnvSettings
 from coop.common.settings.resuming import settings_digest
 from coop.common.types import Array, EnvSpec
 from coop.learner.qnetwork import make_network
-from coop.records.evaluations import EVALUATIONS
-from coop.records.kept import fitting, newest_epoch
-from coop.records.reading import check_records, read_csv, read_jsonl, read_lines, read_run_config
+from coop.records.checkpoints import EVALUATIONS, RECORDS
+from coop.records.learner_checkpoints import fitting, newest_epoch
+from coop.records.reading import check_records, read_frame, read_jsonl, read_run_config
 from coop.records.summaries import read_summary
 
 CPU = torch.device("cpu")
@@ -127,7 +126,7 @@ class SavedRun:
     @property
     def episodes(self) -> pd.DataFrame:
         """A row for each finished episode, with the columns of episodes.csv."""
-        return self._table("episodes.csv")
+        return self._table(RECORDS[0])
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -143,8 +142,7 @@ class SavedRun:
     def _table(self, name: str) -> pd.DataFrame:
         """A CSV record, after its checks; raises RunError."""
         check_records(self.path)
-        read_csv(self.path / name)  # names a line that pandas would fill up
-        return pd.read_csv(io.StringIO("\n".join(read_lines(self.path / name))))
+        return read_frame(self.path / name)
 
     @property
     def summary(self) -> dict[str, Any] | None:

@@ -33,7 +33,7 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     replaying = _replaying(stop)
-    opened = LockstepRun(config, path, "coop-lockstep", options.start, wandb=options.wandb, replaying=replaying)
+    opened = LockstepRun(config, path, "coop-lockstep", options.start, log=options.log, replaying=replaying)
     with closing(opened) as run:
         for line in run.told:
             say(line)

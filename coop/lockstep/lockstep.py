@@ -20,7 +20,7 @@ from coop.common.types import EpisodeRecord
 from coop.learner.trainer import Effects, Trainer
 from coop.lockstep.memory import make_experience
 from coop.records.checkpoints import REPLAY
-from coop.records.kept import fitting, save_epoch
+from coop.records.learner_checkpoints import fitting, save_epoch
 from coop.records.resumption import Whole
 from coop.records.run_directory import RunDirectory
 from coop.replay.persistence.storage import Mark

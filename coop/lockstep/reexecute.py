@@ -18,7 +18,7 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest
 from coop.learner.agent import Agent
 from coop.learner.initial_networks import load_initial_networks
-from coop.records.kept import fitting, load_learner
+from coop.records.learner_checkpoints import fitting, load_learner
 from coop.records.reading import read_run_config
 from coop.records.resumption import Survey, survey
 from coop.records.run_ids import read_run_id

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from coop.common.envs.make import check_filmed
@@ -17,10 +17,11 @@ from coop.evaluation.episodes import Evaluator
 from coop.learner.initial_networks import load_initial_networks
 from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep, Replaying
-from coop.records.kept import load_learner
+from coop.records.learner_checkpoints import load_learner
 from coop.records.locks import RunLock
 from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
+from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import Summary
 
 PROGRESS_EVERY = 5.0  # seconds
@@ -39,10 +40,10 @@ class LockstepRun:
         program: str,
         start: Start,
         *,
-        wandb: bool = False,
+        log: str | Sequence[str] = DEFAULT_LOG,
         replaying: Replaying = lambda played, actions: None,
     ) -> None:
-        """Prepare the run; program: named to other processes that want the directory. wandb: see `RunDirectory`.
+        """Prepare the run; program: named to other processes that want the directory. log: see `chosen_sinks`.
 
         start: how it begins there. replaying: see `Lockstep.restore`; what it raises leaves the run as it was.
 
@@ -52,7 +53,7 @@ class LockstepRun:
         """
         use_threads(config.learner.threads)
         self.path = path
-        self._wandb = wandb
+        self._log = log
         if config.video_every:
             check_filmed(config.env)
         self.run = Lockstep(config)
@@ -81,7 +82,7 @@ class LockstepRun:
 
         Raises:
             RunError: there is no space for the closing epoch or the summary.
-            UsageError: Weights & Biases refuses.
+            UsageError: a sink refuses.
         """
         with self.files() as directory:
             if directory.aside:
@@ -92,7 +93,7 @@ class LockstepRun:
         """Open the run's files, to go on from where it is; raises as `RunDirectory`."""
         run, newest = self.run, self._found.newest
         number = None if newest is None else newest.number
-        return RunDirectory(self.path, run.config, self._found, number, run.step, wandb=self._wandb)
+        return RunDirectory(self.path, run.config, self._found, number, run.step, log=self._log)
 
     @property
     def diverged(self) -> str:
@@ -159,7 +160,7 @@ def _evaluate(run: Lockstep, directory: RunDirectory, evaluator: Evaluator) -> N
     if config.video_every and step % config.video_every == 0:
         gif = evaluator.film(network, step)
         if gif is not None:
-            directory.video(gif, step)
+            directory.film(gif, step)
 
 
 def _progress(run: Lockstep) -> str:

@@ -41,6 +41,7 @@ KEPT = 2  # finished checkpoints
 RECORDS = ("episodes.csv", "metrics.jsonl")
 """The records that a resumed run cuts back to the size that its checkpoint seals."""
 EVALUATIONS = "evaluations.csv"
+SWEEP = "sweep.toml"  # in the folder of a sweep
 _NUMBER = re.compile(r"0|[1-9][0-9]{0,17}")
 _FILE = re.compile(r"learner\.pt|state\.msgpack|[a-z][a-z_]*\.npy")  # what a checkpoint consists of
 _OURS = re.compile(rf"({_FILE.pattern}|{DONE})(\.[0-9a-f]{{8}}\.part)?|{WRITING}")

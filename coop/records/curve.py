@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from pathlib import Path
 
@@ -11,18 +10,22 @@ from numpy.typing import ArrayLike
 
 from coop.common.numbers import RETURN_WINDOW, running_mean
 from coop.common.process.files import write_atomic
-from coop.records.evaluations import EVALUATIONS, Floats, returns_by_step
+from coop.records.checkpoints import EVALUATIONS, RECORDS
+from coop.records.reading import Floats, column, read_csv, returns_by_step
 
 NONE: Floats = np.empty((2, 0))
 
 
 def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
-    """Draw the curve of a run directory to `learning_curve.png` there; None if no episode has ended. Raises OSError."""
-    with (run_dir / "episodes.csv").open(encoding="utf-8") as file:
-        rows = [(int(row["env_step"]), float(row["return"])) for row in csv.DictReader(file)]
+    """Draw the curve of a run directory to `learning_curve.png` there; None if no episode has ended.
+
+    Raises OSError and RunError.
+    """
+    path = run_dir / RECORDS[0]
+    rows = read_csv(path)
     if not rows:
         return None
-    steps, returns = np.array(rows).T
+    steps, returns = (column(rows, name, path, 2) for name in ("env_step", "return"))
     evaluated = returns_by_step((run_dir / EVALUATIONS).read_text(encoding="utf-8"))
     return draw_curve(steps, returns, title, run_dir / "learning_curve.png", evaluated)
 

@@ -6,10 +6,15 @@ A half line at the end is said, and a line that can't be read is named.
 from __future__ import annotations
 
 import csv
+import io
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from coop.common.errors import RunError, UsageError
 from coop.common.process.notices import warn
@@ -26,6 +31,12 @@ from coop.records.checkpoints import (
 )
 from coop.records.run_ids import has_run_id
 from coop.records.summaries import SUMMARY
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Floats = NDArray[np.float64]
+TAIL = 16_384  # bytes at the end of a CSV record, enough for 100 lines of episodes.csv
 
 
 def check_records(run_dir: Path) -> None:
@@ -87,6 +98,32 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     return [parse_row(line, f"{path}, line {number}") for number, line in enumerate(read_lines(path), 1)]
 
 
+def read_frame(path: Path) -> pd.DataFrame:
+    """A CSV record with the types that its values have; raises as `read_csv`."""
+    import pandas as pd  # noqa: PLC0415 (half a second, which a learner does not need)
+
+    read_csv(path)  # names a line that pandas would fill up
+    return pd.read_csv(io.StringIO("\n".join(read_lines(path))))
+
+
+def read_csv_tail(path: Path, most: int) -> list[dict[str, str]]:
+    """The last rows, `most` at most, of a CSV record that may be growing, without reading the rest of it.
+
+    Raises:
+        RunError: it can't be read, or has other values than the header says.
+    """
+    try:
+        with path.open("rb") as file:
+            header = file.readline(TAIL)
+            start = os.fstat(file.fileno()).st_size - TAIL
+            file.seek(max(len(header), start))
+            lines = file.read().decode().rpartition("\n")[0].splitlines()[1 if start > len(header) else 0 :]
+        names = header.decode().strip().split(",")
+        return [dict(zip(names, values, strict=True)) for values in csv.reader(lines[-most:])]
+    except (OSError, ValueError, csv.Error) as error:
+        raise RunError(f"{path}: can't be read: {error}") from error
+
+
 def parse_row(line: str | bytes, place: str) -> dict[str, Any]:
     """A line of JSON; place: for the error. Raises RunError."""
     try:
@@ -124,3 +161,11 @@ def read_run_config(run_dir: Path) -> RunConfig:
         raise UsageError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
     # A config without a run, as a user writes it or takes it from a packed study, has neither.
     return parse_run_config(text, path, needed=has_run_id(run_dir))
+
+
+def returns_by_step(text: str) -> Floats:
+    """Environment steps, in order, and mean returns, of the lines with the least epsilon: float64 [2, lines]."""
+    rows = list(csv.DictReader(text.splitlines()))
+    least = min((float(row["epsilon"]) for row in rows), default=0.0)
+    found = [(float(row["env_step"]), float(row["return_mean"])) for row in rows if float(row["epsilon"]) == least]
+    return np.array(sorted(found), np.float64).reshape(-1, 2).T

@@ -1,10 +1,12 @@
-"""The flags of a run, the config that they start from, and the run directory that they choose."""
+"""The flags of a run, the config that they start from (a preset, a file, or a run to be resumed), and its directory."""
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
@@ -13,22 +15,23 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from coop.common.errors import RunError, UsageError
-from coop.common.imports import permit
+from coop.common.imports import hand_over, permit
 from coop.common.places import absolute
 from coop.common.process import cli
 from coop.common.process.extras import check_extra
 from coop.common.process.flags import HttpAddress
 from coop.common.process.notices import warn
+from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig
 from coop.common.settings.effects import without_effect
 from coop.common.settings.methods import METHODS, table_of
 from coop.common.settings.resuming import check_resumed
-from coop.common.settings.tables import preset_names, validated
+from coop.common.settings.tables import load_tables, preset_names, resolve, shortened, validated
 from coop.records.checkpoints import LEARNER, RECORDS, checkpoint_numbers
 from coop.records.reading import read_run_config
 from coop.records.resumption import Start, holds_run
 from coop.records.run_ids import has_run_id, read_run_id
-from coop.records.sources import base_config
+from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 
 # What --help shows of a run's flags, in this order.
 COMMON = (
@@ -37,6 +40,8 @@ COMMON = (
     *("--learner.batch-size", "--learner.swap-every", "--learner.target-update-every", "--learner.learning-rate"),
     *("--edl.rate", "--actor.envs"),
 )
+
+_OF_RUNS = ("run-id", "checkpoints", "episodes.csv")  # beside a config.toml
 
 
 @dataclass(frozen=True)
@@ -63,8 +68,9 @@ class RunOptions(RunConfig):
     """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
     allow_import: tuple[str, ...] = ()
     """Modules, such as my_envs, that may be imported even if they lie in the folder of a resumed run or beside it."""
-    wandb: bool = False
-    """Mirror TensorBoard's scalars to Weights & Biases, whose own variables (WANDB_MODE, WANDB_PROJECT) apply."""
+    log: str = DEFAULT_LOG
+    """Where metrics go beside the run's own tables, with commas: tensorboard; wandb and mlflow (extras), whose own
+    variables apply (WANDB_MODE, WANDB_PROJECT, MLFLOW_TRACKING_URI); none for nowhere."""
 
     def run_config(self) -> RunConfig:
         """The checked config of the run; raises UsageError."""
@@ -143,8 +149,7 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
         warn(f"--learner.swap-every: of {options.method}, the flag is --learner.target-update-every")
     for line in without_effect(options, given, lockstep=lockstep):
         warn(line)
-    if options.wandb:
-        check_extra("--wandb", "wandb", "wandb")
+    chosen_sinks(options.log)  # refuses
     if isinstance(options, LearnerRunOptions) and options.prometheus:
         check_extra("--prometheus", "prometheus", "prometheus_client")
     return options
@@ -166,3 +171,60 @@ def with_methods(kind: type[OptionsT]) -> type[OptionsT]:
     shown = tyro.conf.arg(metavar=f"{{{','.join(METHODS.names())}}}", help=f"Training method; {'; '.join(summaries)}.")
     added.append(("method", Annotated[str, shown], RunConfig.method))
     return make_dataclass(kind.__name__, added, bases=(kind,), frozen=True)
+
+
+def base_config(args: Sequence[str] | None = None) -> RunConfig:
+    """The config given by `--preset`, `--config`, `--method` and `--total-steps`; the other flags override it.
+
+    With `--resume` or `--resume-from` and neither a preset nor a file, it is the config of the run in `--run-dir`.
+
+    Raises:
+        UsageError: an unknown preset, a bad file, or both given.
+    """
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    early.add_argument("--preset")
+    early.add_argument("--config", type=_path)
+    early.add_argument("--method")
+    early.add_argument("--total-steps", "--total_steps", type=int)
+    early.add_argument("--run-dir", "--run_dir", type=_path)
+    early.add_argument("--resume", action="store_true")
+    early.add_argument("--resume-from", "--resume_from")
+    try:
+        known, _ = early.parse_known_args(sys.argv[1:] if args is None else args)
+    except argparse.ArgumentError as error:
+        raise UsageError(str(error)) from error
+    if known.preset and known.config:
+        raise UsageError("--preset and --config: give one of them")
+    resumed = known.run_dir if known.resume or known.resume_from else None
+    return chosen_config(known.preset, known.config, known.method, known.total_steps, resumed)
+
+
+def chosen_config(
+    preset: str | None, file: Path | None, method: str | None, total_steps: int | None, resumed: Path | None
+) -> RunConfig:
+    """The config of a preset or a file; of neither, that of the run in the folder `resumed`, or of the preset cartpole.
+
+    Raises:
+        UsageError: an unknown preset or method, or a bad file.
+    """
+    if resumed:
+        check_links(resumed)
+        if (resumed / "config.toml").exists():
+            hand_over(resumed)
+    if file and any((file.parent / name).exists() for name in _OF_RUNS):
+        hand_over(file.parent)
+    saved = resumed and not (preset or file) and resumed / "config.toml"
+    if resumed and saved and saved.exists():
+        read_run_config(resumed)
+        file = saved
+    tables = load_tables(None if file else preset or "cartpole", file)
+    if file is None and total_steps is not None:
+        tables = shortened(tables, total_steps)
+    if file and method and "methods" not in tables and method != tables.get("method", method):
+        warn(f"{file} has no settings for single methods: {method} gets those of {tables['method']}")
+    return resolve(tables, method)
+
+
+def _path(text: str) -> Path:
+    """As `user_path`, which will refuse an empty one with its flag."""
+    return Path(text).expanduser()

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from coop.common.errors import UsageError
 from coop.common.process.untrusted import check_run_name, page_sizes
-from coop.records.evaluations import EVALUATIONS
+from coop.records.checkpoints import EVALUATIONS
 
 SWEEP, CONFIG, SUMMARY, EPISODES, METRICS = "sweep.toml", "config.toml", "summary.json", "episodes.csv", "metrics.jsonl"
 TEXTS = (CONFIG, SUMMARY, EVALUATIONS)

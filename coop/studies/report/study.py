@@ -17,7 +17,8 @@ from coop.common.numbers import METRICS_EVERY
 from coop.common.settings.config import OF_MACHINE, RunConfig, value_of
 from coop.common.settings.methods import METHODS
 from coop.common.settings.tables import identity, load_tables, parse_run_config, resolve
-from coop.records.evaluations import EVALUATIONS, returns_by_step
+from coop.records.checkpoints import EVALUATIONS
+from coop.records.reading import returns_by_step
 from coop.records.summaries import parse_summary
 from coop.studies.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
 from coop.studies.report.sources import Source, open_source

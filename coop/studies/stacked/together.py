@@ -26,6 +26,7 @@ from coop.lockstep.run import PROGRESS_EVERY, LockstepRun
 from coop.records.reading import read_run_config
 from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
+from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import Summary
 from coop.studies.stacked.eligible import why_not
 from coop.studies.stacked.seeds import MOST, Seeds
@@ -150,6 +151,7 @@ def _run() -> None:
     )
     parser.add_argument("directories", nargs="+", type=Path)
     parser.add_argument("--player", type=int, choices=(1, 2), help="the network that always acts")
+    parser.add_argument("--log", default=DEFAULT_LOG, help="as of coop-lockstep")
     args = parser.parse_args()
     configs = [read_run_config(path) for path in args.directories]
     if not alike(configs):
@@ -163,7 +165,7 @@ def _run() -> None:
         runs = []
         for config, path in zip(configs, args.directories, strict=True):
             try:
-                run = LockstepRun(config, path, PROGRAM, Start(resume=True))
+                run = LockstepRun(config, path, PROGRAM, Start(resume=True), log=args.log)
             except CoopError as error:
                 failed.append(str(error))
                 say(f"{path}: {error}")

@@ -19,6 +19,7 @@ from coop.common.process.extras import check_extra
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.limits import cores
 from coop.common.suggestions import closest, refusal
+from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.studies.sweep import slurm
 from coop.studies.sweep.beside import side_by_side
 from coop.studies.sweep.display import SweepDisplay
@@ -48,6 +49,8 @@ class SweepOptions:
     """Folder of the sweep; runs/sweeps/GRID if not given."""
     cell: str | None = None
     """Run only this cell: its name, or its number in the grid, from 0."""
+    log: str = DEFAULT_LOG
+    """Where the runs' metrics go, as --log of coop-lockstep: a group of Weights & Biases, an experiment of MLflow."""
     slurm: bool = False
     """Submit the cells as Slurm job arrays instead of running them on this machine."""
     dask: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
@@ -65,6 +68,7 @@ def _run() -> None:
         raise UsageError(f"--jobs {options.jobs}: must be at least 1")
     if options.stack is not None and options.stack < 1:
         raise UsageError(f"--stack {options.stack}: must be at least 1")
+    chosen_sinks(options.log)  # refuses
     if options.dask is not None:
         if options.slurm:
             raise UsageError("--dask and --slurm: give one of them")
@@ -77,7 +81,8 @@ def _run() -> None:
         say("--stack: on this machine only; each cell runs by itself")
     if options.slurm:
         left = [cell.cell.name for cell in cells if cell.ending() is None]
-        print(*(slurm.submit(grid.file, folder, left, options.jobs) if left else ["every cell is finished"]), sep="\n")
+        submitted = slurm.submit(grid.file, folder, left, options.jobs, options.log) if left else []
+        print(*(submitted or ["every cell is finished"]), sep="\n")
         return
     with _executor(options, grid.file, cells) as executor:
         _work(Runner(cells, executor), folder)
@@ -97,7 +102,8 @@ def _executor(options: SweepOptions, grid: GridFile, folders: Sequence[CellFolde
 def chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
     """The cells that the options ask for; raises UsageError if there is none of that name or number."""
     asked = options.cell
-    cells = [CellFolder(folder, cell) for n, cell in enumerate(grid.cells) if asked in (None, cell.name, str(n))]
+    there = [cell for n, cell in enumerate(grid.cells) if asked in (None, cell.name, str(n))]
+    cells = [CellFolder(folder, cell, options.log) for cell in there]
     if not cells:
         names = [cell.name for cell in grid.cells]
         near = closest(str(options.cell), names)

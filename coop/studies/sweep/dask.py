@@ -85,7 +85,7 @@ class DaskWorkers:
     def start(self, folder: CellFolder) -> bool:
         """See `Executor`; the worker waits where another process holds the cell."""
         name = folder.cell.name
-        there = CellFolder(folder.path.parent.resolve(), folder.cell)
+        there = CellFolder(folder.path.parent.resolve(), folder.cell, folder.log)
         self._futures[name] = self._client.submit(
             run_cell, there, self._grid, working_directory(), key=f"{name}-{uuid4().hex}", pure=False
         )

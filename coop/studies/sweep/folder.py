@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +12,11 @@ from coop.common.numbers import RETURN_WINDOW
 from coop.common.process.files import make_folder, write_atomic
 from coop.common.process.untrusted import check_links
 from coop.common.settings.tables import identity, run_config_text, sealed_toml
-from coop.records.checkpoints import checked_summary
+from coop.records.checkpoints import RECORDS, SWEEP, checked_summary
 from coop.records.locks import Held, RunLock
-from coop.records.reading import read_run_config
+from coop.records.reading import read_csv_tail, read_run_config
+from coop.records.sinks import DEFAULT_LOG
 from coop.studies.sweep.grid import Cell, Grid
-
-TAIL = 16_384  # bytes of episodes.csv, enough for 100 lines
 
 
 @dataclass(frozen=True)
@@ -45,8 +41,10 @@ class Ending:
 class CellFolder:
     """One cell's folder within the sweep's."""
 
-    def __init__(self, sweep: Path, cell: Cell) -> None:
+    def __init__(self, sweep: Path, cell: Cell, log: str = DEFAULT_LOG) -> None:
+        """log: see `--log` of a run."""
         self.cell = cell
+        self.log = log
         self.path = sweep / cell.name
 
     def check(self) -> None:
@@ -84,16 +82,11 @@ class CellFolder:
     def progress(self) -> Progress:
         """Read the progress from the end of episodes.csv; zeros before the first episode's end, or if it is damaged."""
         try:
-            with (self.path / "episodes.csv").open("rb") as file:
-                header = file.readline(TAIL).decode()
-                file.seek(max(len(header), os.fstat(file.fileno()).st_size - TAIL))
-                # The first and the last line of the tail may be incomplete.
-                lines = file.read().decode().rpartition("\n")[0].splitlines()[-RETURN_WINDOW:]
-            rows = list(csv.DictReader(io.StringIO("\n".join([header.strip(), *lines]))))
+            rows = read_csv_tail(self.path / RECORDS[0], RETURN_WINDOW)
             if not rows:
                 return Progress(0, 0.0)
             return Progress(int(rows[-1]["env_step"]), sum(float(row["return"]) for row in rows) / len(rows))
-        except (OSError, ValueError, KeyError, TypeError, csv.Error):
+        except (RunError, ValueError, KeyError):
             return Progress(0, 0.0)  # only for the display: who continues or reports the run names what is damaged
 
 
@@ -112,6 +105,6 @@ def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
         make_folder(folder)
         for cell in cells:
             cell.check()
-        write_atomic(folder / "sweep.toml", sealed_toml(grid.to_toml()).encode())
+        write_atomic(folder / SWEEP, sealed_toml(grid.to_toml()).encode())
     except OSError as error:
         raise UsageError(f"--dir {folder}: {error.strerror}") from error

@@ -158,10 +158,15 @@ class LocalProcesses:
 
     def _command(self, cells: Sequence[CellFolder]) -> list[str]:
         if len(cells) > 1:
-            return [sys.executable, "-m", TOGETHER, *(str(cell.path) for cell in cells)]
+            return [sys.executable, "-P", "-m", TOGETHER, f"--log={cells[0].log}", *(str(cell.path) for cell in cells)]
         (folder,) = cells
         # --resume also at the first start, so that a restarted run continues from its newest checkpoint.
-        flags = [f"--config={folder.path / 'config.toml'}", f"--run-dir={folder.path}", "--resume"]
+        flags = [
+            f"--config={folder.path / 'config.toml'}",
+            f"--run-dir={folder.path}",
+            "--resume",
+            f"--log={folder.log}",
+        ]
         modules = [path.partition(":")[0] for path in folder.cell.config.imports.values()]
         flags += ["--allow-import", *modules] if modules else []
         if self._grid.mode == "distributed":

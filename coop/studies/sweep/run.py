@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from coop.common.errors import UsageError
 from coop.common.places import absolute
 from coop.common.process.limits import cores
 from coop.common.settings.config import value_of
+from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.records.summaries import read_summary
 from coop.studies.sweep.beside import side_by_side
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
@@ -48,6 +49,7 @@ def sweep(
     jobs: int | None = None,
     quick: bool = False,
     stack: int | None = None,
+    log: str | Iterable[str] = DEFAULT_LOG,
 ) -> SweepResult:
     """Run every cell of a grid once, and wait; cells that were finished before are not repeated.
 
@@ -57,6 +59,7 @@ def sweep(
         jobs: processes to run concurrently; the number of cores if None.
         stack: seeds that a process plays side by side, where their settings allow that; see `coop-sweep --stack`.
         quick: use the grid's small version.
+        log: where the runs' metrics go beside their files, as of `coop.train`.
 
     Raises:
         UsageError: the grid or a setting is invalid, or the folder holds other runs.
@@ -65,6 +68,7 @@ def sweep(
         raise UsageError(f"jobs = {jobs}: must be at least 1")
     if stack is not None and stack < 1:
         raise UsageError(f"stack = {stack}: must be at least 1")
+    names = ",".join(chosen_sinks(log)) or "none"
     if isinstance(grid, Mapping):
         if folder is None:
             raise UsageError("folder: a grid without a name needs one")
@@ -72,7 +76,7 @@ def sweep(
     else:
         checked = load_grid(str(grid), quick)
         path = absolute(default_folder(grid, quick) if folder is None else folder, "folder")
-    cells = [CellFolder(path, cell) for cell in checked.cells]
+    cells = [CellFolder(path, cell, names) for cell in checked.cells]
     claim_folder(checked, cells, path)
     beside, _ = side_by_side(checked.file, cells, jobs or cores(), stack)
     runner = Runner(cells, LocalProcesses(checked.file, jobs, beside=beside))

@@ -14,7 +14,7 @@ from coop.common.process.processes import command
 from coop.studies.sweep.grid import GridFile
 
 
-def submit(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> list[str]:
+def submit(grid: GridFile, folder: Path, cells: list[str], jobs: int | None, log: str) -> list[str]:
     """Submit the cells that no job holds yet, in as many arrays as Slurm's limit requires; return lines that say so.
 
     Each array's script and the names of its cells stay in the sweep's folder: from them a later call knows the cell of
@@ -24,6 +24,7 @@ def submit(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> 
         folder: of the sweep, with its sweep.toml.
         cells: names of the cells to run.
         jobs: number of concurrent tasks; arrays then run one after another. None: no limit.
+        log: see `--log`.
 
     Raises:
         RunError: Slurm is not installed, or refused.
@@ -37,7 +38,7 @@ def submit(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> 
     for start in range(0, len(left), size):
         part = left[start : start + size]
         try:
-            after = _submit(_write(grid, folder, part, jobs), after if jobs else None)
+            after = _submit(_write(grid, folder, part, jobs, log), after if jobs else None)
         except RunError as error:
             done = f" after {_cells(start)} submitted; the same command submits the rest" if start else ""
             raise RunError(f"{error}{done}") from error
@@ -71,11 +72,11 @@ def _array_size() -> int:
     return size
 
 
-def _write(grid: GridFile, folder: Path, cells: list[str], jobs: int | None) -> Path:
+def _write(grid: GridFile, folder: Path, cells: list[str], jobs: int | None, log: str) -> Path:
     """Write an array's script and the names of its cells, one per line, under a new number."""
     script = next(path for n in count(1) if not (path := folder / f"array-{n}.sh").exists())
     script.with_suffix(".cells").write_text("".join(f"{cell}\n" for cell in cells), encoding="utf-8")
-    script.write_text(_script(grid, folder, script.with_suffix(".cells"), len(cells), jobs), encoding="utf-8")
+    script.write_text(_script(grid, folder, script.with_suffix(".cells"), len(cells), jobs, log), encoding="utf-8")
     return script
 
 
@@ -102,7 +103,7 @@ def _ask(program: str, *arguments: str) -> str:
     return done.stdout
 
 
-def _script(grid: GridFile, folder: Path, names: Path, tasks: int, jobs: int | None) -> str:
+def _script(grid: GridFile, folder: Path, names: Path, tasks: int, jobs: int | None, log: str) -> str:
     limit = f"%{jobs}" if jobs else ""
     processes = 1 if grid.mode == "lockstep" else grid.actors + 2
     (program,) = command("coop-sweep")
@@ -115,5 +116,5 @@ def _script(grid: GridFile, folder: Path, names: Path, tasks: int, jobs: int | N
 #SBATCH --requeue
 mapfile -t cells < {shlex.quote(str(names))}
 exec {shlex.quote(program)} {shlex.quote(str(folder / "sweep.toml"))} --dir {shlex.quote(str(folder))} \\
-  --cell "${{cells[$SLURM_ARRAY_TASK_ID]}}"
+  --log {shlex.quote(log)} --cell "${{cells[$SLURM_ARRAY_TASK_ID]}}"
 """

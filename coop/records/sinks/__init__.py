@@ -1,0 +1,187 @@
+"""Where the records of a run go: one interface, `Sink`, and the sinks by name among which `--log` chooses.
+
+The run directory's own tables (`files`) are always written. Another sink is one file here and its line in `SINKS`; or
+a class of an installed package, which its entry point in the group `coop.sinks` names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+from coop.common.errors import CoopError, UsageError, first_line
+from coop.common.messaging.messages.evaluate import EvaluationRow
+from coop.common.metrics import TAGS
+from coop.common.process.console import say
+from coop.common.process.extras import check_extra
+from coop.common.registry import Registry
+from coop.common.types import EpisodeRow
+
+# The first tags of an episode and of a row of metrics.
+EPISODE, ROW = "charts/episodic_return", "losses/q_values"
+
+
+class Run(NamedTuple):
+    """The run that a sink records: its directory, its id, and the name of the sweep that it belongs to, or nothing."""
+
+    path: Path
+    run_id: int
+    sweep: str
+
+
+class Kept(NamedTuple):
+    """What a run has recorded that goes on: lines of episodes.csv and metrics.jsonl, and environment steps."""
+
+    episodes: int
+    rows: int
+    env_step: int
+
+
+class Sink:
+    """Takes what a run records, in the thread of the run, which waits for it. By itself it takes nothing.
+
+    An exception of a sink that `--log` names ends the sink, not the run.
+
+    Attributes:
+        name: by which `--log` chooses it.
+        extra, library: the extra of this package that brings the library, and the library's import name, if it needs
+            one; import it in `__init__`.
+    """
+
+    name: ClassVar[str] = ""
+    extra: ClassVar[str] = ""
+    library: ClassVar[str] = ""
+
+    def __init__(self, run: Run) -> None:
+        """Get ready. Whatever it raises refuses the run, before any record has been changed."""
+
+    @property
+    def problem(self) -> str:
+        """Why lines are being kept for later; empty if none are."""
+        return ""
+
+    def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
+        """Take the settings by name, before anything else; kept: what the run goes on from, None if it begins."""
+
+    def episode(self, row: EpisodeRow) -> None:
+        """Take a finished episode."""
+
+    def metrics(self, row: Mapping[str, Any]) -> None:
+        """Take a row of metrics, as metrics.jsonl has it."""
+
+    def evaluation(self, row: EvaluationRow) -> None:
+        """Take an evaluation."""
+
+    def film(self, gif: bytes, env_step: int) -> None:
+        """Take an animated GIF of the acting network after `env_step` steps."""
+
+    def close(self) -> None:
+        """Write or send what is left."""
+
+
+class ScalarSink(Sink):
+    """A sink of numbers by tag, over the run's environment steps."""
+
+    def scalars(self, values: Mapping[str, float], env_step: int) -> None:
+        """Take scalars by tag."""
+        raise NotImplementedError
+
+    def episode(self, row: EpisodeRow) -> None:
+        """See `Sink`."""
+        end = row.record.end
+        self.scalars({EPISODE: end.episode_return, "charts/episodic_length": end.length}, row.record.env_step)
+
+    def metrics(self, row: Mapping[str, Any]) -> None:
+        """See `Sink`."""
+        numbers = {name: value for name, value in row.items() if name != "env_step" and isinstance(value, int | float)}
+        scalars = {TAGS.get(name, f"train/{name}"): value for name, value in numbers.items()}
+        self.scalars({ROW: row[f"q{row['acting']}_mean"], **scalars}, row["env_step"])
+
+    def evaluation(self, row: EvaluationRow) -> None:
+        """See `Sink`."""
+        self.scalars({"eval/return_mean": row.return_mean, "eval/return_sd": row.return_sd}, row.env_step)
+
+
+SINKS: Registry[Any] = Registry(
+    "log",
+    "coop.sinks",
+    type,
+    {
+        "tensorboard": "coop.records.sinks.tensorboard:TensorBoardSink",
+        "wandb": "coop.records.sinks.wandb:WandbSink",
+        "mlflow": "coop.records.sinks.mlflow:MlflowSink",
+    },
+)
+"""The classes of sinks that `--log` names."""
+DEFAULT_LOG = "tensorboard"
+
+
+def chosen_sinks(log: str | Iterable[str]) -> tuple[str, ...]:
+    """The names in a list, or in a text with commas; "none" alone for no sink.
+
+    Raises:
+        UsageError: there is no sink of a name, or its library is not installed.
+    """
+    names = [name.strip() for name in (log.split(",") if isinstance(log, str) else log)]
+    if names == ["none"]:
+        return ()
+    for name in names:
+        sink = SINKS.get(name)
+        if not issubclass(sink, Sink):
+            raise UsageError(f"log = {name!r}: {sink.__qualname__} is no Sink")
+        if sink.library:
+            check_extra(f"--log {name}", sink.extra, sink.library)
+    return tuple(dict.fromkeys(names))
+
+
+class ChosenSinks:
+    """The sinks that `--log` names; one that fails is left out from then on, and a line says so."""
+
+    def __init__(self, run: Run, names: Iterable[str]) -> None:
+        """Open them; raises UsageError if one refuses."""
+        self._run = run
+        self._sinks: list[Sink] = []
+        for name in names:
+            try:
+                self._sinks.append(SINKS.get(name)(run))
+            except Exception as error:
+                self.close()
+                raise _refused(name, error) from error
+
+    def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
+        """See `Sink`; raises UsageError if one refuses."""
+        for sink in self._sinks:
+            try:
+                sink.begin(settings, kept)
+            except Exception as error:
+                self.close()
+                raise _refused(sink.name, error) from error
+
+    @property
+    def problem(self) -> str:
+        """Why one of them keeps lines; empty if none does."""
+        return next((sink.problem for sink in self._sinks if sink.problem), "")
+
+    def tell(self, call: Callable[[Sink], None]) -> None:
+        """Call each of them."""
+        for sink in list(self._sinks):
+            try:
+                call(sink)
+            except CoopError:  # this process may not write any more
+                raise
+            except Exception as error:
+                say(f"{self._run.path}: --log {sink.name}: {first_line(error)}; the run goes on without it")
+                self._sinks.remove(sink)
+                with suppress(Exception):
+                    sink.close()
+
+    def close(self) -> None:
+        """Close all of them."""
+        self.tell(lambda sink: sink.close())
+        self._sinks.clear()
+
+
+def _refused(name: str, error: Exception) -> CoopError:
+    return error if isinstance(error, CoopError) else UsageError(f"--log {name}: {first_line(error)}")

@@ -1,0 +1,51 @@
+"""Weights & Biases (extra `wandb`): a run's scalars and settings."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+from coop.common.errors import UsageError
+from coop.records.sinks import Kept, Run, ScalarSink
+
+STEP = "env_step"
+
+
+class WandbSink(ScalarSink):
+    """One run of Weights & Biases; with its own variables, such as WANDB_MODE and WANDB_PROJECT, users direct it.
+
+    Scalars are plotted over environment steps, as in TensorBoard. The runs of a sweep are a group. A resumed run
+    continues the same run there; what was sent of steps after its checkpoint stays.
+    """
+
+    name, extra, library = "wandb", "wandb", "wandb"
+
+    def __init__(self, run: Run) -> None:
+        """Begin the run, or continue it where the id is known; its files are in wandb/ of the run directory.
+
+        Raises:
+            UsageError: it refuses, for instance because nobody has logged in.
+        """
+        wandb = importlib.import_module("wandb")  # an extra, and it takes seconds
+        settings = wandb.Settings(console="off", silent=True, disable_git=True, save_code=False)
+        named = {"name": run.path.name, "id": f"{run.run_id:x}", "group": run.sweep or None}
+        try:
+            self._run = wandb.init(dir=run.path, resume="allow", settings=settings, **named)
+        except wandb.Error as error:
+            raise UsageError(f"--log wandb: {str(error).splitlines()[0]}") from error
+        # Episodes are told a little later than updates; wandb's own step must not go back.
+        self._run.define_metric(STEP, hidden=True)
+        self._run.define_metric("*", step_metric=STEP)
+
+    def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
+        """See `Sink`."""
+        self._run.config.update(dict(settings), allow_val_change=True)
+
+    def scalars(self, values: Mapping[str, float], env_step: int) -> None:
+        """See `ScalarSink`."""
+        self._run.log({**values, STEP: env_step})
+
+    def close(self) -> None:
+        """See `Sink`."""
+        self._run.finish()

@@ -1,0 +1,277 @@
+"""What leaves a run for Prometheus and for Weights & Biases, and what is refused where they are not installed."""
+
+import dataclasses
+import json
+import socket
+import struct
+import urllib.request
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import run_command
+from msgspec.structs import replace
+from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
+from tensorboard.context import RequestContext
+from tensorboard.plugins.base_plugin import TBContext
+from tensorboard.plugins.hparams import api_pb2, get_experiment
+from tensorboard.plugins.hparams.backend_context import Context
+from test_screen import STATUS
+
+import coop
+from coop.common.errors import UsageError
+from coop.common.messaging.messages.status import LearnerStatus
+from coop.common.process.extras import check_extra
+from coop.common.process.lifecycle import Stop
+from coop.common.process.processes import free_endpoint
+from coop.common.registry import Registry
+from coop.common.types import EpisodeRow
+from coop.lockstep.lockstep import Lockstep
+from coop.lockstep.run import LockstepRun
+from coop.records.resumption import Start
+from coop.records.run_directory import RunDirectory
+from coop.records.run_options import base_config
+from coop.records.sinks import Kept, Sink, chosen_sinks
+from website.assemble import assembled
+
+PAGE = assembled("docs/watching.md")
+BLOCK, HEADER = 32768, 7  # bytes, of the log in which wandb keeps its records
+
+
+def test_a_status_for_prometheus() -> None:
+    pytest.importorskip("prometheus_client", reason="needs the extra prometheus")
+    from prometheus_client.parser import text_string_to_metric_families  # noqa: PLC0415
+
+    from coop.monitor.exporter import exported  # noqa: PLC0415
+
+    status: LearnerStatus | None = None
+
+    def scrape() -> dict[str, float]:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=20) as answer:
+            families = list(text_string_to_metric_families(answer.read().decode()))
+        samples = [sample for family in families for sample in family.samples]
+        assert not [sample.name for sample in samples if f"`{sample.name}`" not in PAGE], "docs/watching.md lists all"
+        own = {"env": "CartPole-v1", "method": "coop", "seed": "0"}
+        assert all(own.items() <= sample.labels.items() for sample in samples)
+        return {" ".join([s.name, *(v for k, v in sorted(s.labels.items()) if k not in own)]): s.value for s in samples}
+
+    with exported("0", lambda: status) as port:
+        assert scrape() == {}, "before the first status"
+        status = replace(STATUS, missing=["actor 2 on node2 (pid 44)"])
+        told = scrape()
+        with pytest.raises(UsageError, match=f"--prometheus {port}: Address already in use"), exported(str(port), dict):
+            pass
+        status = replace(STATUS, ratio=None, measured=None, waits=[], env_steps=31_290)
+        fewer = scrape()
+    assert told["coop_env_steps_total"] == 31_240
+    assert told["coop_return_mean_100"] == 187.43
+    assert (told["coop_members actor"], told["coop_members_lost"]) == (2, 1)
+    assert (told["coop_ratio_measured"], told["coop_ratio_most"]) == (0.998, 80)
+    assert (told["coop_q_abs_mean"], told["coop_q_bound"]) == (42.13, 100)
+    assert told["coop_wait_share the learner actors"] == 0.63
+    assert told["coop_evicted_unsampled"] == 0, "which is not unknown"
+    assert fewer["coop_env_steps_total"] == 31_290
+    assert not [name for name in fewer if name.startswith(("coop_ratio", "coop_q", "coop_wait"))]
+
+
+def records(path: Path) -> Iterator[bytes]:
+    """The records of wandb's file: a log of blocks, in which a record may be split into several parts."""
+    data, record = path.read_bytes()[7:], b""  # after its own header
+    at = HEADER
+    while at - HEADER < len(data):
+        left = BLOCK - at % BLOCK
+        if left < HEADER:
+            at += left
+            continue
+        _, size, kind = struct.unpack_from("<IHB", data, at - HEADER)
+        record += data[at : at + size]
+        at += HEADER + size
+        if kind in (1, 4):  # whole, or the last part
+            yield record
+            record = b""
+
+
+def play(run: Lockstep, directory: RunDirectory, rows: int = 2) -> None:
+    """Play until there are some more rows of metrics."""
+    while rows > 0:
+        for effects in run.play():
+            directory.record(effects.episodes, effects.metrics)
+            rows -= bool(effects.metrics)
+
+
+def scalars(folder: Path) -> dict[tuple[str, int], float]:
+    """What TensorBoard reads of a run, by tag and step."""
+    board = EventAccumulator(str(folder / "tb"), size_guidance={"scalars": 0}).Reload()
+    return {(tag, e.step): e.value for tag in board.Tags()["scalars"] for e in board.Scalars(tag)}
+
+
+def test_weights_and_biases_gets_tensorboards_scalars(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wandb = pytest.importorskip("wandb", reason="needs the extra wandb")
+    from wandb.proto.wandb_internal_pb2 import Record  # noqa: PLC0415
+
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    run = Lockstep(base_config(["--method", "coop"]))
+    with RunDirectory(tmp_path, run.config, log="tensorboard,wandb") as directory:
+        play(run, directory)
+    wandb.teardown()
+    run.env.close()
+    expected = scalars(tmp_path)
+    (file,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
+    told, settings = {}, {}
+    for data in records(file):
+        record = Record.FromString(data)
+        row = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
+        told |= {(tag, row["env_step"]): value for tag, value in row.items() if "/" in tag}
+        settings |= {item.key: json.loads(item.value_json) for item in record.config.update}
+    assert told == pytest.approx(expected)
+    assert settings["replay.capacity"] == run.config.replay.capacity
+
+
+def test_mlflow_gets_tensorboards_scalars(tmp_path: Path) -> None:
+    """A run that is killed behind its checkpoint and resumed is one run of MLflow, in its own directory's store."""
+    pytest.importorskip("mlflow", reason="needs the extra mlflow")
+    config = base_config(["--method", "coop"])
+    config = dataclasses.replace(config, total_steps=1200, checkpoint_every=400)
+    run, path = Lockstep(config), tmp_path / "run"
+    with RunDirectory(path, config, log="tensorboard,mlflow") as directory:
+        run_id = directory.run_id()
+        play(run, directory)
+        run.save(directory)
+        play(run, directory)
+    run.env.close()
+    resumed = LockstepRun(config, path, "test", Start(resume=True), log="mlflow")
+    resumed.play(Stop())
+    resumed.close()
+    store = mlflow_store(path / "logs" / "mlruns")
+    (experiment,) = [each for each in store.search_experiments() if each.name != "Default"]
+    (its_run,) = store.search_runs([experiment.experiment_id])
+    assert (experiment.name, its_run.info.run_name, its_run.info.status) == ("coop", "run", "FINISHED")
+    assert its_run.data.tags["coop.run_id"] == f"{run_id:x}"
+    assert its_run.data.params["replay.capacity"] == str(config.replay.capacity)
+    told = {
+        (tag, each.step): each.value
+        for tag in its_run.data.metrics
+        for each in store.get_metric_history(its_run.info.run_id, tag)
+    }
+    expected = scalars(path)
+    assert max(step for _, step in expected) > 1000, "the resumed run goes on with tb/, which has to be cut back"
+    assert told == pytest.approx(expected), "what was behind the checkpoint was logged twice, with the same values"
+
+
+def mlflow_store(folder: Path) -> Any:
+    from mlflow import MlflowClient  # noqa: PLC0415
+
+    return MlflowClient(tracking_uri=folder.as_uri())
+
+
+def test_the_runs_of_a_sweep_are_an_experiment(tmp_path: Path) -> None:
+    pytest.importorskip("mlflow", reason="needs the extra mlflow")
+    config = {"total_steps": 300, "replay": {"learning_starts": 50}}
+    grid = {"preset": "cartpole", "mode": "lockstep", "config": config, "vary": {"seed": [0, 1]}}
+    done = coop.sweep(grid, tmp_path / "study", jobs=2, log=["mlflow"])
+    assert not done.failed
+    assert not list((tmp_path / "study").glob("*/tb")), "which --log does not name"
+    store = mlflow_store(tmp_path / "study" / "mlruns")
+    (experiment,) = [each for each in store.search_experiments() if each.name != "Default"]
+    runs = store.search_runs([experiment.experiment_id])
+    assert experiment.name == "study"
+    assert {each.info.run_name for each in runs} == set(done.runs.index)
+    assert {each.data.params["seed"] for each in runs} == {"0", "1"}
+
+
+def test_tensorboards_hparams_show_settings_and_metrics(tmp_path: Path) -> None:
+    """Asks the plugin itself, as its page does."""
+    run = Lockstep(base_config(["--method", "coop"]))
+    for name in ("one", "two"):
+        with RunDirectory(tmp_path / name, run.config) as directory:
+            play(run, directory, 1)
+    run.env.close()
+    multiplexer = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
+    context = Context(TBContext(data_provider=MultiplexerDataProvider(multiplexer, str(tmp_path))))
+    asked = api_pb2.GetExperimentRequest(experiment_name="", include_metrics=True)
+    shown = get_experiment.Handler(RequestContext(), context, "", asked).run()
+    assert {"replay.capacity", "learner.learning_rate", "method"} <= {each.name for each in shown.hparam_infos}
+    assert {"charts/episodic_return", "losses/td_loss"} <= {each.name.tag for each in shown.metric_infos}
+
+
+class Broken(Sink):
+    """Takes one episode, and fails at the next."""
+
+    name = "broken"
+
+    def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
+        if settings["seed"] == 7:
+            raise ValueError("no luck\nat all")
+        self.taken = 0
+
+    def episode(self, row: EpisodeRow) -> None:
+        self.taken += 1
+        if self.taken >= 2:
+            raise ConnectionError("the server is gone")
+
+
+def test_a_sink_that_fails_does_not_end_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("coop.records.sinks.SINKS", Registry("log", "coop.sinks", type, {"broken": Broken}))
+    run = Lockstep(base_config(["--method", "coop"]))
+    with RunDirectory(tmp_path / "run", run.config, log="broken") as directory:
+        play(run, directory)
+        lines = capsys.readouterr().out
+        assert (
+            lines == f"{tmp_path}/run: --log broken: ConnectionError: the server is gone; the run goes on without it\n"
+        )
+        assert len((tmp_path / "run" / "episodes.csv").read_text().splitlines()) > 3
+    run.env.close()
+    with pytest.raises(UsageError, match=r"^--log broken: ValueError: no luck$"):
+        RunDirectory(tmp_path / "other", dataclasses.replace(run.config, seed=7), log="broken")
+
+
+def test_sinks_are_refused_by_name(tmp_path: Path) -> None:
+    assert chosen_sinks("none") == ()
+    assert chosen_sinks(["tensorboard"]) == chosen_sinks("tensorboard, tensorboard") == ("tensorboard",)
+    done = run_command("coop-lockstep", "--log", "tensorbord", "--run-dir", tmp_path / "run")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("coop-lockstep: error: log = 'tensorbord': ")
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_extra("--json", "json", "json")
+    with pytest.raises(UsageError, match=r"^--x: needs the extra 'x': pip install 'coop-rl\[x\]'$"):
+        check_extra("--x", "x", "no_such_module")
+
+
+def test_flags_are_refused_before_anything_starts(tmp_path: Path) -> None:
+    done = run_command("coop-local", "--prometheus", "x", "--run-dir", tmp_path / "run")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "coop-local: error: --prometheus x: PORT or HOST:PORT with a port from 0 to 65535 is needed\n",
+    )
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "flags", "refused"),
+    [
+        ("coop-local", ("--prometheus", "{busy}"), "--prometheus {busy}"),
+        ("coop-local", ("--web", "{free}", "--prometheus", "{free}"), "--prometheus {free}"),
+        ("coop-learner", ("--prometheus", "{busy}"), "--prometheus {busy}"),
+        ("coop-learner", ("--health", "{busy}"), "--health {busy}"),
+        ("coop-replay", ("--health", "{busy}"), "--health {busy}"),
+        ("coop-actor", ("--health", "{busy}"), "--health {busy}"),
+        ("coop-router", ("--health", "{busy}"), "--health {busy}"),
+    ],
+)
+def test_a_port_in_use_is_refused_before_anything_starts(
+    tmp_path: Path, command: str, flags: tuple[str, ...], refused: str
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        ports = {"busy": other.getsockname()[1], "free": free_endpoint().rpartition(":")[2]}
+        done = run_command(command, *(flag.format(**ports) for flag in flags), cwd=tmp_path)
+    expected = f"{command}: error: {refused.format(**ports)}: Address already in use\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
+    assert not list(tmp_path.iterdir())
