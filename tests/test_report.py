@@ -45,7 +45,7 @@ title = "Small <and> smaller"
 methods = ["dqn", "edql", "coop"]
 seeds = [0, 1]
 fixed.total_steps = 2000
-fixed.replay.start = 50
+fixed.replay.learning_starts = 50
 fixed.replay.ratio = 0.25
 vary.replay.capacity = [60, 300]
 """
