@@ -97,13 +97,6 @@ def captured(function: Callable[[], None], device: torch.device) -> Callable[[],
     return repeat
 
 
-def plain_call(function: Callable[[], None], device: torch.device) -> Callable[[], None]:
-    """The function itself, after the runs that recording needs: for tests of all else on a CPU."""
-    for _ in range(_WARM_UPS):
-        function()
-    return function
-
-
 class Late:
     """TD errors on their way to the host: float32 [batch]."""
 

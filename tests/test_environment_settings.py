@@ -89,7 +89,7 @@ def earlier(env_id: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("env_id", "stack"), [("CartPole-v0", 1), ("coop/Corridor-v0", 1), ("coop/Catch-v0", 4), ("breakout", 4)]
+    ("env_id", "stack"), [("CartPole-v0", 1), ("corridor:test/Corridor-v0", 1), ("coop/Catch-v0", 4), ("breakout", 4)]
 )
 def test_configs_of_earlier_versions_stacked_pictures_only(env_id: str, stack: int) -> None:
     config = resolve(earlier(env_id))

@@ -64,7 +64,7 @@ def without_seconds(folder: Path) -> list[dict[str, str]]:
 @pytest.mark.parametrize(("episodes", "left", "right"), [(4, 2, 2), (3, 2, 1)])
 def test_short_episodes_do_not_crowd_out_long_ones(episodes: int, left: int, right: int) -> None:
     """The first emulator walks to the left, for 50 steps and nothing; the other one reaches the end within 5."""
-    env = make_vector_env(EnvSettings(id="coop/Corridor-v0"), 2, 0)
+    env = make_vector_env(EnvSettings(id="corridor:test/Corridor-v0"), 2, 0)
     returns = play(env, lambda obs: np.array([0, 1]), episodes)
     env.close()
     assert sorted(returns) == [0.0] * left + [1.0] * right
@@ -174,9 +174,11 @@ def test_films_of_a_lockstep_run(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["coop-local", "coop-lockstep"])
 def test_what_can_t_be_filmed_is_refused_before_the_run_starts(name: str, tmp_path: Path) -> None:
-    done = run_command(name, "--env.id", "coop/Corridor-v0", "--video-every", "9", "--run-dir", tmp_path / "run")
+    done = run_command(
+        name, "--env.id", "corridor:test/Corridor-v0", "--video-every", "9", "--run-dir", tmp_path / "run"
+    )
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"{name}: error: video_every: env.id: 'coop/Corridor-v0' has no pictures to film\n"
+    assert done.stderr == f"{name}: error: video_every: env.id: 'corridor:test/Corridor-v0' has no pictures to film\n"
     assert not (tmp_path / "run").exists()
 
 

@@ -114,6 +114,7 @@ class Reference:
             zeros,
             zeros,
             zeros.astype(np.int32),
+            np.ones(size, np.uint8),
         )
         self.agent.update(Batch(frames, *columns))
 
