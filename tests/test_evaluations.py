@@ -32,7 +32,7 @@ from coop.common.settings.config import NetworkSettings, RunConfig
 from coop.common.settings.environment import EnvSettings
 from coop.common.types import EnvSpec
 from coop.evaluation.episodes import Evaluator, exploring, play
-from coop.evaluation.evaluator import EvaluatorService, Plan, Schedule
+from coop.evaluation.evaluator import EvaluationPlan, EvaluatorService, Schedule
 from coop.learner.agent import Agent
 from coop.learner.broadcast import Broadcaster
 from coop.learner.evaluations import EvaluationInbox
@@ -273,7 +273,7 @@ def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -
     assert {f"{image.step}.gif" for image in images} == {video.name for video in videos}
 
 
-def service(nodes: tuple[Node, Node], stop: Stop, plan: Plan) -> tuple[Agent, EvaluatorService]:
+def service(nodes: tuple[Node, Node], stop: Stop, plan: EvaluationPlan) -> tuple[Agent, EvaluatorService]:
     """A learner's agent, and an evaluator that has joined its run."""
     config = RunConfig(method="coop", network=NetworkSettings(hidden=(8,)))
     agent = Agent(config, SPEC)
@@ -285,7 +285,7 @@ def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> 
     learner, evaluator = nodes
     stop = Stop()
     evaluator.follow_stop(stop)
-    agent, evaluations = service(nodes, stop, Plan(steps=100, episodes=2))
+    agent, evaluations = service(nodes, stop, EvaluationPlan(steps=100, episodes=2))
     broadcaster, inbox = Broadcaster(learner, agent), EvaluationInbox(learner, lambda: 1000)
     taken: list[EvaluationRow] = []
 
@@ -320,7 +320,7 @@ def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> 
 
 def test_an_evaluator_of_an_interrupted_run_stops_at_once(nodes: tuple[Node, Node]) -> None:
     stop = Stop()
-    agent, evaluations = service(nodes, stop, Plan(seconds=0.0, episodes=100_000))
+    agent, evaluations = service(nodes, stop, EvaluationPlan(seconds=0.0, episodes=100_000))
     Broadcaster(nodes[0], agent)
     inbox = EvaluationInbox(nodes[0], lambda: 1000)
     with ThreadPoolExecutor() as threads, ExitStack() as end:
@@ -334,7 +334,7 @@ def test_an_evaluator_of_an_interrupted_run_stops_at_once(nodes: tuple[Node, Nod
 
 def test_an_evaluator_asks_for_the_final_networks_until_it_has_them(nodes: tuple[Node, Node]) -> None:
     stop = Stop()
-    agent, evaluations = service(nodes, stop, Plan(steps=100, episodes=2))
+    agent, evaluations = service(nodes, stop, EvaluationPlan(steps=100, episodes=2))
     inbox = EvaluationInbox(nodes[0], lambda: 1000)
     stop.set("complete: total_updates reached")
     with ThreadPoolExecutor() as threads:
@@ -347,4 +347,4 @@ def test_an_evaluator_asks_for_the_final_networks_until_it_has_them(nodes: tuple
 
 def test_an_evaluator_needs_to_know_how_often(nodes: tuple[Node, Node]) -> None:
     with pytest.raises(UsageError, match="--every: needed, as the run has no eval_every"):
-        service(nodes, Stop(), Plan())
+        service(nodes, Stop(), EvaluationPlan())

@@ -1,5 +1,6 @@
 """What is installed and what goes with the source: packages, their data, license, citation and links of pages."""
 
+import ast
 import os
 import re
 import tomllib
@@ -12,6 +13,7 @@ import yaml
 from setuptools import find_packages
 
 ROOT = Path(__file__).parents[1]
+ROOMS = ("actors", "common", "deploy", "learner", "replay", "coop")  # rglob follows no links
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 IN_CHECKOUTS_ONLY = (
     "coop/deploy/Dockerfile",
@@ -35,6 +37,16 @@ def test_every_folder_of_the_package_is_installed_and_no_other_name() -> None:
     modules = [Path(folder, name) for folder, _, names in os.walk(ROOT / "coop", followlinks=True) for name in names]
     here = {path.parent.relative_to(ROOT).as_posix() for path in modules if path.suffix == ".py"}
     assert folders == here
+
+
+def test_no_two_classes_share_a_name() -> None:
+    places: dict[str, list[str]] = {}
+    for file in sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py")):
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
+    assert len(places) > 300
+    assert not {name: files for name, files in places.items() if len(files) > 1}
 
 
 def test_every_data_file_is_installed() -> None:

@@ -16,7 +16,7 @@ from coop.common.imports import describe, remember
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.numbers import exact, strict_json
 from coop.common.process.console import say
-from coop.common.process.files import LineFile, Measured, make_folder, measure, truncate, write_atomic
+from coop.common.process.files import FileDigest, LineFile, make_folder, measure, truncate, write_atomic
 from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import leaves
 from coop.common.settings.resuming import settings_digest
@@ -63,7 +63,7 @@ class RunDirectory:
         self.settings = settings_digest(config)
         self.fallbacks: list[str] = []
         self.aside = ""
-        sealed: Mapping[str, Measured] = {}
+        sealed: Mapping[str, FileDigest] = {}
         try:
             (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
             newest = None if found is None or number is None else found.of(number)
@@ -166,7 +166,7 @@ class RunDirectory:
         except Exception as error:  # matplotlib's own settings, and the fonts and programs that they name
             say(f"{self.path}: no learning curve: {describe(error)[:200]}")
 
-    def records(self) -> dict[str, Measured]:
+    def records(self) -> dict[str, FileDigest]:
         """What the growing files hold now, for a checkpoint."""
         return {name: file.measured for name, file in zip(RECORDS, (self._episodes, self._metrics), strict=True)}
 
