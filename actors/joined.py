@@ -6,14 +6,14 @@ from collections.abc import Collection
 
 import numpy as np
 
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.errors import JoinError
 from coop.common.imports import check_allowed
 from coop.common.messaging.messages.join import Joined
 from coop.common.networks.acting import acting_network
 
 
-def make_policy(joined: Joined, allow_import: Collection[str], rng: np.random.Generator) -> Policy:
+def make_policy(joined: Joined, allow_import: Collection[str], rng: np.random.Generator) -> EpsilonGreedy:
     """A policy with networks of the run's layout, whose parameters the learner will send.
 
     Raises:
@@ -25,4 +25,4 @@ def make_policy(joined: Joined, allow_import: Collection[str], rng: np.random.Ge
     first, second = (acting_network(joined.config.network, joined.spec) for _ in range(2))
     if first.layout_digest() != joined.layout:
         raise JoinError(f"network layout here {first.layout_digest()}, the learner's {joined.layout}")
-    return Policy((first, second), joined.spec, rng)
+    return EpsilonGreedy((first, second), joined.spec, rng)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.protocol import Steps, VectorEnv
 from coop.common.types import Array, EpisodeEnd
 
@@ -36,7 +36,7 @@ class Player:
         steps: environment steps played by this process, over all its emulators.
     """
 
-    def __init__(self, env: VectorEnv, policy: Policy, epsilon: Callable[[int], float]) -> None:
+    def __init__(self, env: VectorEnv, policy: EpsilonGreedy, epsilon: Callable[[int], float]) -> None:
         self.steps = 0
         self._env = env
         self._policy = policy

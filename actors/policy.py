@@ -9,7 +9,7 @@ from coop.common.networks.acting import ActingNetwork
 from coop.common.types import Array, EnvSpec
 
 
-class Policy:
+class EpsilonGreedy:
     """The two networks of a run, one of which acts.
 
     networks: Q1 and Q2. acting: 0 or 1.

@@ -6,7 +6,7 @@ import time
 from functools import partial
 
 from coop.actors.player import Player, Turn
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.actors.segments import SegmentAssembler
 from coop.actors.weights import WeightsFollower
 from coop.common.envs.protocol import VectorEnv
@@ -33,7 +33,7 @@ class ActorService:
         stop: Stop,
         config: RunConfig,
         env: VectorEnv,
-        policy: Policy,
+        policy: EpsilonGreedy,
         incarnation: int,
         console: Console,
     ) -> None:

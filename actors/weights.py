@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.errors import BadMessage
 from coop.common.messaging.keys import role_key, weights_key
 from coop.common.messaging.messages.weights import Current, Role, Weights
@@ -24,7 +24,7 @@ class WeightsFollower:
     the newest role names were broadcast.
     """
 
-    def __init__(self, node: Node, policy: Policy) -> None:
+    def __init__(self, node: Node, policy: EpsilonGreedy) -> None:
         self._node = node
         self._policy = policy
         self._size = policy.networks[0].size

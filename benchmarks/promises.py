@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from coop.actors.player import Player
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.envs import gymnasium_env
 from coop.common.envs.checked import CheckedEnv
 from coop.common.envs.make import make_vector_env
@@ -57,7 +57,7 @@ def actor(env_id: str, envs: int, steps: int) -> Callable[[], None]:
     """So many steps of an actor's emulators."""
     env = make_vector_env(EnvSettings(id=env_id), envs, 0)
     first, second = (FlatNetwork(build_network("mlp", env.spec, (32,), seed=seed)) for seed in (0, 1))
-    player = Player(env, Policy((first, second), env.spec, np.random.default_rng(0)), lambda _: 0.1)
+    player = Player(env, EpsilonGreedy((first, second), env.spec, np.random.default_rng(0)), lambda _: 0.1)
     player.begin()
 
     def play() -> None:

@@ -6,7 +6,7 @@ from coop.common.messaging.keys import role_key, weights_key
 from coop.common.messaging.messages.weights import Current, Role, Weights
 from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message
-from coop.learner.protocol import Agent
+from coop.learner.protocol import AnyAgent
 
 
 class Broadcaster:
@@ -15,7 +15,7 @@ class Broadcaster:
     env_step: environment steps of the run so far, here and below.
     """
 
-    def __init__(self, node: Node, agent: Agent, env_step: int = 0) -> None:
+    def __init__(self, node: Node, agent: AnyAgent, env_step: int = 0) -> None:
         self._node = node
         self._agent = agent
         self._progress = (0, 0)

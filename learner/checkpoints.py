@@ -14,7 +14,7 @@ from coop.common.messaging.messages.epoch import Snapshot, Written
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.messaging.wire import Message
-from coop.common.process.files import Measured
+from coop.common.process.files import FileDigest
 from coop.learner.shared_epochs import SharedEpochs
 from coop.records.checkpoints import DONE, KEPT, checkpoint_numbers
 from coop.records.learner_checkpoints import save_epoch
@@ -76,13 +76,13 @@ class Checkpoints:
     def _writing(self) -> bool:
         return self._writer is not None and self._writer.is_alive()
 
-    def _try(self, number: int, state: dict[str, Any], records: dict[str, Measured]) -> None:
+    def _try(self, number: int, state: dict[str, Any], records: dict[str, FileDigest]) -> None:
         try:
             self._save(number, state, records)
         except RunError as error:
             self._event(f"{error}; the run goes on without it")
 
-    def _save(self, number: int, state: dict[str, Any], records: dict[str, Measured]) -> None:
+    def _save(self, number: int, state: dict[str, Any], records: dict[str, FileDigest]) -> None:
         began = time.monotonic()
         try:
             try:

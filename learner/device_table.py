@@ -10,7 +10,7 @@ from torch import Tensor
 from coop.common.types import EnvSpec
 from coop.learner.edl import kernels
 from coop.learner.given import Given
-from coop.learner.losses import Columns
+from coop.learner.losses import BatchColumns
 
 
 class DeviceTable:
@@ -63,7 +63,7 @@ class DeviceTable:
         told = (self._ended, self._terminated, self._rewards, self._actions)
         drawn = kernels.draws(chance, self.steps, told, self._powers, len(self._stack))
         *columns, index = self._drawn(chance) if drawn is None else drawn
-        return Given(self._frames, index, Columns(*columns), s, rate)
+        return Given(self._frames, index, BatchColumns(*columns), s, rate)
 
     def _drawn(self, chance: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """See `kernels.draws`."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from coop.common.networks.inputs import preprocess
 from coop.common.types import Batch
 from coop.learner.losses import columns, td_errors
-from coop.learner.protocol import Agent
+from coop.learner.protocol import AnyAgent
 from coop.learner.qnetwork import on_host
 
 ARCHIVED = 64  # transitions
@@ -44,7 +44,7 @@ class Diagnostics:
             first = _first(batch, missing)
             self.archive = first if self.archive is None else _joined(self.archive, first)
 
-    def row(self, agent: Agent) -> dict[str, Any]:
+    def row(self, agent: AnyAgent) -> dict[str, Any]:
         """The values for a row of metrics.jsonl; there must be an archive.
 
         Hidden layers, and the TD error as an update would find it, are those of the acting network. Drift and churn

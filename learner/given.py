@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from coop.common.types import Batch
-from coop.learner.losses import Columns, columns
+from coop.learner.losses import BatchColumns, columns
 
 
 class Given(NamedTuple):
@@ -20,7 +20,7 @@ class Given(NamedTuple):
 
     frames: Any
     index: Any
-    columns: Columns[Any]
+    columns: BatchColumns[Any]
     s: Any
     rate: Any
 
@@ -32,7 +32,7 @@ class Given(NamedTuple):
             return cls(batch.frames, index, held, s, rate)
         # Copies, because arrays from the wire are read-only and PyTorch warns about views of those.
         frames, places, *parts = (torch.tensor(array, device=device) for array in (batch.frames, index, *held))
-        return cls(frames, places, Columns(*parts), s, rate)
+        return cls(frames, places, BatchColumns(*parts), s, rate)
 
 
 def indices(batch: Batch) -> Any:  # noqa: ANN401

@@ -5,11 +5,11 @@ from __future__ import annotations
 from coop.common.errors import UsageError
 from coop.common.places import absolute
 from coop.common.process.untrusted import check_links
-from coop.learner.protocol import Agent
+from coop.learner.protocol import AnyAgent
 from coop.records.learner_checkpoints import fitting, newest_epoch
 
 
-def load_initial_networks(agent: Agent) -> None:
+def load_initial_networks(agent: AnyAgent) -> None:
     """Give a new run's agent the networks of the run `learner.initial_networks`; leave it as it is if that is empty.
 
     Raises:

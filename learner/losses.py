@@ -67,7 +67,7 @@ class Huber:
 LOSSES: dict[str, Loss] = {"squared": SquaredError(), "mse": MeanSquaredError(), "huber": Huber()}
 
 
-class Columns(NamedTuple, Generic[ArrayT]):
+class BatchColumns(NamedTuple, Generic[ArrayT]):
     """What the loss needs of a batch's transitions, in arrays of one library.
 
     actions: int64 [batch]. rewards: float32 [batch]. discounts: float32 [batch], gamma^k of the k steps that a
@@ -80,13 +80,15 @@ class Columns(NamedTuple, Generic[ArrayT]):
     weights: ArrayT
 
 
-def columns(batch: Batch, gamma: float) -> Columns[NDArray[Any]]:
+def columns(batch: Batch, gamma: float) -> BatchColumns[NDArray[Any]]:
     """The columns of a batch, in numpy."""
     discounts = _powers(gamma)[batch.span] * ~batch.terminated
-    return Columns(batch.actions.astype(np.int64), batch.rewards, discounts, batch.weights)
+    return BatchColumns(batch.actions.astype(np.int64), batch.rewards, discounts, batch.weights)
 
 
-def td_errors(batch: Columns[ArrayT], values: ArrayT, bootstrap: ArrayT, value_bound: float | None = None) -> ArrayT:
+def td_errors(
+    batch: BatchColumns[ArrayT], values: ArrayT, bootstrap: ArrayT, value_bound: float | None = None
+) -> ArrayT:
     """e[a] = y[a] - (r + gamma^k (1 - terminated) V(x')) of the actions taken, float32 [batch].
 
     values: y = Q(x), float32 [batch, actions]. bootstrap: V(x'), float32 [batch], clipped to +-value_bound.
@@ -99,7 +101,7 @@ def td_errors(batch: Columns[ArrayT], values: ArrayT, bootstrap: ArrayT, value_b
     return errors
 
 
-def output_error(batch: Columns[ArrayT], slopes: ArrayT, outputs: ArrayT) -> ArrayT:
+def output_error(batch: BatchColumns[ArrayT], slopes: ArrayT, outputs: ArrayT) -> ArrayT:
     """The gradient of the batch's mean weighted loss with respect to the outputs, float32 [batch, actions].
 
     Only the entries of the actions taken are not 0.

@@ -15,8 +15,8 @@ from coop.learner.losses import Loss, Values
 from coop.learner.methods.rule import UpdateRule
 
 
-class Agent(Protocol):
-    """See `coop.learner.agent.Agent` for the attributes."""
+class AnyAgent(Protocol):
+    """See `coop.learner.agent.AnyAgent` for the attributes."""
 
     config: RunConfig
     spec: EnvSpec

@@ -23,7 +23,7 @@ from coop.common.settings.config import RunConfig
 from coop.common.types import Batch, EnvSpec
 from coop.learner.edl.beside import branching
 from coop.learner.given import Given, indices
-from coop.learner.losses import Columns, Values, columns
+from coop.learner.losses import BatchColumns, Values, columns
 
 Capture = Callable[[Callable[[], None], torch.device], Callable[[], None]]
 """Makes a function without arguments, of a device, repeatable; it may run before, but does not while it is recorded."""
@@ -95,13 +95,6 @@ def captured(function: Callable[[], None], device: torch.device) -> Callable[[],
             gc.enable()
     repeat: Callable[[], None] = graph.replay
     return repeat
-
-
-def plain_call(function: Callable[[], None], device: torch.device) -> Callable[[], None]:
-    """The function itself, after the runs that recording needs: for tests of all else on a CPU."""
-    for _ in range(_WARM_UPS):
-        function()
-    return function
 
 
 class Late:
@@ -209,15 +202,15 @@ class Feed:
         if self._on_gpu:
             self._copies = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         views = self._layout.views(self._place)
-        held = Columns(*(views[name] for name in Columns._fields))
+        held = BatchColumns(*(views[name] for name in BatchColumns._fields))
         self.given = Given(views["frames"], views["index"], held, views["s"].view(()), views["rate"].view(()))
 
-    def load(self, batch: Batch, held: Columns[NDArray[Any]], s: float, rate: float) -> None:
+    def load(self, batch: Batch, held: BatchColumns[NDArray[Any]], s: float, rate: float) -> None:
         """Begin to copy a batch; what the device does next sees it."""
         lane = self._lanes[0]
         self._lanes.rotate(-1)
         lane.await_copied()
-        for name, values in zip(Columns._fields, held, strict=True):
+        for name, values in zip(BatchColumns._fields, held, strict=True):
             lane.arrays[name][...] = values
         lane.arrays["index"][...] = indices(batch)
         lane.arrays["s"][...] = s

@@ -13,7 +13,7 @@ from coop.common.numbers import RETURN_WINDOW
 from coop.common.types import Array, Batch
 from coop.learner.diagnostics import Diagnostics
 from coop.learner.losses import Values
-from coop.learner.protocol import Agent
+from coop.learner.protocol import AnyAgent
 from coop.learner.return_history import ReturnHistory
 
 
@@ -40,7 +40,7 @@ class Telemetry:
         """Note the TD errors of one update, float32 [batch], before the next row."""
         self._errors.append(errors)
 
-    def add(self, agent: Agent, batch: Batch) -> None:
+    def add(self, agent: AnyAgent, batch: Batch) -> None:
         """Note one update."""
         self.diagnostics.add(batch)
         self.largest_reward = max(self.largest_reward, float(np.abs(batch.rewards).max()))
@@ -48,7 +48,7 @@ class Telemetry:
         lag = agent.updates - batch.param_version
         self._batches.append((batch.age.copy(), batch.reuse.copy(), lag, batch.terminated.copy(), batch.ids.copy()))
 
-    def row(self, agent: Agent, drawn: Drawn, epsilon: float, now: float) -> dict[str, Any]:
+    def row(self, agent: AnyAgent, drawn: Drawn, epsilon: float, now: float) -> dict[str, Any]:
         """The metrics of the updates since the last row, of which there must be at least one."""
         errors = np.concatenate(self._errors)
         age, reuse, lag, terminal = (np.concatenate([arrays[i] for arrays in self._batches]) for i in range(4))
@@ -84,16 +84,16 @@ class Telemetry:
             "weight_lag_mean": float(lag.mean()),
         }
 
-    def q_bound(self, agent: Agent) -> float | None:
+    def q_bound(self, agent: AnyAgent) -> float | None:
         """The largest possible |Q|, (largest |reward| seen) / (1 - gamma); None if gamma is 1."""
         gamma = agent.config.learner.gamma
         return self.largest_reward / (1 - gamma) if gamma < 1 else None
 
-    def _bound(self, agent: Agent) -> dict[str, float]:
+    def _bound(self, agent: AnyAgent) -> dict[str, float]:
         bound = self.q_bound(agent)
         return {} if bound is None else {"q_bound": bound}
 
-    def warning(self, agent: Agent) -> str:
+    def warning(self, agent: AnyAgent) -> str:
         """A warning that mean |Q| exceeds its bound; empty if it does not."""
         bound = self.q_bound(agent)
         if bound is None or self.q_abs_mean <= bound:

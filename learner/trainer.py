@@ -20,7 +20,7 @@ from coop.common.messaging.messages.sample import Drawn
 from coop.common.numbers import METRICS_EVERY
 from coop.common.types import Batch, EpisodeRow
 from coop.learner.agent import Update
-from coop.learner.protocol import Agent
+from coop.learner.protocol import AnyAgent
 from coop.learner.telemetry import Telemetry
 
 NOTHING_DRAWN = Drawn(0, 0, 0, 0, 0, 0, ())
@@ -58,7 +58,7 @@ class Trainer:
     broadcast, a row or an epoch is due it is read at once.
     """
 
-    def __init__(self, agent: Agent, now: float) -> None:
+    def __init__(self, agent: AnyAgent, now: float) -> None:
         self.agent = agent
         self.config = agent.config
         self.telemetry = Telemetry(now)

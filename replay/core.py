@@ -25,7 +25,7 @@ LEARNERS_KEPT = 64  # superseded learners, which are refused
 
 
 @dataclass(frozen=True, slots=True)
-class Wait:
+class RetryLater:
     """The request is not admitted now; `reason` says why."""
 
     reason: str
@@ -115,7 +115,7 @@ class ReplayCore:
         """Number of episodes that have ended."""
         return self._episodes.total
 
-    def insert(self, segment: Segment, payload: bytes = b"") -> int | Wait:
+    def insert(self, segment: Segment, payload: bytes = b"") -> int | RetryLater:
         """Insert a segment unless it is a duplicate; return the number of transitions accepted, or the reason to wait.
 
         payload: the segment's request, for the recorder.
@@ -132,7 +132,7 @@ class ReplayCore:
                 reason = self.problem = f"the journal can't be written: {error.strerror or error}"
         self.inserts_wait_for = reason or ""
         if reason:
-            return Wait(reason)
+            return RetryLater(reason)
         self.apply_insert(segment)
         return self.table.inserted
 
@@ -149,7 +149,7 @@ class ReplayCore:
         )
         self.table.insert(segment)
 
-    def draws(self, request: DrawRequest) -> list[Reply] | Wait:
+    def draws(self, request: DrawRequest) -> list[Reply] | RetryLater:
         """Draw the batches of a request, as many as are admitted; return the reason to wait if none is.
 
         Raises:
@@ -162,7 +162,7 @@ class ReplayCore:
             if replies:
                 one = msgspec.structs.replace(request, sequence=sequence, episodes_from=episodes_from, priorities=())
             reply = self.draw(one)
-            if isinstance(reply, Wait):
+            if isinstance(reply, RetryLater):
                 return replies or reply
             replies.append(reply)
             _, drawn = reply
@@ -171,7 +171,7 @@ class ReplayCore:
                 break
         return replies
 
-    def draw(self, request: DrawRequest) -> Reply | Wait:
+    def draw(self, request: DrawRequest) -> Reply | RetryLater:
         """Draw a batch, or repeat the one of an equal earlier request; return the reason to wait if none is admitted.
 
         Raises:
@@ -188,7 +188,7 @@ class ReplayCore:
             reason = f"{reason}; {self.problem}"
         self.samples_wait_for = reason or ""
         if reason:
-            return Wait(reason)
+            return RetryLater(reason)
         reply = self.apply_draw(request)
         self.recorder.draw(request, reply.batch.columns["ids"])
         return reply

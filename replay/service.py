@@ -29,7 +29,7 @@ from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.messaging.wire import Message
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
-from coop.replay.core import ReplayCore, Reply, Wait
+from coop.replay.core import ReplayCore, Reply, RetryLater
 from coop.replay.gate import HOLD, Gate
 from coop.replay.persistence.epochs import ReplayEpochs
 
@@ -142,7 +142,7 @@ class ReplayService:
     def _insert(self, message: Message) -> bytearray:
         segment = self._read_segment(message)
         outcome = self._admit(self._inserts, lambda: self._core.insert(segment, message.payload))
-        if isinstance(outcome, Wait):
+        if isinstance(outcome, RetryLater):
             return Retry(outcome.reason).encode(self._node.run)
         return Ack(outcome, self._window()).encode(self._node.run)
 
@@ -159,14 +159,14 @@ class ReplayService:
         if shared and request.memory not in (None, shared):
             return Memory(shared).encode(self._node.run)
         outcome = self._admit(self._draws, lambda: self._draw(request))
-        if isinstance(outcome, Wait):
+        if isinstance(outcome, RetryLater):
             return Retry(outcome.reason).encode(self._node.run)
         return outcome
 
-    def _draw(self, request: DrawRequest) -> bytearray | Wait:
+    def _draw(self, request: DrawRequest) -> bytearray | RetryLater:
         """Draw batches as a message; frames that the learner lacks are copied straight into it."""
         replies = self._core.draws(request)
-        if isinstance(replies, Wait):
+        if isinstance(replies, RetryLater):
             return replies
         memory = self._core.table.shared_memory if request.memory else ""
         if memory or request.mirror:
@@ -197,13 +197,13 @@ class ReplayService:
         lacking = core.table.stored(slots[indices])
         return encode_named(self._node.run, draws, columns, slots, frames.numbers, indices, lacking, self._batch)
 
-    def _admit(self, gate: Gate, attempt: Callable[[], T | Wait]) -> T | Wait:
+    def _admit(self, gate: Gate, attempt: Callable[[], T | RetryLater]) -> T | RetryLater:
         """Try, and repeat whenever the core has changed, until the gate's deadline."""
         with self._changed:
             if self._broken:  # senders repeat their requests to the next replay service
-                return Wait(self._broken)
+                return RetryLater(self._broken)
         with self._changing():
-            while isinstance(outcome := self._not_serving() or attempt(), Wait):
+            while isinstance(outcome := self._not_serving() or attempt(), RetryLater):
                 left = gate.refuse(outcome.reason, time.monotonic())
                 if left <= 0 or self._leaving:
                     return outcome
@@ -230,11 +230,11 @@ class ReplayService:
                 self._broken = f"an error of this program may have left the table half changed: {error!r}"
                 raise
 
-    def _not_serving(self) -> Wait | None:
+    def _not_serving(self) -> RetryLater | None:
         """Why this service must neither acknowledge nor draw now; None if it may."""
         if self._leaving:
-            return Wait(LEAVING)
-        return None if time.monotonic() < self._confirmed else Wait(UNCONFIRMED)
+            return RetryLater(LEAVING)
+        return None if time.monotonic() < self._confirmed else RetryLater(UNCONFIRMED)
 
     def _stats(self, message: Message) -> bytearray:
         StatsQuestion.decode(message)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coop.common.types import Array, Batch, EnvSpec, Segment
-from coop.replay.table.table import Table
+from coop.replay.table.table import Table, _reuse_histogram
 
 
 def make_spec(stack: int, dtype: str = "float32", shape: tuple[int, ...] = (2, 3)) -> EnvSpec:
@@ -153,3 +153,44 @@ def whole_state(table: Table) -> tuple[dict[str, Any], dict[str, Array]]:
     meta, arrays, frames = table.snapshot()
     with frames:
         return meta, {**arrays, "frames": frames.read(0, len(frames))}
+
+
+@dataclass(frozen=True, slots=True)
+class TableStats:
+    """Counts since the table's beginning, and its present contents.
+
+    inserted, evicted, evicted_unsampled: transitions (one that reservoir eviction never kept counts as evicted).
+    batches, sampled: sample calls and transitions drawn.
+    reuse_mean: draws per transition held. reuse_held, reuse_evicted: transitions by how often they have been drawn;
+    entry 0 counts those never drawn, entry b those drawn 2^(b-1) to 2^b - 1 times, the last entry all above.
+    """
+
+    size: int
+    inserted: int
+    evicted: int
+    evicted_unsampled: int
+    batches: int
+    sampled: int
+    frames_held: int
+    bytes_held: int
+    reuse_mean: float
+    reuse_held: tuple[int, ...]
+    reuse_evicted: tuple[int, ...]
+
+
+def table_stats(table: Table) -> TableStats:
+    size = len(table)
+    reuse = table._columns.reuse[:size]
+    return TableStats(
+        size=size,
+        inserted=table.inserted,
+        evicted=table.evicted,
+        evicted_unsampled=table.evicted_unsampled,
+        batches=table.batches,
+        sampled=table._sampled,
+        frames_held=table._frames.held,
+        bytes_held=table._frames.bytes_held + size * table._columns.row_bytes,
+        reuse_mean=float(reuse.mean()) if size else 0.0,
+        reuse_held=tuple(_reuse_histogram(reuse).tolist()),
+        reuse_evicted=tuple(table._reuse_evicted.tolist()),
+    )

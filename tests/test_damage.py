@@ -23,7 +23,7 @@ from test_journal import _insert, _use
 
 import coop
 from coop.common.errors import RunError, UsageError
-from coop.common.process.files import Measured, measure, sealed, unsealed
+from coop.common.process.files import FileDigest, measure, sealed, unsealed
 from coop.common.types import EnvSpec
 from coop.evaluation.evaluate import evaluate_checkpoint
 from coop.evaluation.export import export
@@ -32,7 +32,7 @@ from coop.records.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers
 from coop.records.locks import _place
 from coop.records.reading import read_csv, read_jsonl, read_lines
 from coop.records.resumption import survey
-from coop.replay.core import ReplayCore, Wait
+from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.persistence.epochs import ReplayEpochs
 from coop.replay.persistence.journal import HEADER_BYTES, SEGMENT, Header, Journal
 from coop.replay.persistence.journal import _packed as packed_header
@@ -132,7 +132,7 @@ def test_python_refuses_as_the_commands_do(run: Path) -> None:
 def test_a_run_of_another_account_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the operating system answers: EACCES of a permission, EIO of a disk or of a network file system."""
 
-    def fails(path: Path, size: int | None = None) -> Measured:
+    def fails(path: Path, size: int | None = None) -> FileDigest:
         raise OSError(5, os.strerror(5), str(path))
 
     monkeypatch.setattr(checkpoints, "measure", fails)
@@ -213,7 +213,7 @@ def test_a_link_and_a_foreign_record_name_are_not_followed(run: Path, tmp_path: 
     for number in (200, 220):
         folder = run / "checkpoints" / str(number)
         manifest = checkpoints.read_manifest(folder)
-        records = {"../outside.csv": Measured(0, 0)}
+        records = {"../outside.csv": FileDigest(0, 0)}
         write_manifest(folder, Manifest(manifest.run, number, manifest.files, records))
     done = resume(run, "--total-steps", "300")
     assert done.returncode == 2
@@ -392,7 +392,7 @@ def _journal(spec: EnvSpec, folder: Path) -> tuple[ReplayCore, list[int]]:
     core, at = ReplayCore(AHEAD, spec, Journal(folder, 5, 1, keep=False)), []
     for sequence in range(6):
         at.append((folder / "00000001.log").stat().st_size)
-        assert not isinstance(_insert(core, spec, sequence), Wait)
+        assert not isinstance(_insert(core, spec, sequence), RetryLater)
     return core, at
 
 
@@ -419,7 +419,7 @@ def test_a_damaged_record_costs_only_itself_and_is_counted(
         assert "the journal lacks 4 transitions that had been acknowledged" in told[2]
     assert contents(tmp_path) == before, "reading changes nothing"
     twin.recorder = Journal(tmp_path, 5, number, keep=False, accepted=twin.table.inserted)
-    assert not isinstance(_insert(twin, spec, 6), Wait)
+    assert not isinstance(_insert(twin, spec, 6), RetryLater)
     third = ReplayCore(AHEAD, spec)
     recover(third, tmp_path, 1, 5)
     assert (third.table.inserted, third.lost) == (28 - lost, lost), "the same loss, once"

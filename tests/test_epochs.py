@@ -18,7 +18,7 @@ from coop.common.types import EnvSpec, EpisodeRecord
 from coop.records.checkpoints import DONE, checkpoint_numbers
 from coop.records.learner_checkpoints import load_learner, newest_epoch, save_epoch
 from coop.records.resumption import go_back, survey
-from coop.replay.core import ReplayCore, Wait
+from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.episodes import MOST, EpisodeLog
 from coop.replay.persistence.epochs import ReplayEpochs
 
@@ -34,8 +34,8 @@ def _used_core(spec: EnvSpec) -> ReplayCore:
     core = ReplayCore(CONFIG, spec)
     drawn = 0
     for sequence in range(15):
-        assert not isinstance(core.insert(make_segment(spec, sequence, acked=4 * sequence)), Wait)
-        while not isinstance(core.draw(DrawRequest(1, drawn, max(0, drawn - 2), 4, 0)), Wait):
+        assert not isinstance(core.insert(make_segment(spec, sequence, acked=4 * sequence)), RetryLater)
+        while not isinstance(core.draw(DrawRequest(1, drawn, max(0, drawn - 2), 4, 0)), RetryLater):
             drawn += 1
     core.insert(make_segment(spec, 3))
     return core
@@ -58,8 +58,8 @@ def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
     for sequence in (base, base + 1, core.drawn, core.drawn + 1):
         request = DrawRequest(1, sequence, base, 4, 0)
         first, second = core.draw(request), twin.draw(request)
-        assert not isinstance(first, Wait)
-        assert not isinstance(second, Wait)
+        assert not isinstance(first, RetryLater)
+        assert not isinstance(second, RetryLater)
         for name in ("ids", "frames", "obs_index"):
             np.testing.assert_array_equal(getattr(first.batch.read(), name), getattr(second.batch.read(), name))
         assert first.drawn == second.drawn
@@ -82,7 +82,7 @@ def test_the_frames_of_old_answers_are_given_back(spec: EnvSpec, tmp_path: Path)
     ReplayEpochs(tmp_path, 5).restore(twin, core.drawn - 2)
     for one in (core, twin):
         assert len(one.repeatable()) == 2
-        assert isinstance(one.draw(DrawRequest(1, one.drawn, one.drawn, 4, 0)), Wait)
+        assert isinstance(one.draw(DrawRequest(1, one.drawn, one.drawn, 4, 0)), RetryLater)
         assert not one.repeatable()
         check_references(one.table)
 
@@ -139,7 +139,9 @@ def test_episodes_are_kept_as_long_as_they_may_be_asked_for(spec: EnvSpec, tmp_p
         for _ in range(10):
             core.insert(make_segment(spec, sequence))  # an episode each
             sequence += 1
-            while not isinstance(reply := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, sequence - 1)), Wait):
+            while not isinstance(
+                reply := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, sequence - 1)), RetryLater
+            ):
                 last = reply
         told[core.drawn] = last.drawn.first_episode
         save(core, epochs, core.drawn, *list(told)[-3:-1])
@@ -151,10 +153,10 @@ def test_episodes_are_kept_as_long_as_they_may_be_asked_for(spec: EnvSpec, tmp_p
     back = list(told)[-2]
     ReplayEpochs(tmp_path, 5).restore(twin, back)
     for number in range(twin.table.inserted // 4, twin.table.inserted // 4 + 2):
-        assert not isinstance(twin.insert(make_segment(spec, number)), Wait)
+        assert not isinstance(twin.insert(make_segment(spec, number)), RetryLater)
     for one in (core, twin):
         reply = one.draw(DrawRequest(2, back, back, 4, told[back]))
-        assert not isinstance(reply, Wait)
+        assert not isinstance(reply, RetryLater)
         assert reply.drawn.first_episode == told[back]
         steps = [record.env_step for record in reply.drawn.episodes]
         assert steps == [4 * (number + 1) for number in range(told[back], one.table.inserted // 4)]
@@ -168,7 +170,7 @@ def test_a_draw_that_may_be_repeated_keeps_its_episodes(spec: EnvSpec) -> None:
     for number in range(3):
         core.insert(make_segment(spec, number))
     for sequence, episodes_from in ((0, 0), (1, 2)):
-        assert not isinstance(core.draw(DrawRequest(1, sequence, 0, 4, episodes_from)), Wait)
+        assert not isinstance(core.draw(DrawRequest(1, sequence, 0, 4, episodes_from)), RetryLater)
     for base, first in ((0, 0), (1, 2)):
         kept = core.snapshot(base, [base])
         assert kept.state["first_episode"] == first
@@ -187,8 +189,8 @@ def test_a_run_without_epochs_keeps_a_bounded_number_of_episodes(spec: EnvSpec) 
 def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
     core = _used_core(spec)
     drawn = core.drawn
-    assert isinstance(core.draw(DrawRequest(1, drawn, drawn - 1, 4, 0)), Wait)
-    assert not isinstance(core.draw(DrawRequest(2, 5, 5, 4, 3)), Wait), "another learner, back at update 5"
+    assert isinstance(core.draw(DrawRequest(1, drawn, drawn - 1, 4, 0)), RetryLater)
+    assert not isinstance(core.draw(DrawRequest(2, 5, 5, 4, 3)), RetryLater), "another learner, back at update 5"
     assert core.drawn == 6
     assert [drawn.sequence for _, drawn in core.repeatable()] == [5], "the other one's are forgotten"
     with pytest.raises(RunError, match="another learner has taken over"):
@@ -197,9 +199,9 @@ def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
     assert core.drawn == 21, "updates that this table was not asked for"
     older = ReplayCore(CONFIG, spec)
     older.insert(make_segment(spec))
-    assert isinstance(older.draw(DrawRequest(2, 20, 20, 4, 9)), Wait)
+    assert isinstance(older.draw(DrawRequest(2, 20, 20, 4, 9)), RetryLater)
     assert (older.drawn, older.episodes_total) == (20, 9), "episodes that the learner knows keep their numbers"
-    assert isinstance(older.draw(DrawRequest(2, 30, 30, 4, 11)), Wait)
+    assert isinstance(older.draw(DrawRequest(2, 30, 30, 4, 11)), RetryLater)
     assert (older.drawn, older.episodes_total) == (30, 11), "also of a learner that it knows"
 
 

@@ -196,10 +196,10 @@ def test_a_filmed_atari_game_is_the_one_that_is_played() -> None:
 
 
 def test_an_environment_without_pictures() -> None:
-    with pytest.raises(UsageError, match=r"video_every: env\.id: 'coop/Corridor-v0' has no pictures to film"):
-        check_filmed(EnvSettings(id="coop/Corridor-v0"))
+    with pytest.raises(UsageError, match=r"video_every: env\.id: 'corridor:test/Corridor-v0' has no pictures to film"):
+        check_filmed(EnvSettings(id="corridor:test/Corridor-v0"))
     with pytest.raises(UsageError, match="has no pictures to film"):
-        make_filmed_env(EnvSettings(id="coop/Corridor-v0"), 0)
+        make_filmed_env(EnvSettings(id="corridor:test/Corridor-v0"), 0)
 
 
 def test_a_gif_of_a_run_s_network(

@@ -32,7 +32,7 @@ from coop.common.settings.config import NetworkSettings, RunConfig
 from coop.common.settings.environment import EnvSettings
 from coop.common.types import EnvSpec
 from coop.evaluation.episodes import Evaluator, exploring, play
-from coop.evaluation.evaluator import EvaluatorService, Plan, Schedule
+from coop.evaluation.evaluator import EvaluationPlan, EvaluatorService, Schedule
 from coop.learner.agent import Agent
 from coop.learner.broadcast import Broadcaster
 from coop.learner.evaluations import EvaluationInbox
@@ -64,7 +64,7 @@ def without_seconds(folder: Path) -> list[dict[str, str]]:
 @pytest.mark.parametrize(("episodes", "left", "right"), [(4, 2, 2), (3, 2, 1)])
 def test_short_episodes_do_not_crowd_out_long_ones(episodes: int, left: int, right: int) -> None:
     """The first emulator walks to the left, for 50 steps and nothing; the other one reaches the end within 5."""
-    env = make_vector_env(EnvSettings(id="coop/Corridor-v0"), 2, 0)
+    env = make_vector_env(EnvSettings(id="corridor:test/Corridor-v0"), 2, 0)
     returns = play(env, lambda obs: np.array([0, 1]), episodes)
     env.close()
     assert sorted(returns) == [0.0] * left + [1.0] * right
@@ -174,9 +174,10 @@ def test_films_of_a_lockstep_run(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["coop-local", "coop-lockstep"])
 def test_what_can_t_be_filmed_is_refused_before_the_run_starts(name: str, tmp_path: Path) -> None:
-    done = run_command(name, "--env.id", "coop/Corridor-v0", "--video-every", "9", "--run-dir", tmp_path / "run")
+    flags = ("--env.id", "corridor:test/Corridor-v0", "--video-every", "9", "--run-dir", tmp_path / "run")
+    done = run_command(name, *flags, cwd=Path(__file__).parent)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"{name}: error: video_every: env.id: 'coop/Corridor-v0' has no pictures to film\n"
+    assert done.stderr == f"{name}: error: video_every: env.id: 'corridor:test/Corridor-v0' has no pictures to film\n"
     assert not (tmp_path / "run").exists()
 
 
@@ -271,7 +272,7 @@ def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -
     assert {f"{image.step}.gif" for image in images} == {video.name for video in videos}
 
 
-def service(nodes: tuple[Node, Node], stop: Stop, plan: Plan) -> tuple[Agent, EvaluatorService]:
+def service(nodes: tuple[Node, Node], stop: Stop, plan: EvaluationPlan) -> tuple[Agent, EvaluatorService]:
     """A learner's agent, and an evaluator that has joined its run."""
     config = RunConfig(method="coop", network=NetworkSettings(hidden=(8,)))
     agent = Agent(config, SPEC)
@@ -283,7 +284,7 @@ def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> 
     learner, evaluator = nodes
     stop = Stop()
     evaluator.follow_stop(stop)
-    agent, evaluations = service(nodes, stop, Plan(steps=100, episodes=2))
+    agent, evaluations = service(nodes, stop, EvaluationPlan(steps=100, episodes=2))
     broadcaster, inbox = Broadcaster(learner, agent), EvaluationInbox(learner, lambda: 1000)
     taken: list[EvaluationRow] = []
 
@@ -318,7 +319,7 @@ def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> 
 
 def test_an_evaluator_of_an_interrupted_run_stops_at_once(nodes: tuple[Node, Node]) -> None:
     stop = Stop()
-    agent, evaluations = service(nodes, stop, Plan(seconds=0.0, episodes=100_000))
+    agent, evaluations = service(nodes, stop, EvaluationPlan(seconds=0.0, episodes=100_000))
     Broadcaster(nodes[0], agent)
     inbox = EvaluationInbox(nodes[0], lambda: 1000)
     with ThreadPoolExecutor() as threads, ExitStack() as end:
@@ -332,7 +333,7 @@ def test_an_evaluator_of_an_interrupted_run_stops_at_once(nodes: tuple[Node, Nod
 
 def test_an_evaluator_asks_for_the_final_networks_until_it_has_them(nodes: tuple[Node, Node]) -> None:
     stop = Stop()
-    agent, evaluations = service(nodes, stop, Plan(steps=100, episodes=2))
+    agent, evaluations = service(nodes, stop, EvaluationPlan(steps=100, episodes=2))
     inbox = EvaluationInbox(nodes[0], lambda: 1000)
     stop.set("complete: total_updates reached")
     with ThreadPoolExecutor() as threads:
@@ -345,4 +346,4 @@ def test_an_evaluator_asks_for_the_final_networks_until_it_has_them(nodes: tuple
 
 def test_an_evaluator_needs_to_know_how_often(nodes: tuple[Node, Node]) -> None:
     with pytest.raises(UsageError, match="--every: needed, as the run has no eval_every"):
-        service(nodes, Stop(), Plan())
+        service(nodes, Stop(), EvaluationPlan())

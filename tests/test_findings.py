@@ -1,4 +1,4 @@
-"""What a report says in words and against a baseline, by hand-made runs; and that its figures and page fit."""
+"""What a report says against a baseline, by hand-made runs; and that its figures and page fit."""
 
 import re
 import shutil
@@ -14,7 +14,6 @@ from matplotlib.figure import Figure as Canvas
 from test_comparisons import write_runs
 
 from coop.common.errors import UsageError
-from coop.studies.report.answer import answer
 from coop.studies.report.baseline import baseline_figure, baseline_table, find_baseline
 from coop.studies.report.figures import buffers
 from coop.studies.report.intervals import Interval
@@ -23,7 +22,7 @@ from coop.studies.report.plots import STYLE, WIDTH, Figure, Line, Panel, _finish
 from coop.studies.report.results import tables
 from coop.studies.report.study import Study, load_study
 from coop.studies.report.summaries import final_returns
-from coop.studies.report.table import ResultTable, Value
+from coop.studies.report.table import ResultTable
 from coop.studies.report.writer import write_report
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -112,56 +111,6 @@ def test_what_is_no_baseline(folder: Path) -> None:
     assert not (folder / "out").exists()
 
 
-def test_the_answer_has_the_numbers_of_the_tables(reported: tuple[Study, list[ResultTable]]) -> None:
-    study, made = reported
-    aggregate = {row["method"]: row for row in made[1].frame.to_dict("records")}
-    subject, compared, means, pairs, breaking, doubts = answer(study, made)
-    assert subject == (
-        "18 of 19 runs finished, 1 diverged: dqn, coop on CartPole-v0, seeds 0-2; "
-        "they differ by replay.capacity (500, 600, 5000)."
-    )
-    assert compared == (
-        "Differences from dqn, return of the last 100 episodes over the same seeds: coop 8.67 [3.7, 13.6]."
-    )
-    assert means.startswith("Over the 3 settings that all methods share, the interquartile mean")
-    best, other = re.findall(r"(dqn|coop) ([\d.]+) \[([\d.]+), ([\d.]+)\]", means)
-    assert {best[0], other[0]} == {"dqn", "coop"}
-    assert float(best[1]) >= float(other[1])
-    for name, *values in (best, other):
-        assert [float(value) for value in values] == pytest.approx(
-            [aggregate[name][column] for column in ("IQM", "low", "high")], rel=1e-2
-        )
-    # Coop is better at one of three capacities, with every seed.
-    assert pairs == "Of two runs, dqn returns more than coop with probability 0.667 [0.667, 0.667]."
-    assert breaking == "Smallest buffer with 95 % of the return at 5000: dqn 500 [500, 500], coop 5000 [5000, 5000]."
-    assert doubts.startswith("Some settings have 3 runs")
-
-
-def test_methods_that_the_runs_do_not_tell_apart(reported: tuple[Study, list[ResultTable]]) -> None:
-    study, made = reported
-    (settings,) = (table for table in made if table.name == "settings")
-    means = ResultTable("aggregate", "", ["method", "IQM", "low", "high", "settings"], [["dqn", 1.0, 0.0, 2.0, 1]])
-    columns = ["x", "y", "P(x > y)", "low", "high"]
-    rows: list[list[Value]] = [["coop", "dqn", 0.6, 0.4, 0.8]]
-    told = answer(study, [means, ResultTable("improvement", "", columns, rows), settings])
-    assert told[1:3] == [
-        "The interquartile mean of the return of the last 100 episodes is: dqn 1 [0, 2].",
-        "These runs tell no two methods apart: every interval of the probability of improvement holds 0.5.",
-    ]
-    rows += [["edql", "dqn", 0.3, 0.2, 0.4], ["edql", "coop", 0.7, 0.6, 0.8]]
-    told = answer(study, [means, ResultTable("improvement", "", columns, rows), settings])
-    assert told[2] == (
-        "Of two runs, dqn returns more than edql with probability 0.7 [0.6, 0.8]; edql returns more than coop with "
-        "probability 0.7 [0.6, 0.8]. One other pair they do not tell apart: its interval holds 0.5."
-    )
-    assert told[3:5] == [
-        "dqn: the interquartile mean of the return of the last 100 episodes is highest at capacity 500, "
-        "101 [100, 102]; the intervals of all others overlap with it.",
-        "coop: the interquartile mean of the return of the last 100 episodes is highest at capacity 5000, "
-        "203 [200, 206]; the intervals of capacity 500, capacity 600 end below it.",
-    ]
-
-
 @pytest.mark.parametrize("columns", [1, 3])
 @pytest.mark.parametrize(
     "sizes",
@@ -205,7 +154,7 @@ def test_nothing_is_wider_than_the_window(reported: tuple[Study, list[ResultTabl
     for figure, png in drawn:
         draw(figure, png)
     index = tmp_path / "index.html"
-    index.write_text(page(study, tmp_path, answer(study, made), made, drawn, []) + MEASURE, encoding="utf-8")
+    index.write_text(page(study, tmp_path, made, drawn, []) + MEASURE, encoding="utf-8")
     headings = re.findall("<h2>(.*?)</h2>", index.read_text(encoding="utf-8"))
     assert headings == [*("Return against buffer size", made[0].title, "Over all settings", "Every setting"),
                         *("Figures", "Tables")]  # fmt: skip

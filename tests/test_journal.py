@@ -12,24 +12,24 @@ from coop.common.errors import RunError
 from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.types import EnvSpec
-from coop.replay.core import ReplayCore, Wait
+from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.persistence.epochs import ReplayEpochs
 from coop.replay.persistence.journal import Journal, journal_files
 from coop.replay.persistence.recovery import recover
 
 
-def _insert(core: ReplayCore, spec: EnvSpec, sequence: int) -> int | Wait:
+def _insert(core: ReplayCore, spec: EnvSpec, sequence: int) -> int | RetryLater:
     segment = make_segment(spec, sequence, acked=4 * sequence)
     return core.insert(segment, bytes(encode_segment("test", segment)))
 
 
 def _draw(core: ReplayCore) -> bool:
-    return not isinstance(core.draw(DrawRequest(1, core.drawn, max(0, core.drawn - 2), 4, 0)), Wait)
+    return not isinstance(core.draw(DrawRequest(1, core.drawn, max(0, core.drawn - 2), 4, 0)), RetryLater)
 
 
 def _use(core: ReplayCore, spec: EnvSpec, sequences: range) -> None:
     for sequence in sequences:
-        assert not isinstance(_insert(core, spec, sequence), Wait)
+        assert not isinstance(_insert(core, spec, sequence), RetryLater)
         while _draw(core):
             pass
 
@@ -89,7 +89,7 @@ def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
     filler = small_disk / "filler"
     filler.write_bytes(bytes(220_000))
     sequence = 0
-    while not isinstance(outcome := _insert(core, spec, sequence), Wait):
+    while not isinstance(outcome := _insert(core, spec, sequence), RetryLater):
         sequence += 1
         while core.drawn < core.table.inserted - CONFIG.replay.learning_starts:
             assert _draw(core)
@@ -102,7 +102,7 @@ def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
     assert core.drawn > before, "training goes on as far as the limiter lets it"
     with pytest.raises(RunError, match="No space left on device"):
         save(core, epochs, 1)
-    assert isinstance(_insert(core, spec, sequence), Wait)
+    assert isinstance(_insert(core, spec, sequence), RetryLater)
     filler.unlink()
     assert _insert(core, spec, sequence) == 4 * sequence + 4
     twin = ReplayCore(CONFIG, spec)
@@ -117,8 +117,8 @@ def test_priorities_are_carried_out_again(spec: EnvSpec, tmp_path: Path) -> None
     core = ReplayCore(config, spec, Journal(tmp_path, 5, 1, keep=False))
     priorities: tuple[tuple[int, float], ...] = ()
     for sequence in range(20):
-        assert not isinstance(_insert(core, spec, sequence), Wait)
-        while not isinstance(got := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, 0, priorities)), Wait):
+        assert not isinstance(_insert(core, spec, sequence), RetryLater)
+        while not isinstance(got := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, 0, priorities)), RetryLater):
             priorities = tuple((number, 0.1 + number % 7) for number in got.batch.columns["ids"].tolist())
     assert len(set(core.table.snapshot().arrays["priorities"].tolist())) > 3
     twin = ReplayCore(config, spec)

@@ -6,7 +6,7 @@ from custom_networks import Centred, Duel, Negative, Residual
 from test_graph import _by_svd, _inputs, _networks, _relative
 from torch import Tensor, nn
 
-from coop.learner.edl.autograd_backprop import AutogradBackprop, Layer
+from coop.learner.edl.autograd_backprop import AutogradBackprop, FeedbackLayer
 from coop.learner.edl.backprop import Tape, UnsupportedLayerError
 from coop.learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices
 from coop.learner.edl.layers import _range, make_backprop
@@ -198,7 +198,7 @@ class Given:
     def __init__(self, *rows: list[float]) -> None:
         self._t = torch.tensor([rows], dtype=torch.float64)
 
-    def transforms(self, _: Layer) -> Tensor:
+    def transforms(self, _: FeedbackLayer) -> Tensor:
         return self._t
 
 
@@ -219,7 +219,7 @@ def test_directions_count_from_a_hundred_thousandth_of_the_largest(
     trials: list[Given], rank: int, basis: list[list[float]]
 ) -> None:
     """Singular values are compared within each sample, so that a trial with small ones shows its directions as well."""
-    found = _range(trials, Layer("inner", nn.Linear(2, 2).double()))  # type: ignore[arg-type]
+    found = _range(trials, FeedbackLayer("inner", nn.Linear(2, 2).double()))  # type: ignore[arg-type]
     assert found is not None
     actions = len(found.outside)
     rows = torch.tensor(basis, dtype=torch.float64).reshape(-1, actions)
@@ -230,4 +230,4 @@ def test_directions_count_from_a_hundred_thousandth_of_the_largest(
 
 
 def test_a_small_direction_above_that_is_full_rank() -> None:
-    assert _range([Given([1, 0], [0, 3e-5])], Layer("inner", nn.Linear(2, 2).double())) is None  # type: ignore[list-item]
+    assert _range([Given([1, 0], [0, 3e-5])], FeedbackLayer("inner", nn.Linear(2, 2).double())) is None  # type: ignore[list-item]

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import statistics
 import subprocess
 import sysconfig
@@ -10,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from corridor import CELLS, LEFT, RIGHT, optimal_values
 from numpy.typing import NDArray
 
-from coop.common.envs.corridor import CELLS, LEFT, RIGHT, optimal_values
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import load_tables, resolve
@@ -25,7 +26,7 @@ pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 CONFIG = """
 total_steps = 2000
 [env]
-id = "coop/Corridor-v0"
+id = "corridor:test/Corridor-v0"
 [network]
 kind = "mlp"
 hidden = [32]
@@ -81,7 +82,8 @@ def test_optimal_values_are_found_in_lockstep(method: str, seed: int, config: Ru
 def test_coop_finds_optimal_values_over_the_real_topology(config: RunConfig, tmp_path: Path) -> None:
     command = [Path(sysconfig.get_path("scripts")) / "coop-local", "--config", tmp_path / "corridor.toml"]
     flags = ["--method", "coop", "--actors", "2", "--run-dir", tmp_path / "run"]
-    subprocess.run([*command, *flags], capture_output=True, timeout=120, check=True)
+    found = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    subprocess.run([*command, *flags], env=found, capture_output=True, timeout=120, check=True)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["exit"] == "complete"
     assert summary["transitions_lost"] == 0

@@ -10,7 +10,7 @@ import pytest
 import torch
 from commands import run_command
 
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.errors import UsageError
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.settings.config import NETWORK_KINDS, NetworkSettings, RunConfig
@@ -43,7 +43,7 @@ def test_a_network_of_ones_own_is_flat_and_acts(name: str) -> None:
     assert same.layout_digest() == other.layout_digest()
     obs = np.random.default_rng(0).standard_normal((9, 4)).astype(np.float32)
     other.load(same.snapshot())
-    actions = Policy((same, other), SPEC, np.random.default_rng(0)).act(obs, 0.0)
+    actions = EpsilonGreedy((same, other), SPEC, np.random.default_rng(0)).act(obs, 0.0)
     values = _build(name)(torch.from_numpy(obs)).detach()
     np.testing.assert_array_equal(actions, values.argmax(1).numpy())
     torch.testing.assert_close(other(torch.from_numpy(obs)), values)

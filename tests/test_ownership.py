@@ -21,7 +21,7 @@ from coop.common.messaging.joining import join
 from coop.common.messaging.messages.join import Join
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
-from coop.common.process.files import Measured, truncate
+from coop.common.process.files import FileDigest, truncate
 from coop.common.process.lifecycle import Stop
 from coop.common.types import EnvSpec
 from coop.learner.join_service import JoinService
@@ -339,7 +339,7 @@ def test_a_file_is_never_lengthened(tmp_path: Path) -> None:
     truncate(path, 6)
     assert path.read_bytes() == b"twelve"
     config = RunOptions().run_config()
-    seals = Manifest(5, 100, {}, {"episodes.csv": Measured(99, 0)})
+    seals = Manifest(5, 100, {}, {"episodes.csv": FileDigest(99, 0)})
     with pytest.raises(RunError, match="has 6 bytes, and should have at least 99"):
         RunDirectory(tmp_path, config, Survey(tmp_path, (Whole(tmp_path, seals),)), 100)
     assert path.read_bytes() == b"twelve"

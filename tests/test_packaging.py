@@ -1,5 +1,6 @@
 """What is installed and what goes with the source: packages, their data, license, citation and links of pages."""
 
+import ast
 import os
 import re
 import subprocess
@@ -14,6 +15,7 @@ import yaml
 from setuptools import find_packages
 
 ROOT = Path(__file__).parents[1]
+ROOMS = ("actors", "common", "deploy", "learner", "replay", "coop")  # rglob follows no links
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 IN_CHECKOUTS_ONLY = (
     "coop/deploy/Dockerfile",
@@ -60,6 +62,16 @@ def test_a_research_folder_with_the_names_of_rooms_works_beside_the_package(tmp_
         [sys.executable, "research.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
     )
     assert done.stdout.splitlines()[-2:] == ["ours ours ours ours []", "complete"], done.stderr
+
+
+def test_no_two_classes_share_a_name() -> None:
+    places: dict[str, list[str]] = {}
+    for file in sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py")):
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
+    assert len(places) > 300
+    assert not {name: files for name, files in places.items() if len(files) > 1}
 
 
 def test_every_data_file_is_installed() -> None:

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.envs.classic_control import CartPoleEnv
 
 from coop.actors.player import Player, Turn
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import make_vector_env
 from coop.common.envs.protocol import VectorEnv
 from coop.common.networks.network import FlatNetwork, build_network
@@ -31,10 +31,10 @@ gymnasium.register("Generous-v0", entry_point=Generous, max_episode_steps=200)
 
 def make_player(
     num_envs: int = 3, epsilon: float = 0.5, settings: EnvSettings | None = None
-) -> tuple[Player, VectorEnv, Policy]:
+) -> tuple[Player, VectorEnv, EpsilonGreedy]:
     env = make_vector_env(settings or EnvSettings(id="CartPole-v0"), num_envs, seed=1)
     first, second = (FlatNetwork(build_network("mlp", env.spec, (8,), seed=seed)) for seed in (0, 1))
-    policy = Policy((first, second), env.spec, np.random.default_rng(0))
+    policy = EpsilonGreedy((first, second), env.spec, np.random.default_rng(0))
     return Player(env, policy, lambda _: epsilon), env, policy
 
 

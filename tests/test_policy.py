@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 import torch
 
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.types import EnvSpec
 
 SPEC = EnvSpec("made-up", (84, 84), "uint8", 4, 6)
 
 
-def policy(dtype: torch.dtype) -> Policy:
+def policy(dtype: torch.dtype) -> EpsilonGreedy:
     """Networks of other seeds take over, as an actor's do, what a learner sends: float32 on the host."""
     first, second = (FlatNetwork(build_network("nips2013", SPEC, (), seed).to(dtype)) for seed in (8, 9))
     for seed, network in enumerate((first, second)):
         network.load(FlatNetwork(build_network("nips2013", SPEC, (), seed)).snapshot())
-    return Policy((first, second), SPEC, np.random.default_rng(0))
+    return EpsilonGreedy((first, second), SPEC, np.random.default_rng(0))
 
 
 def test_bfloat16_acts_nearly_as_float32() -> None:

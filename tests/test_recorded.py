@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,18 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from coop.common.settings.tables import resolve
 from coop.common.types import Batch, EnvSpec
 from coop.learner.agent import Agent
-from coop.learner.recorded import plain_call
+from coop.learner.recorded import _WARM_UPS
 from coop.replay.table.table import Table
 
 PICTURES = EnvSpec("pictures", (36, 36), "uint8", 4, 5)
 ON_HOST = ("_local_scalar_dense", "nonzero", "masked_select", "_to_copy", "item", "is_nonzero", "equal")
+
+
+def plain_call(function: Callable[[], None], device: torch.device) -> Callable[[], None]:
+    """The function itself, after the runs that recording needs."""
+    for _ in range(_WARM_UPS):
+        function()
+    return function
 
 
 def make_agent(method: str, device: str = "cpu", capture: Any = None, **tables: dict[str, Any]) -> Agent:

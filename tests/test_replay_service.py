@@ -27,7 +27,7 @@ from coop.common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.types import EnvSpec
-from coop.replay.core import ReplayCore, Wait
+from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.persistence.epochs import ReplayEpochs
 from coop.replay.service import ReplayService
 
@@ -131,7 +131,7 @@ def test_snapshot_on_disk(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Pat
 
 def test_lost_counts_receipts_without_transitions(spec: EnvSpec) -> None:
     core = ReplayCore(CONFIG, spec)
-    assert not isinstance(core.insert(make_segment(spec, 0)), Wait)
+    assert not isinstance(core.insert(make_segment(spec, 0)), RetryLater)
     assert core.lost == 0
     core.insert(make_segment(spec, 2, acked=8))
     assert core.lost == 0, "4 taken then, 4 more now"

@@ -191,7 +191,7 @@ def test_a_run_does_not_depend_on_those_beside_it(feedback: str) -> None:
     assert not torch.equal(many.theta[0, 0], many.theta[0, 2])
 
 
-def _example(rank: int | None = None) -> tuple[Shape, torch.Tensor, networks.Tape, torch.Tensor]:
+def _example(rank: int | None = None) -> tuple[Shape, torch.Tensor, networks.StackTape, torch.Tensor]:
     torch.manual_seed(0)
     shape = Shape(2, 32)
     theta = torch.stack([shape.initial(seed, 0) for seed in range(3)])

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from samples import make_segment
-from table_reference import Copies, Stream, check_references, make_spec, whole_state
+from table_reference import Copies, Stream, check_references, make_spec, table_stats, whole_state
 
 from coop.common.errors import UsageError
 from coop.common.settings.capacity import estimated_bytes
 from coop.common.types import Batch, EnvSpec, Segment
-from coop.replay.stats import reuse_histogram
 from coop.replay.table import streams
-from coop.replay.table.table import Table
+from coop.replay.table.table import Table, _reuse_histogram
 
 
 def test_terminal_transitions_are_counted_as_they_come_and_go(spec: EnvSpec) -> None:
@@ -46,7 +45,7 @@ def test_each_frame_is_held_once(stack: int) -> None:
             for now, following in zip(segment.obs_index.tolist(), segment.next_index.tolist(), strict=True)
         ]
         last = {(one.number, name) for one in streams for name in one.sent[-stack:]}
-        assert table.stats().frames_held == len(set().union(last, *sent[-50:]))
+        assert table_stats(table).frames_held == len(set().union(last, *sent[-50:]))
 
 
 def test_n_step_transitions_carry_more_than_a_stack() -> None:
@@ -73,7 +72,7 @@ def test_n_step_transitions_carry_more_than_a_stack() -> None:
             )
         )
     # The first border shares one stack of two, as no more was expected then; the others share all four.
-    assert table.stats().frames_held == 10 + 8 + 6 + 6
+    assert table_stats(table).frames_held == 10 + 8 + 6 + 6
     batch = table.sample(200)
     first = batch.frames[batch.obs_index][:, :, 0, 0]
     np.testing.assert_array_equal(batch.frames[batch.next_index][:, :, 0, 0], first + 3)
@@ -86,7 +85,7 @@ def test_streams_used_least_recently_give_their_frames_back(monkeypatch: pytest.
         table.insert(Stream(make_spec(2), number, np.random.default_rng(0), 50).segment(4))
         check_references(table)
     assert [stream for _, stream, *_ in table._tails.streams()] == [7, 8, 9]
-    assert table.stats().frames_held == 5 + 2 * 2
+    assert table_stats(table).frames_held == 5 + 2 * 2
 
 
 def test_a_batch_has_each_frame_once() -> None:
@@ -107,21 +106,21 @@ def test_reuse_histograms() -> None:
     stream = Stream(make_spec(1), 0, np.random.default_rng(0), 50)
     table.insert(stream.segment(2))
     draws = np.bincount(table.sample(7).ids, minlength=2)
-    stats = table.stats()
+    stats = table_stats(table)
     assert (stats.batches, stats.sampled, stats.reuse_mean) == (1, 7, 3.5)
     assert stats.reuse_held == tuple(np.bincount([int(n).bit_length() for n in draws], minlength=16))
     table.insert(stream.segment(1))
-    assert table.stats().reuse_evicted[int(draws[0]).bit_length()] == 1
+    assert table_stats(table).reuse_evicted[int(draws[0]).bit_length()] == 1
     table.insert(stream.segment(2))
-    assert table.stats().evicted_unsampled == 1
+    assert table_stats(table).evicted_unsampled == 1
     table.sample(3)
-    stats = table.stats()
+    stats = table_stats(table)
     assert (stats.batches, stats.sampled) == (2, 10)
     assert {type(count) for count in stats.reuse_evicted} == {int}
 
 
 def test_the_last_bucket_is_open() -> None:
-    histogram = reuse_histogram(np.array([0, 1, 2, 3, 4, 2**14, 2**15, 2**31 - 1], np.int32))
+    histogram = _reuse_histogram(np.array([0, 1, 2, 3, 4, 2**14, 2**15, 2**31 - 1], np.int32))
     assert histogram.tolist() == [1, 1, 2, 1, *[0] * 11, 3]
 
 
@@ -169,7 +168,7 @@ def test_estimate_covers_a_full_table() -> None:
     stream = Stream(spec, 0, np.random.default_rng(0), 10**9)
     for _ in range(20):
         table.insert(stream.segment(50))
-    assert table.stats().bytes_held <= 1.05 * estimated_bytes(spec, 500)
+    assert table_stats(table).bytes_held <= 1.05 * estimated_bytes(spec, 500)
     assert estimated_bytes(spec, 10**6) < 7300 * 10**6
 
 
@@ -286,10 +285,10 @@ def test_types_of_a_batch() -> None:
 def test_bytes_of_transitions(sampling: str, row: int) -> None:
     """Two slots, action, reward, end, span, version, number and draws: 8 + 4 + 4 + 1 + 1 + 8 + 8 + 4; 8 a priority."""
     table = Table(make_spec(1), 10, sampling=sampling, rng=np.random.default_rng(0))
-    empty = table.stats()
+    empty = table_stats(table)
     assert (empty.size, empty.bytes_held, empty.reuse_mean) == (0, table._frames.bytes_held, 0.0)
     table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(4))
-    held = table.stats().bytes_held
+    held = table_stats(table).bytes_held
     assert (held, type(held)) == (table._frames.bytes_held + 4 * row, int)
 
 

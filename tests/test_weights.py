@@ -10,7 +10,7 @@ from msgspec.structs import replace as changed
 from samples import await_service
 
 from coop.actors.joined import make_policy
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.actors.weights import GRACE, WeightsFollower
 from coop.common.errors import JoinError
 from coop.common.messaging.keys import role_key, weights_key
@@ -26,10 +26,10 @@ from coop.learner.broadcast import Broadcaster
 CONFIG = RunConfig(method="coop", network=NetworkSettings(hidden=(8,)))
 
 
-def own_policy(spec: EnvSpec) -> Policy:
+def own_policy(spec: EnvSpec) -> EpsilonGreedy:
     """Networks of the run's layout with parameters of their own."""
     first, second = (FlatNetwork(build_network("mlp", spec, (8,), seed=seed)) for seed in (7, 8))
-    return Policy((first, second), spec, np.random.default_rng(0))
+    return EpsilonGreedy((first, second), spec, np.random.default_rng(0))
 
 
 def refresh_until(follower: WeightsFollower, version: int, seconds: float = 10.0) -> None:
@@ -40,7 +40,7 @@ def refresh_until(follower: WeightsFollower, version: int, seconds: float = 10.0
         time.sleep(0.01)
 
 
-def assert_equal(policy: Policy, agent: Agent) -> None:
+def assert_equal(policy: EpsilonGreedy, agent: Agent) -> None:
     for mine, theirs in zip(policy.networks, agent.networks, strict=True):
         np.testing.assert_array_equal(mine.snapshot(), theirs.snapshot())
 

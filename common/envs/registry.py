@@ -11,7 +11,6 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec, namespace
 
 from coop.common.envs import catch as _registers_catch  # noqa: F401
-from coop.common.envs import corridor as _registers_corridor  # noqa: F401
 from coop.common.errors import UsageError
 from coop.common.imports import describe, import_module
 from coop.common.settings.environment import EnvSettings

@@ -31,7 +31,7 @@ class Standardize(nn.Module):
         return (x - self.mean) / self.sd
 
 
-class Record(NamedTuple):
+class LayerPass(NamedTuple):
     """The forward pass of one layer, for the gradient.
 
     inputs: float32 [batch, in], or [batch, in, places] of a convolution. normalised: float32 [batch, out * places],
@@ -44,7 +44,7 @@ class Record(NamedTuple):
     scale: Floats
 
 
-class Layer:
+class NormalisedLayer:
     """One Linear or Conv2d layer.
 
     weight: float32 [out, in]. bias: float32 [out]. windows: int [in, places], which inputs a kernel sees at each place;
@@ -62,7 +62,7 @@ class Layer:
         self.average = np.full((size, 1), 1 / size, np.float32)
 
     def __call__(self, x: Floats) -> tuple[Floats, Floats]:
-        """What the layer sees (see `Record`), and its pre-activations, float32 [batch, out * places]."""
+        """What the layer sees (see `LayerPass`), and its pre-activations, float32 [batch, out * places]."""
         if self.windows is None:
             return x, x.dot(self.weight.T) + self.bias
         seen = x.take(self.windows, axis=1)
@@ -86,7 +86,7 @@ class NormalisedNetwork:
         self._eps = np.float32(norms[0].eps if norms else 0.0)
         shapes = [tuple(self.mean.shape), *(norm.normalized_shape for norm in norms)]
         linear = [step for step in steps if isinstance(step, nn.Linear | nn.Conv2d)]
-        self.layers = [Layer(step, shape) for step, shape in zip(linear, shapes, strict=True)]
+        self.layers = [NormalisedLayer(step, shape) for step, shape in zip(linear, shapes, strict=True)]
 
     @staticmethod
     def fits(module: nn.Module) -> bool:
@@ -98,7 +98,7 @@ class NormalisedNetwork:
         """float32 [batch, *input] -> [batch, actions]."""
         return self.record(x)[-1].normalised
 
-    def record(self, x: Array) -> list[Record]:
+    def record(self, x: Array) -> list[LayerPass]:
         """The forward pass of each layer for inputs float32 [batch, *input]."""
         records = []
         with np.errstate(all="ignore"):  # of diverging networks, as in PyTorch
@@ -109,9 +109,9 @@ class NormalisedNetwork:
                 y -= y.dot(average)
                 scale = 1 / np.sqrt((y * y).dot(average) + self._eps)
                 y *= scale
-                records.append(Record(seen, y, scale))
+                records.append(LayerPass(seen, y, scale))
                 h = np.maximum(y, self.slope * y)
-            records.append(Record(*self.layers[-1](h), _UNSCALED))
+            records.append(LayerPass(*self.layers[-1](h), _UNSCALED))
         return records
 
 

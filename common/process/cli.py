@@ -18,7 +18,7 @@ from coop.common.errors import UsageError
 from coop.common.places import absolute, user_path
 from coop.common.process.flags import SHELLS, completion, placeholder, sections
 from coop.common.process.help import full_help, short_help
-from coop.common.process.lifecycle import Leave
+from coop.common.process.lifecycle import ProcessExit
 from coop.common.suggestions import closest, not_among, refusal
 
 PACKAGE = "coop-rl"
@@ -57,7 +57,7 @@ def parse(
 
     Raises:
         UsageError: an unknown flag or a value of the wrong type.
-        Leave: the flags asked for help, the version or a completion script; it has been printed.
+        ProcessExit: the flags asked for help, the version or a completion script; it has been printed.
     """
     args = sys.argv[1:] if args is None else args
     asked = {token.partition("=")[0].replace("_", "-") for token in args}
@@ -99,7 +99,7 @@ def _with_absolute_paths(options: T) -> T:
 
 def _answer(text: str) -> NoReturn:
     print(text)
-    raise Leave(0)
+    raise ProcessExit(0)
 
 
 def _shell(args: Sequence[str]) -> str:

@@ -23,7 +23,7 @@ ASIDE = "aside"  # folder in a run directory for what a resumed run does not go 
 _SEAL = b"\ncrc32 "  # between a sealed file's content and the checksum, in hexadecimal
 
 
-class Measured(NamedTuple):
+class FileDigest(NamedTuple):
     """The size of a file, or of its beginning, in bytes, and the CRC-32 of these bytes."""
 
     size: int
@@ -55,9 +55,9 @@ class SyncedFile:
         self.checksum = 0
 
     @property
-    def measured(self) -> Measured:
+    def measured(self) -> FileDigest:
         """Size and checksum of what was written."""
-        return Measured(self.size, self.checksum)
+        return FileDigest(self.size, self.checksum)
 
     def write(self, data: bytes | memoryview) -> None:
         """Append bytes; raises OSError if there is no space for all of them."""
@@ -92,7 +92,7 @@ class LineFile:
 
     def __init__(self, path: Path, *, go_on: bool) -> None:
         self.problem = ""
-        self.measured = measure(path) if go_on and path.exists() else Measured(0, 0)
+        self.measured = measure(path) if go_on and path.exists() else FileDigest(0, 0)
         self._late = b""
         keep_standard_files()
         mode = "ab" if go_on else "wb"
@@ -107,7 +107,7 @@ class LineFile:
         check_guards()
         self._late += data
         size, checksum = self.measured
-        self.measured = Measured(size + len(data), zlib.crc32(data, checksum))
+        self.measured = FileDigest(size + len(data), zlib.crc32(data, checksum))
         try:
             self.finish()
             self.problem = ""
@@ -130,7 +130,7 @@ class LineFile:
         self._file.close()
 
 
-def write_atomic(path: Path, data: bytes) -> Measured:
+def write_atomic(path: Path, data: bytes) -> FileDigest:
     """Replace a file atomically and durably. Raises OSError, and then leaves the old file untouched."""
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")  # others may write the same file now
     try:
@@ -170,14 +170,14 @@ def truncate(path: Path, size: int) -> None:
         os.truncate(path, size)
 
 
-def measure(path: Path, size: int | None = None) -> Measured:
+def measure(path: Path, size: int | None = None) -> FileDigest:
     """Measure a file, or its first `size` bytes; raises OSError."""
     done = checksum = 0
     with path.open("rb") as file:
         while piece := file.read(PIECE if size is None else min(PIECE, size - done)):
             done += len(piece)
             checksum = zlib.crc32(piece, checksum)
-    return Measured(done, checksum)
+    return FileDigest(done, checksum)
 
 
 def sealed(data: bytes) -> bytes:

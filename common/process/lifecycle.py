@@ -26,7 +26,7 @@ LEFT = 2.0  # seconds for users' threads to end by themselves
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Leave(SystemExit):
+class ProcessExit(SystemExit):
     """The end of this process with a status that the program has chosen itself; users' code raises SystemExit."""
 
 
@@ -99,12 +99,12 @@ class Stop:
 
         Raises:
             PeerLost: the stop is a failure.
-            Leave: a signal caused the stop; schedulers must not mistake this for completed work.
+            ProcessExit: a signal caused the stop; schedulers must not mistake this for completed work.
         """
         if self.failed:
             raise PeerLost(self.reason)
         if self.exit_status:
-            raise Leave(self.exit_status)
+            raise ProcessExit(self.exit_status)
 
     def on_thread_failures(self) -> None:
         """Stop the process when an uncaught exception ends one of its threads."""
@@ -158,7 +158,7 @@ def run_main(program: str, main: Callable[[], None]) -> None:
     status: int | None = None
     try:
         main()
-    except Leave as error:
+    except ProcessExit as error:
         status = error.code if isinstance(error.code, int) else 0
     except KeyboardInterrupt as error:
         complain(f"{program}: interrupted")

@@ -75,10 +75,10 @@ def _run() -> None:
     permit(options.allow_import)
     # Imported only after the flags have been checked: torch takes seconds.
     if live:
-        from coop.evaluation.evaluator import Plan, evaluate_run  # noqa: PLC0415
+        from coop.evaluation.evaluator import EvaluationPlan, evaluate_run  # noqa: PLC0415
 
         epsilon = options.epsilon[0] if options.epsilon else 0.0
-        plan = Plan(options.every, options.every_steps, options.episodes, epsilon, options.envs)
+        plan = EvaluationPlan(options.every, options.every_steps, options.episodes, epsilon, options.envs)
         evaluate_run(options, options.allow_import, plan)
         return
     from coop.evaluation.evaluate import evaluate_checkpoint, film_checkpoint  # noqa: PLC0415

@@ -35,7 +35,7 @@ Progress = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Plan:
+class EvaluationPlan:
     """What to evaluate, and when.
 
     seconds: between the beginnings of two evaluations; None: `steps` counts. steps: environment steps of the run
@@ -84,7 +84,7 @@ class Schedule:
             self._next_step = (progress[1] // self._steps + 1) * self._steps
 
 
-def evaluate_run(options: RoleOptions, allow_import: tuple[str, ...], plan: Plan) -> None:
+def evaluate_run(options: RoleOptions, allow_import: tuple[str, ...], plan: EvaluationPlan) -> None:
     """Join a run and evaluate its acting network until the stop; after a complete run, its final one too."""
     use_threads(1)
     stop = Stop()
@@ -116,7 +116,7 @@ class EvaluatorService:
         stop: Stop,
         joined: Joined,
         allow_import: tuple[str, ...],
-        plan: Plan,
+        plan: EvaluationPlan,
         incarnation: int,
         console: Console,
     ) -> None:

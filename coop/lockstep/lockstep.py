@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from coop.actors.player import Player, Turn
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import RunError, UsageError
 from coop.common.process.randomness import generator_state, set_generator_state
@@ -45,7 +45,7 @@ class Lockstep:
         self.trainer = Trainer(self.agent, time.monotonic())
         self._policy_rng = np.random.default_rng(policy_seed)
         first, second = self.agent.networks
-        self._policy = Policy((first, second), self.env.spec, self._policy_rng)
+        self._policy = EpsilonGreedy((first, second), self.env.spec, self._policy_rng)
         self._player = Player(self.env, self._policy, self.agent.epsilon)
         self._actions: list[int] = []
         first_obs = self._player.begin()

@@ -20,7 +20,7 @@ from coop.common.settings.methods import METHODS
 from coop.common.types import Array, Batch, EnvSpec, Segment
 from coop.learner.agent import Agent
 from coop.learner.methods.stream_q import StreamAgent, Transition
-from coop.learner.protocol import Agent as AnyAgent
+from coop.learner.protocol import AnyAgent
 from coop.records.checkpoints import Damaged
 from coop.replay.core import ReplayCore
 from coop.replay.persistence.storage import Mark, load_snapshot, save_snapshot

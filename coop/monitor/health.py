@@ -14,7 +14,7 @@ from contextlib import closing, contextmanager
 
 from coop.common.errors import RunError, UsageError
 from coop.common.process.console import Console
-from coop.common.process.lifecycle import Leave, run_main
+from coop.common.process.lifecycle import ProcessExit, run_main
 from coop.common.process.ports import http_address
 
 STUCK = 60.0  # seconds without a turn of the main loop; an epoch or a compilation may take half of that
@@ -74,7 +74,7 @@ def _ask() -> None:
             print(answer.read().decode())
         except OSError as error:
             raise RunError(f"{sys.argv[1]}: {error.strerror or error}") from error
-    raise Leave(int(answer.status != 200))
+    raise ProcessExit(int(answer.status != 200))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import msgspec
 
 from coop.common.errors import RunError
 from coop.common.process.files import (
-    Measured,
+    FileDigest,
     make_folder,
     measure,
     sealed,
@@ -62,8 +62,8 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     run: int
     number: int
-    files: dict[str, Measured]
-    records: dict[str, Measured] = msgspec.field(default_factory=dict)
+    files: dict[str, FileDigest]
+    records: dict[str, FileDigest] = msgspec.field(default_factory=dict)
     fallbacks: list[str] = msgspec.field(default_factory=list)
     journal: int = 0
     settings: str = ""
@@ -135,7 +135,7 @@ def check_part(folder: Path, number: int, run_id: int | None) -> Manifest:
     return manifest
 
 
-def check_record(path: Path, written: Measured) -> None:
+def check_record(path: Path, written: FileDigest) -> None:
     """Check the beginning of a record file that a checkpoint or a summary has sealed; raises Damaged."""
     try:
         found = measure(path, written.size)
@@ -158,7 +158,7 @@ def checked_summary(run_dir: Path) -> dict[str, Any]:
         try:
             if name not in (*RECORDS, EVALUATIONS, "config.toml"):
                 raise Damaged(f"{SUMMARY}: names {name!r}, which is no record of a run")
-            check_record(run_dir / name, Measured(size, checksum))
+            check_record(run_dir / name, FileDigest(size, checksum))
         except Damaged as damaged:
             raise RunError(f"{run_dir}: can't be read as it was written: {damaged}") from damaged
     return summary

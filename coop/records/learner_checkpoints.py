@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from coop.common.errors import CoopError, UsageError
-from coop.common.process.files import Measured, write_atomic
+from coop.common.process.files import FileDigest, write_atomic
 from coop.common.process.notices import warn
 from coop.common.process.untrusted import check_torch_file
 from coop.records.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
@@ -26,7 +26,7 @@ def save_epoch(
     learner_state: dict[str, Any],
     snapshot: Callable[[str], None],
     *,
-    records: Mapping[str, Measured],
+    records: Mapping[str, FileDigest],
     fallbacks: Sequence[str] = (),
     settings: str = "",
 ) -> Path:

@@ -235,7 +235,7 @@ class RunLock:
         try:
             self._locks.append(FileLock(path, self._holder, _inherited(path)))
         except BlockingIOError:
-            raise Held(f"run directory {folder}: in use by {_read(path)[0] or 'another process'}") from None
+            raise LockHeld(f"run directory {folder}: in use by {_read(path)[0] or 'another process'}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -246,7 +246,7 @@ class RunLock:
         self.release()
 
 
-class Held(RunError):
+class LockHeld(RunError):
     """Another process, which the message names, works in the run directory."""
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from coop.common.errors import RunError, UsageError
-from coop.common.process.files import Measured, aside_folder, measure, move_aside, truncate
+from coop.common.process.files import FileDigest, aside_folder, measure, move_aside, truncate
 from coop.common.process.untrusted import LEFT, MAX_SETTINGS, read_bytes
 from coop.records.checkpoints import (
     DONE,
@@ -170,7 +170,7 @@ def survey(
             state = {} if load is None else _loaded(path, load)
             lost_records = number if lost_records is None else lost_records
             for name in RECORDS if records else ():
-                check_record(run_dir / name, manifest.records.get(name, Measured(0, 0)))
+                check_record(run_dir / name, manifest.records.get(name, FileDigest(0, 0)))
         except Damaged as damaged:
             problems[number] = str(damaged)
             continue

@@ -14,7 +14,7 @@ from coop.common.errors import RunError
 from coop.common.imports import describe, remember
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.process.console import say
-from coop.common.process.files import Measured, make_folder, measure, truncate, write_atomic
+from coop.common.process.files import FileDigest, make_folder, measure, truncate, write_atomic
 from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import leaves
 from coop.common.settings.resuming import settings_digest
@@ -55,7 +55,7 @@ class RunDirectory:
         self.settings = settings_digest(config)
         self.fallbacks: list[str] = []
         self.aside = ""
-        sealed: Mapping[str, Measured] = {}
+        sealed: Mapping[str, FileDigest] = {}
         opened = ExitStack()
         try:
             newest = None if found is None or number is None else found.of(number)
@@ -152,7 +152,7 @@ class RunDirectory:
         except Exception as error:  # matplotlib's own settings, and the fonts and programs that they name
             say(f"{self.path}: no learning curve: {describe(error)[:200]}")
 
-    def records(self) -> dict[str, Measured]:
+    def records(self) -> dict[str, FileDigest]:
         """What the growing files hold now, for a checkpoint."""
         return {name: self._files.measured[name] for name in RECORDS}
 

@@ -14,7 +14,7 @@ from coop.learner.edl.torch_backprop import TorchBackprop
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
+class FeedbackLayer:
     """A layer that takes feedback: its name in the module, and the range of its T, None if that has full rank."""
 
     name: str
@@ -32,7 +32,7 @@ class Call:
     passed: Tensor
 
 
-def record(run: Callable[[Tensor], Tensor], layers: Sequence[Layer], x: Tensor) -> tuple[Tensor, list[Call]]:
+def record(run: Callable[[Tensor], Tensor], layers: Sequence[FeedbackLayer], x: Tensor) -> tuple[Tensor, list[Call]]:
     """The output of `run`, which calls the layers' modules, on x [batch, *input], with their calls in order."""
     calls: list[Call] = []
 
@@ -76,7 +76,7 @@ class GraphTape(Tape[Tensor]):
 class AutogradBackprop(Backprop[Tensor]):
     """The passes of a module; its steps are layers that take feedback, all other parameters are the rest."""
 
-    def __init__(self, module: nn.Module, layers: Sequence[Layer] = (), *, ends: bool = False) -> None:
+    def __init__(self, module: nn.Module, layers: Sequence[FeedbackLayer] = (), *, ends: bool = False) -> None:
         """ends: the output of the last layer, a Linear, is the module's."""
         self.names = [f"{layer.name}." if layer.name else "" for layer in layers]
         self.parametrised = list(range(len(layers)))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from coop.common.networks.custom import state_problems
-from coop.learner.edl.autograd_backprop import AutogradBackprop, Call, Layer, record
+from coop.learner.edl.autograd_backprop import AutogradBackprop, Call, FeedbackLayer, record
 from coop.learner.edl.backprop import Backprop, Subspace, UnsupportedLayerError
 from coop.learner.edl.torch_backprop import TorchBackprop
 
@@ -51,16 +51,16 @@ def _examined(module: nn.Module, x: Tensor) -> AutogradBackprop:
     return AutogradBackprop(module, [replace(layer, range=_range(trials, layer)) for layer in layers], ends=ends)
 
 
-def _candidates(module: nn.Module) -> Iterator[Layer]:
+def _candidates(module: nn.Module) -> Iterator[FeedbackLayer]:
     """Every Linear and Conv2d with its own weight and the usual forward."""
     for name, layer in module.named_modules():
         kind = next((kind for kind in (nn.Linear, nn.Conv2d) if isinstance(layer, kind)), None)
         own = {part for part, _ in layer.named_parameters()}
         if kind is not None and type(layer).forward is kind.forward and own in ({"weight"}, {"weight", "bias"}):
-            yield Layer(name, layer)
+            yield FeedbackLayer(name, layer)
 
 
-def _check_sharing(module: nn.Module, layers: list[Layer]) -> None:
+def _check_sharing(module: nn.Module, layers: list[FeedbackLayer]) -> None:
     """Refuse parameters that two modules share, where one of them is a layer with feedback."""
     holders: dict[int, list[str]] = {}
     for name, part in module.named_modules():
@@ -75,7 +75,9 @@ def _check_sharing(module: nn.Module, layers: list[Layer]) -> None:
 class _Trial:
     """One forward pass with random weights."""
 
-    def __init__(self, module: nn.Module, layers: Sequence[Layer], x: Tensor, generator: torch.Generator) -> None:
+    def __init__(
+        self, module: nn.Module, layers: Sequence[FeedbackLayer], x: Tensor, generator: torch.Generator
+    ) -> None:
         weights = {
             name: (torch.randn(p.shape, generator=generator) / math.sqrt(p[0].numel() if p.dim() > 1 else 1)).to(p)
             for name, p in module.named_parameters()
@@ -89,7 +91,7 @@ class _Trial:
         for call in calls:
             self._add(layers[call.index], call)
 
-    def _add(self, layer: Layer, call: Call) -> None:
+    def _add(self, layer: FeedbackLayer, call: Call) -> None:
         if layer.name in self._calls:
             raise UnsupportedLayerError(f"layer {_named(layer)} is used twice in a forward pass")
         if call.output.shape[0] != self._batch:
@@ -97,17 +99,17 @@ class _Trial:
             raise UnsupportedLayerError(f"layer {_named(layer)} gives {shape}; its first axis must be the batch")
         self._calls[layer.name] = call
 
-    def used_layers(self) -> list[Layer]:
+    def used_layers(self) -> list[FeedbackLayer]:
         """The layers that the output depends on, in the order of their calls, each checked."""
         layers = [self._layers[call.index] for call in self._calls.values()]
         used = [layer for layer in layers if self._depends_on(layer)]
         return sorted(used, key=self.ends_with)  # stable
 
-    def ends_with(self, layer: Layer) -> bool:
+    def ends_with(self, layer: FeedbackLayer) -> bool:
         """Whether the layer's output is the module's."""
         return self._calls[layer.name].passed is self._root
 
-    def _depends_on(self, layer: Layer) -> bool:
+    def _depends_on(self, layer: FeedbackLayer) -> bool:
         """Whether the output depends on the layer; raises unless its parameters act through its own output alone."""
         output = self._calls[layer.name].output
         error = torch.linspace(-1, 1, self._root.numel()).view(self._root.shape).to(self._root)
@@ -126,7 +128,7 @@ class _Trial:
                 raise UnsupportedLayerError(f"layer {_named(layer)}: its parameters are also used outside it")
         return True
 
-    def transforms(self, layer: Layer) -> Tensor:
+    def transforms(self, layer: FeedbackLayer) -> Tensor:
         """T of the layer for each sample: float64 [batch, A, n]."""
         units = torch.eye(self._root.shape[1]).to(self._root)[:, None]
         cotangents = units.expand(-1, self._batch, -1)
@@ -135,7 +137,7 @@ class _Trial:
         return rows.movedim(0, 1).flatten(2).double().nan_to_num()
 
 
-def _range(trials: Sequence[_Trial], layer: Layer) -> Subspace | None:
+def _range(trials: Sequence[_Trial], layer: FeedbackLayer) -> Subspace | None:
     """The range of the layer's T; None if T has full rank for some weights."""
     ts = torch.cat([trial.transforms(layer) for trial in trials])
     grams = ts @ ts.mT
@@ -150,5 +152,5 @@ def _range(trials: Sequence[_Trial], layer: Layer) -> Subspace | None:
     return Subspace(basis.to(layer.module.weight), outside.to(layer.module.weight), rank)
 
 
-def _named(layer: Layer) -> str:
+def _named(layer: FeedbackLayer) -> str:
     return f"{layer.name!r} ({type(layer.module).__name__})"

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from coop.common.networks.network import FlatNetwork
-from coop.common.networks.normalised import Floats, NormalisedNetwork, Record
+from coop.common.networks.normalised import Floats, LayerPass, NormalisedNetwork
 
 
 class Traces:
@@ -29,7 +29,7 @@ class Traces:
         """Set z to 0."""
         self.z.zero_()
 
-    def add(self, records: Sequence[Record], action: int, decay: float) -> None:
+    def add(self, records: Sequence[LayerPass], action: int, decay: float) -> None:
         """Let z decay, and add the gradient of Q(s, action).
 
         records: of the forward pass with the one observation s.
@@ -51,7 +51,7 @@ class Traces:
                 self._weights[number] += torch.from_numpy(at_places.dot(record.inputs[0].T))
                 self._biases[number] += at_places.sum(1)
 
-    def _before_normalisation(self, slope: Floats, record: Record, average: Floats) -> Floats:
+    def _before_normalisation(self, slope: Floats, record: LayerPass, average: Floats) -> Floats:
         """The slope float32 [n] at a layer's pre-activations, from that at the outputs of its leaky ReLUs."""
         y = record.normalised[0]
         slope = np.where(y > 0, slope, self._form.slope * slope)

@@ -63,7 +63,7 @@ class Header(NamedTuple):
     length: int
 
 
-class Record(NamedTuple):
+class JournalRecord(NamedTuple):
     """One entry of a journal; accepted: how many transitions the run had accepted after it."""
 
     kind: int
@@ -219,7 +219,7 @@ def journal_names(folder: Path) -> list[str]:
     return [str(_path(Path("journal"), number)) for number in journal_files(folder / "journal")]
 
 
-def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record | Lost]:
+def read_file(folder: Path, number: int, run_id: int) -> Iterator[JournalRecord | Lost]:
     """Yield the records of one file, those that begin and end it included, and what is lost between and behind them.
 
     The file of a process that was killed ends behind its last whole record, which is no loss.
@@ -249,7 +249,7 @@ def read_file(folder: Path, number: int, run_id: int) -> Iterator[Record | Lost]
                 if len(payload) == header.length and _checksum(payload) == header.payload_checksum:
                     if header.kind == BEGIN:
                         _check_begin(path, payload, run_id)
-                    yield Record(header.kind, payload, header.accepted)
+                    yield JournalRecord(header.kind, payload, header.accepted)
                     if header.kind == END:
                         return
                     at += HEADER_BYTES + header.length

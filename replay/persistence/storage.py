@@ -17,7 +17,7 @@ import numpy as np
 from coop.common.errors import BadMessage, CoopError
 from coop.common.messaging import wire
 from coop.common.messaging.messages.sample import BatchReader, encode_batch
-from coop.common.process.files import PIECE, Measured, SyncedFile, make_folder, sync_folder
+from coop.common.process.files import PIECE, FileDigest, SyncedFile, make_folder, sync_folder
 from coop.common.process.untrusted import load_array, read_bytes
 from coop.common.types import Array, EpisodeEnd, EpisodeRecord
 from coop.records.checkpoints import Damaged, Manifest, check_part, read_manifest, remove, write_manifest
@@ -61,9 +61,9 @@ def save_snapshot(snapshot: CoreSnapshot, lock: threading.Condition, path: Path,
             snapshot.table.frames.release()
 
 
-def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path) -> dict[str, Measured]:
+def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path) -> dict[str, FileDigest]:
     meta, arrays, frames = snapshot.table
-    files: dict[str, Measured] = {}
+    files: dict[str, FileDigest] = {}
     for name, array in arrays.items():
         with SyncedFile(part / f"{name}.npy") as file:
             file.write(_header(array.dtype, array.shape))

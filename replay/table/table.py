@@ -11,13 +11,13 @@ from coop.common.errors import UsageError
 from coop.common.process.randomness import generator_state, set_generator_state
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
 from coop.common.types import Array, Batch, EnvSpec, Segment
-from coop.replay.stats import REUSE_BUCKETS, TableSnapshot, TableStats, reuse_histogram
 from coop.replay.table.columns import Columns
 from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
 from coop.replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
 from coop.replay.table.streams import StreamTails
 
-__all__ = ["PinnedBatch", "Table", "TableSnapshot", "TableStats"]
+_REUSE_BUCKETS = 16
+_BUCKETS = 2 ** np.arange(_REUSE_BUCKETS - 1, dtype=np.int32)  # the fewest draws of each bucket but the first
 
 
 class PinnedBatch(NamedTuple):
@@ -32,6 +32,18 @@ class PinnedBatch(NamedTuple):
     def read(self) -> Batch:
         """The batch, with a copy of the frames."""
         return Batch(frames=self.frames.read(), **self.columns)
+
+
+class TableSnapshot(NamedTuple):
+    """A table's state at one moment, while the table stays in use.
+
+    meta, arrays: as `Table.load_state` takes them, except the array "frames". frames: its content, to be read in pieces
+    of any size between other calls on the table, and to be released at the end (it is a context manager).
+    """
+
+    meta: dict[str, Any]
+    arrays: dict[str, Array]
+    frames: PinnedFrames
 
 
 class Table:
@@ -86,7 +98,7 @@ class Table:
         self._eviction, self._sampling = make_policies(evicts, draws, view)
         self._tails = StreamTails(self._frames, spec.stack)
         self._sampled = 0
-        self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
+        self._reuse_evicted = np.zeros(_REUSE_BUCKETS, np.int64)
 
     def __len__(self) -> int:
         return min(self.inserted, self.capacity)
@@ -126,7 +138,7 @@ class Table:
         index = np.concatenate((segment.obs_index[kept], segment.next_index[kept]), axis=1)
         slots, dropped = self._tails.store(segment, index)
         replaced = rows[rows < size]
-        self._reuse_evicted += reuse_histogram(self._columns.reuse[replaced])
+        self._reuse_evicted += _reuse_histogram(self._columns.reuse[replaced])
         self._reuse_evicted[0] += segment.steps - len(rows)
         old = self._columns.slots.take(replaced, axis=0).ravel()
         if self._row_of is not None:
@@ -203,24 +215,6 @@ class Table:
             self._max_priority = max(self._max_priority, float(given.max()))
             self._set_priorities(rows, given)
 
-    def stats(self) -> TableStats:
-        """Compute counts and diagnostics, in time proportional to the number of transitions held."""
-        size = len(self)
-        reuse = self._columns.reuse[:size]
-        return TableStats(
-            size=size,
-            inserted=self.inserted,
-            evicted=self.evicted,
-            evicted_unsampled=self.evicted_unsampled,
-            batches=self.batches,
-            sampled=self._sampled,
-            frames_held=self._frames.held,
-            bytes_held=self._frames.bytes_held + size * self._columns.row_bytes,
-            reuse_mean=float(reuse.mean()) if size else 0.0,
-            reuse_held=tuple(reuse_histogram(reuse).tolist()),
-            reuse_evicted=tuple(self._reuse_evicted.tolist()),
-        )
-
     def snapshot(self) -> TableSnapshot:
         """Freeze the present state while the table stays in use: small arrays are copied, frames only held."""
         size = len(self)
@@ -280,3 +274,8 @@ class Table:
         self._columns.priorities[rows] = priorities
         self._eviction.prioritise(rows)
         self._sampling.prioritise(rows, priorities)
+
+
+def _reuse_histogram(reuse: NDArray[np.int32]) -> NDArray[np.intp]:
+    """Transitions by the bit length of their draws: int [_REUSE_BUCKETS], the last entry open-ended."""
+    return np.bincount(_BUCKETS.searchsorted(reuse, "right"), minlength=_REUSE_BUCKETS)

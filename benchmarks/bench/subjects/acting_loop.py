@@ -6,7 +6,7 @@ import numpy as np
 from turns import attend, processor_rate
 from work import EMULATORS, EPSILON, acting_config
 
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import env_spec, make_vector_env
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.process.threads import use_threads
@@ -16,7 +16,7 @@ config = acting_config("bench", EMULATORS, EPSILON)
 spec, env = env_spec(config.env), make_vector_env(config.env, EMULATORS, seed=0)
 networks = tuple(FlatNetwork(build_network(config.network.kind, spec, (), seed)) for seed in (0, 1))
 rng = np.random.default_rng(0)
-policy = Policy(networks, spec, rng)
+policy = EpsilonGreedy(networks, spec, rng)
 seen = [env.reset()]
 
 

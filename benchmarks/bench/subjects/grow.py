@@ -28,7 +28,7 @@ from start import BIN, PACKED
 from turns import attend, rate, resident_bytes
 from work import ATARI, BATCH, KINDS, STEPS, update_config
 
-from coop.actors.policy import Policy
+from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import env_spec, make_vector_env
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.process.threads import use_threads
@@ -59,7 +59,7 @@ def emulators(size: int) -> Turn:
     before, config = resident_bytes(), update_config("mlp", "coop", BATCH, "float32")
     spec, env = env_spec(config.env), make_vector_env(config.env, size, seed=0)
     networks = tuple(FlatNetwork(build_network("mlp", spec, config.network.hidden, seed)) for seed in (0, 1))
-    policy, seen = Policy(networks, spec, np.random.default_rng(0)), [env.reset()]
+    policy, seen = EpsilonGreedy(networks, spec, np.random.default_rng(0)), [env.reset()]
 
     def unit() -> None:
         seen[0] = env.step(policy.act(seen[0], 0.1)).obs

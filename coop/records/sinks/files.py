@@ -12,7 +12,7 @@ from typing import Any
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.numbers import exact, strict_json
 from coop.common.process.console import say
-from coop.common.process.files import LineFile, Measured, aside_folder
+from coop.common.process.files import FileDigest, LineFile, aside_folder
 from coop.common.process.untrusted import read_bytes
 from coop.common.types import EpisodeRow
 from coop.records.checkpoints import EVALUATIONS, RECORDS
@@ -48,7 +48,7 @@ class RecordFiles(Sink):
         return next((file.problem for file in self._files if file.problem), "")
 
     @property
-    def measured(self) -> dict[str, Measured]:
+    def measured(self) -> dict[str, FileDigest]:
         """What each file holds now, lines that are kept included, by name."""
         return {name: file.measured for name, file in zip((*RECORDS, EVALUATIONS), self._files, strict=True)}
 

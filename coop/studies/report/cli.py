@@ -66,5 +66,4 @@ def _run() -> None:
         beside = runs if runs.is_dir() else runs.with_suffix("")
         if options.out is None:
             refuse_links(beside / "report")
-        index, told = write_report(runs, options.out or beside / "report", options.baseline)
-        print(*told, shown(index), sep="\n")
+        print(shown(write_report(runs, options.out or beside / "report", options.baseline)))

@@ -11,20 +11,19 @@ from pathlib import Path
 
 from coop.common.process.console import counted
 from coop.studies.report.plots import Figure
+from coop.studies.report.slices import seeds_of
 from coop.studies.report.study import Study
 from coop.studies.report.table import ResultTable
 
 ENLARGED = 1.5  # screens are read from further away than paper
 SHORT = 12  # rows; a longer table is folded
+FEW = 5  # runs of a method at one setting, below which intervals say little
 STYLE = """
 :root { color-scheme: light; }
 body { font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; max-width: 76rem; margin: 1.5rem auto; padding: 0 1.5rem;
   color: #1b1f24; background: #fff; }
 h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 0.6rem; text-wrap: balance; }
 h2 { font-size: 1.1rem; margin: 2rem 0 0.5rem; }
-.answer { max-width: 62rem; padding-left: 1.2rem; }
-.answer li { margin: 0.25rem 0; }
-.answer li:first-child { list-style: none; margin-left: -1.2rem; color: #555; }
 figure { margin: 0.5rem 0; }
 img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
 figcaption, .note { color: #555; font-size: 0.85rem; max-width: 62rem; }
@@ -46,21 +45,18 @@ code { background: #f3f4f6; padding: 0.1rem 0.3rem; }
 def page(
     study: Study,
     folder: Path,
-    told: Sequence[str],
     tables: Sequence[ResultTable],
     figures: Sequence[tuple[Figure, Path]],
     lacking: Sequence[str],
 ) -> str:
-    """Render the page: the answer, one figure and the tables that sum up first; then everything else, folded.
+    """Render the page: what the study holds, one figure and the tables that sum up first; then everything else, folded.
 
     Args:
         folder: of the runs.
-        told: what was found, in sentences.
         figures: each with the path of its PNG, which is embedded in the page; the first one shows what was found.
         lacking: lines about what cannot be shown, with the reason.
     """
     title = html.escape(study.title or f"Runs in {folder.name}")
-    sentences = "".join(f"<li>{html.escape(line)}</li>" for line in told)
     sums_up = len(study.methods) > 1 and len(study.settings) > 1
     names = ("baseline", "aggregate", "settings") if sums_up else ("baseline", "settings")
     first = [table for table in tables if table.name in names]
@@ -71,7 +67,7 @@ def page(
         '<meta name=viewport content="width=device-width, initial-scale=1">',
         f"<title>{title}</title><style>{STYLE}</style>",
         f"<h1>{title}</h1>",
-        f"<ul class=answer>{sentences}</ul>",
+        f"<p>{html.escape(_subject(study))}</p>",
         *(f"<h2>{html.escape(figure.title)}</h2>{_figure(figure, png)}" for figure, png in shown),
         *(f"<h2>{html.escape(table.title)}</h2>{table.html()}" for table in first),
         "<h2>Figures</h2>",
@@ -88,6 +84,17 @@ def page(
         "beside this page as PNG and PDF with its points as CSV, every table as CSV and Markdown.</p></html>",
     ]
     return "\n".join(parts) + "\n"
+
+
+def _subject(study: Study) -> str:
+    """What the study holds, and whether it has too few runs of a setting for its intervals."""
+    runs = f"{len(study.runs)} of {len(study.runs) + len(study.missing)} runs finished"
+    diverged = f", {len(study.diverged)} diverged" if study.diverged else ""
+    what = f"{', '.join(study.methods)} on {', '.join(study.environments)}, seeds {seeds_of(study.runs)}"
+    fewest = min(filter(None, (len(study.of(method, at)) for method in study.methods for at in study.settings)))
+    if fewest >= FEW:
+        return f"{runs}{diverged}: {what}."
+    return f"{runs}{diverged}: {what}. Settings with {counted(fewest, 'run')}: their intervals cover less than 95 %."
 
 
 def _folded(title: str, more: str, content: str, *, is_open: bool = False) -> str:

@@ -19,7 +19,7 @@ from coop.records.run_ids import RUN_ID
 from coop.studies.report.packed import CONFIG, EPISODES, SUMMARY, SWEEP, PackedStudy
 
 
-class Source(Protocol):
+class RunSource(Protocol):
     """The files of runs.
 
     names: of the runs. sweep: the text of sweep.toml; None if there is none.
@@ -70,7 +70,7 @@ class FolderSource:
         return text
 
     def text(self, run: str, file: str) -> str | None:
-        """See `Source`."""
+        """See `RunSource`."""
         path = self._folder / run / file
         try:
             return read_text(path)
@@ -80,7 +80,7 @@ class FolderSource:
             raise RunError(f"{path}: can't be read: {getattr(error, 'strerror', None) or error}") from error
 
     def columns(self, run: str, file: str, wanted: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
-        """See `Source`."""
+        """See `RunSource`."""
         path, first = self._folder / run / file, 2 if file == EPISODES else 1
         rows = self._read(run, file)
         found = {name: column(rows, name, path, first) for name in wanted}
@@ -116,7 +116,7 @@ def _numbers(column: pd.Series) -> pd.Series:
     return column
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path) -> RunSource:
     """Open a folder of runs or a packed study.
 
     Raises:

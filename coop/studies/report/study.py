@@ -21,7 +21,7 @@ from coop.records.checkpoints import EVALUATIONS
 from coop.records.reading import returns_by_step
 from coop.records.summaries import parse_summary
 from coop.studies.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
-from coop.studies.report.sources import Source, open_source
+from coop.studies.report.sources import RunSource, open_source
 from coop.studies.sweep.grid import parse_grid
 
 Floats = NDArray[np.float64]
@@ -213,7 +213,7 @@ def load_study(path: Path) -> Study:
     return Study(grid.file.title if grid else "", tuple(runs), missing, diverged, axes, reference)
 
 
-def _state(source: Source, run: str) -> str:
+def _state(source: RunSource, run: str) -> str:
     """Which part of a run is missing; empty if it is finished."""
     summary = source.text(run, SUMMARY)
     if summary is None:
@@ -225,7 +225,7 @@ def _state(source: Source, run: str) -> str:
     return "" if outcome.startswith("complete") else f"begun, not finished: {outcome}"
 
 
-def _read(source: Source, run: str, path: Path) -> Run:
+def _read(source: RunSource, run: str, path: Path) -> Run:
     config = read_config(source, run, path)
     try:
         episodes = source.columns(run, EPISODES, ("env_step", "return", "s", "q1_mean", "q2_mean"))
@@ -245,7 +245,7 @@ def _read(source: Source, run: str, path: Path) -> Run:
     return Run(run, config, ends, returns, s, q1, q2, metrics, int((size > bound).sum()), fallbacks, evaluated)
 
 
-def read_config(source: Source, run: str, path: Path) -> RunConfig:
+def read_config(source: RunSource, run: str, path: Path) -> RunConfig:
     """The config of a run of the study at `path`; raises RunError."""
     try:
         return parse_run_config(source.text(run, CONFIG) or "", path / run / CONFIG)

@@ -14,7 +14,6 @@ from coop.common.process.limits import cores
 from coop.common.process.notices import warn
 from coop.common.process.untrusted import refuse_links
 from coop.records.curve import draw_curve
-from coop.studies.report.answer import answer
 from coop.studies.report.baseline import baseline_figure, baseline_table, find_baseline
 from coop.studies.report.figures import figures
 from coop.studies.report.packed import EPISODES
@@ -54,8 +53,8 @@ def draw_curves(runs: Path, out: Path) -> list[Path]:
     return drawn
 
 
-def write_report(runs: Path, out: Path, baseline: str | None = None) -> tuple[Path, list[str]]:
-    """Write the report of a folder of runs, and warn of untrustworthy runs; return its path and what was found.
+def write_report(runs: Path, out: Path, baseline: str | None = None) -> Path:
+    """Write the report of a folder of runs, and warn of untrustworthy runs; return its path.
 
     baseline: a method or a run, from which the differences of the others are reported.
 
@@ -72,7 +71,6 @@ def write_report(runs: Path, out: Path, baseline: str | None = None) -> tuple[Pa
     if compared is not None:
         results.insert(0, baseline_table(study, compared))
         made.append(baseline_figure(study, compared))
-    told = answer(study, results)
     try:
         out.mkdir(parents=True, exist_ok=True)
         refuse_links(*out.iterdir())
@@ -84,10 +82,10 @@ def write_report(runs: Path, out: Path, baseline: str | None = None) -> tuple[Pa
             (out / f"table_{table.name}.csv").write_text(table.csv(), encoding="utf-8")
             (out / f"table_{table.name}.md").write_text(table.markdown(), encoding="utf-8")
         index = out / "index.html"
-        index.write_text(page(study, runs, told, results, drawn, lacking), encoding="utf-8")
+        index.write_text(page(study, runs, results, drawn, lacking), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror}") from error
-    return index, told
+    return index
 
 
 def _draw_all(figures: Sequence[tuple[Figure, Path]]) -> None:

@@ -61,7 +61,7 @@ def normal(words: Tensor) -> Tensor:
     return radius * ((words & 0xFFFF).float() * (2 * math.pi / 65536)).cos()
 
 
-class Draws(NamedTuple):
+class RandomNumbers(NamedTuple):
     """What chance and the schedules decide for a block of n steps, before any network is asked.
 
     Attributes:
@@ -107,7 +107,7 @@ class Chance:
         words = bits(self.keys, self._lanes[_RESET:_NORMAL] + (1 << 31))
         return words.double() * (2.0**-32 * 0.1) - 0.05
 
-    def draws(self, first: int, count: int) -> Draws:
+    def draws(self, first: int, count: int) -> RandomNumbers:
         """The draws of `count` steps, of which `first` steps are done before; only `first` comes from the host."""
         settings = self._settings
         step = torch.arange(count, device=self.keys.device) + first
@@ -125,7 +125,7 @@ class Chance:
         s = self._scales[update][:, None] * self._s
         if settings.noise == "normal":
             s = s * normal(words[..., _NORMAL])
-        return Draws(
+        return RandomNumbers(
             step=step,
             action=torch.where(random, words[..., _ACTION] & 1, -1),
             reset=share[..., _RESET:_NORMAL] * 0.1 - 0.05,

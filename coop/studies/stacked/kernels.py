@@ -21,7 +21,7 @@ from coop.studies.stacked.cartpole import (
     POLE_MASS,
     TAU,
     TOTAL_MASS,
-    Draws,
+    RandomNumbers,
 )
 from coop.studies.stacked.settings import StackSettings
 
@@ -490,7 +490,7 @@ class Kernels:
             "MAX_X": MAX_X, "MAX_ANGLE": MAX_ANGLE,
         }  # fmt: skip
 
-    def step(self, draws: Draws, number: int, role: int) -> None:
+    def step(self, draws: RandomNumbers, number: int, role: int) -> None:
         """`Stack.act` and `Stack.update`."""
         stack, settings = self._stack, self._stack.settings
         code, size = CODES[settings.feedback], stack.shape.size

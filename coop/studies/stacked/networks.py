@@ -25,7 +25,7 @@ _RANK = 1e-12  # of det G / (|t_1|^2 |t_2|^2): below it, T counts as one of rank
 _TINY = 1e-37  # below any square that matters, above the denormals
 
 
-class Layer(NamedTuple):
+class LayerSlice(NamedTuple):
     """Where a layer lies in a row of theta: weight [outputs, inputs] from `start`, then bias; `stop` is behind it."""
 
     start: int
@@ -46,11 +46,11 @@ class Shape:
     def __init__(self, hidden: int, width: int) -> None:
         self.hidden, self.width = hidden, width
         sizes = [INPUTS, *[width] * hidden, ACTIONS]
-        self.layers: list[Layer] = []
+        self.layers: list[LayerSlice] = []
         start = 0
         for inputs, outputs in pairwise(sizes):
             stop = start + outputs * (inputs + 1)
-            self.layers.append(Layer(start, outputs, inputs, stop))
+            self.layers.append(LayerSlice(start, outputs, inputs, stop))
             start = stop
         self._counts: dict[torch.device, Tensor] = {}
         self.parameters = start
@@ -94,20 +94,20 @@ class Shape:
         return flat
 
 
-class Tape(NamedTuple):
+class StackTape(NamedTuple):
     """A forward pass: h [K, batch, n] of the input and of each hidden layer, and the values [K, batch, 2]."""
 
     h: list[Tensor]
     values: Tensor
 
 
-def forward(shape: Shape, theta: Tensor, x: Tensor) -> Tape:
+def forward(shape: Shape, theta: Tensor, x: Tensor) -> StackTape:
     """Run the networks theta [K, size] on x, float32 [K, batch, 4]."""
     h = [x]
     for weight, bias in shape.views(theta)[:-1]:
         h.append(torch.baddbmm(bias[:, None], h[-1], weight.mT).relu_())
     weight, bias = shape.views(theta)[-1]
-    return Tape(h, torch.baddbmm(bias[:, None], h[-1], weight.mT))
+    return StackTape(h, torch.baddbmm(bias[:, None], h[-1], weight.mT))
 
 
 def td_errors(settings: StackSettings, batch: Tensor, values: Tensor, chosen: Tensor, target: Tensor) -> Tensor:
@@ -179,7 +179,7 @@ def whiten(t: Tensor, e: Tensor) -> White:
     return White(torch.stack((w1, w2), -1).float(), torch.stack((x1, x2), -1).float(), least)
 
 
-def backward(shape: Shape, theta: Tensor, tape: Tape, error: Tensor) -> list[Tensor]:
+def backward(shape: Shape, theta: Tensor, tape: StackTape, error: Tensor) -> list[Tensor]:
     """Backpropagate: delta(i), float32 [K, batch, n], of each layer, first to last."""
     deltas = [error]
     for (weight, _), h in zip(shape.views(theta)[:0:-1], tape.h[:0:-1], strict=True):
@@ -187,7 +187,7 @@ def backward(shape: Shape, theta: Tensor, tape: Tape, error: Tensor) -> list[Ten
     return deltas
 
 
-def transforms(shape: Shape, theta: Tensor, tape: Tape) -> list[Tensor]:
+def transforms(shape: Shape, theta: Tensor, tape: StackTape) -> list[Tensor]:
     """T(i), float32 [K, batch, 2, n], of each hidden layer, first to last."""
     views = shape.views(theta)
     last = views[-1][0] * _HALF
@@ -219,7 +219,7 @@ def polar_parts(ts: list[Tensor], error: Tensor) -> tuple[list[Tensor], list[Whi
     return parts, whites
 
 
-def error_driven(shape: Shape, theta: Tensor, tape: Tape, error: Tensor, s: Tensor) -> list[Tensor]:
+def error_driven(shape: Shape, theta: Tensor, tape: StackTape, error: Tensor, s: Tensor) -> list[Tensor]:
     """sigma(i) = B(i)^T e of each layer, first to last, by the transform feedback; s: float32 [K]."""
     ts, scale = transforms(shape, theta, tape), s[:, None, None]
     parts, _ = polar_parts(ts, error)
@@ -233,7 +233,7 @@ def aligned(fixed: Tensor, error: Tensor) -> list[Tensor]:
     return [*torch.einsum("kba,klan->lkbn", error, fixed).unbind(0), error]
 
 
-def write_gradient(shape: Shape, tape: Tape, deltas: list[Tensor], out: Tensor) -> Tensor:
+def write_gradient(shape: Shape, tape: StackTape, deltas: list[Tensor], out: Tensor) -> Tensor:
     """The sums of delta h^T and of delta over the batch, into out, float32 [K, size]."""
     for (weight, bias), delta, h in zip(shape.views(out), deltas, tape.h, strict=True):
         weight.copy_(torch.bmm(delta.mT, h))

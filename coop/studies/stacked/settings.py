@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from coop.common.settings.config import RunConfig
 
 TWO_NETWORKS = {"dqn": False, "edql": False, "g-coop": True, "coop": True}
-ERROR_DRIVEN = {"dqn": False, "edql": True, "g-coop": False, "coop": True}
 # "noise", "matched" and "parallel" are controls of a study: see `coop.studies.stacked.networks`.
 FEEDBACKS = ("none", "transform", "weight-gradient", "random", "noise", "matched")
 OPTIMIZERS = ("sgd", "rmsprop", "adam")
@@ -201,8 +200,3 @@ def from_config(config: RunConfig) -> tuple[StackSettings, Runs]:
     )  # fmt: skip
     s = 0.0 if config.feedback == "none" else edl.rate
     return settings, Runs.of([config.seed], learner.optimizer, learner.learning_rate, s)
-
-
-def with_feedback(settings: StackSettings, feedback: str, **changes: Any) -> StackSettings:  # noqa: ANN401
-    """The same settings with another feedback, and further changes."""
-    return replace(settings, feedback=feedback, **changes)

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from coop.learner.recorded import captured
 from coop.studies.stacked import networks
-from coop.studies.stacked.cartpole import Chance, Draws, move
-from coop.studies.stacked.networks import Tape, shape_of
+from coop.studies.stacked.cartpole import Chance, RandomNumbers, move
+from coop.studies.stacked.networks import StackTape, shape_of
 from coop.studies.stacked.settings import Runs, StackSettings
 
 COLUMNS = 10  # of the table: obs, next_obs, action, terminated
@@ -83,11 +83,11 @@ class Stack:
             self.segments.append((name, slice(start, start + many)))
             start += many
         self._every = max(n for n in range(1, BLOCK + 1) if settings.swap_every % n == 0)
-        self._draws: Draws | None = None  # of a captured block
+        self._draws: RandomNumbers | None = None  # of a captured block
         self._replays: dict[int, Callable[[], None]] = {}
         self._kernel_step, self.path = self._choose(kernels, precision)
 
-    def _choose(self, kernels: bool, precision: str) -> tuple[Callable[[Draws, int, int], None] | None, str]:
+    def _choose(self, kernels: bool, precision: str) -> tuple[Callable[[RandomNumbers, int, int], None] | None, str]:
         """A step by Triton's kernels, or None, and what a block of steps is made of, in words."""
         if self.device.type != "cuda":
             return None, "PyTorch's operations"
@@ -134,10 +134,10 @@ class Stack:
         """Whether blocks become graphs; the decompositions of a weight gradient can't."""
         return self.device.type == "cuda" and self.settings.feedback != "weight-gradient"
 
-    def _replay(self, draws: Draws, role: int) -> None:
+    def _replay(self, draws: RandomNumbers, role: int) -> None:
         """Play a block of `_every` steps as a graph; the first block of a role is played without one, and warms up."""
         if self._draws is None:
-            self._draws = Draws(*(each.clone() for each in draws))
+            self._draws = RandomNumbers(*(each.clone() for each in draws))
         for kept, new in zip(self._draws, draws, strict=True):
             kept.copy_(new)
         if role in self._replays:
@@ -151,7 +151,7 @@ class Stack:
         held = self._draws
         self._replays[role] = captured(lambda: self.play(held, True, role), self.device)
 
-    def play(self, draws: Draws, learning: bool, role: int) -> None:
+    def play(self, draws: RandomNumbers, learning: bool, role: int) -> None:
         """Play the steps of a block; network `role` acts, and is trained if `learning`."""
         for number in range(len(draws.step)):
             if learning and self._kernel_step is not None:
@@ -161,7 +161,7 @@ class Stack:
             if learning:
                 self.update(draws, number, role)
 
-    def act(self, draws: Draws, number: int, role: int) -> None:
+    def act(self, draws: RandomNumbers, number: int, role: int) -> None:
         """Step `number` of a block up to its transition's place in the table."""
         settings = self.settings
         obs = self.state.float()
@@ -179,7 +179,7 @@ class Stack:
         self.length *= ~over
         torch.where(over[:, None], draws.reset[number], moved, out=self.state)
 
-    def update(self, draws: Draws, number: int, role: int) -> None:
+    def update(self, draws: RandomNumbers, number: int, role: int) -> None:
         """Train network `role` towards the other one's targets, with the batch of step `number` of a block."""
         batch = self.table.index_select(0, draws.batch[number].view(-1)).view(*draws.batch[number].shape, COLUMNS)
         tape, error = self.errors(batch, role)
@@ -192,18 +192,18 @@ class Stack:
             rate = draws.rate[number, part, None]
             self.theta[role, part].sub_(step * (rate if scale is None else rate * scale[part]))
 
-    def errors(self, batch: Tensor, role: int) -> tuple[Tape, Tensor]:
+    def errors(self, batch: Tensor, role: int) -> tuple[StackTape, Tensor]:
         """The forward pass of the batch's observations, and the output error, float32 [K, batch, 2]."""
         settings, size = self.settings, batch.shape[1]
         obs, next_obs = batch[..., :4], batch[..., 4:8]
         both = networks.forward(self.shape, self.theta[role], torch.cat((obs, next_obs), 1) if settings.double else obs)
         target = networks.forward(self.shape, self.theta[1 - role], next_obs).values
-        tape = Tape([h[:, :size] for h in both.h], both.values[:, :size])
+        tape = StackTape([h[:, :size] for h in both.h], both.values[:, :size])
         chosen = both.values[:, size:] if settings.double else target
         errors = networks.td_errors(settings, batch, tape.values, chosen, target)
         return tape, networks.output_error(settings, errors, batch[..., 8])
 
-    def feedback(self, tape: Tape, error: Tensor, draws: Draws, number: int, role: int) -> Tensor | None:
+    def feedback(self, tape: StackTape, error: Tensor, draws: RandomNumbers, number: int, role: int) -> Tensor | None:
         """Write the gradient by the runs' feedback; return factors of the learning rate, [K, size], if it has some.
 
         noise: the plain gradient, and in each layer normal noise with the length of what transform would add to it.

@@ -12,7 +12,7 @@ from coop.common.process.randomness import generator_state, set_generator_state
 from coop.common.settings.config import RunConfig
 from coop.common.types import Array, Batch, EnvSpec
 from coop.lockstep.memory import TableMemory
-from coop.replay.stats import REUSE_BUCKETS
+from coop.replay.table.table import REUSE_BUCKETS
 from coop.studies.stacked import compiled
 
 Ints = NDArray[np.int64]

@@ -13,7 +13,7 @@ from coop.common.process.files import make_folder, write_atomic
 from coop.common.process.untrusted import check_links
 from coop.common.settings.tables import identity, run_config_text, sealed_toml
 from coop.records.checkpoints import RECORDS, SWEEP, checked_summary
-from coop.records.locks import Held, RunLock
+from coop.records.locks import LockHeld, RunLock
 from coop.records.reading import read_csv_tail, read_run_config
 from coop.records.sinks import DEFAULT_LOG
 from coop.studies.sweep.grid import Cell, Grid
@@ -72,7 +72,7 @@ class CellFolder:
         """The locks of the cell's run; None if another process has them. A child that inherits them keeps them."""
         try:
             return RunLock(self.path, "coop-sweep", ("learner", "replay")).sign()
-        except Held:
+        except LockHeld:
             return None
 
     def prepare(self) -> None:

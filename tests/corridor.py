@@ -1,4 +1,4 @@
-"""Corridor: walk to its end. Its optimal action values are known, so tests can compare a learner with them."""
+"""Corridor: walk to its end. Its optimal action values are known, which a learner can be compared with."""
 
 from __future__ import annotations
 
@@ -53,4 +53,4 @@ def optimal_values(gamma: float) -> NDArray[np.float64]:
     return np.stack((left, right), axis=1)
 
 
-gymnasium.register("coop/Corridor-v0", entry_point="coop.common.envs.corridor:Corridor", max_episode_steps=50)
+gymnasium.register("test/Corridor-v0", entry_point="corridor:Corridor", max_episode_steps=50)
