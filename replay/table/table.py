@@ -16,8 +16,8 @@ from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFram
 from coop.replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
 from coop.replay.table.streams import StreamTails
 
-_REUSE_BUCKETS = 16
-_BUCKETS = 2 ** np.arange(_REUSE_BUCKETS - 1, dtype=np.int32)  # the fewest draws of each bucket but the first
+REUSE_BUCKETS = 16
+_BUCKETS = 2 ** np.arange(REUSE_BUCKETS - 1, dtype=np.int32)  # the fewest draws of each bucket but the first
 
 
 class PinnedBatch(NamedTuple):
@@ -98,7 +98,7 @@ class Table:
         self._eviction, self._sampling = make_policies(evicts, draws, view)
         self._tails = StreamTails(self._frames, spec.stack)
         self._sampled = 0
-        self._reuse_evicted = np.zeros(_REUSE_BUCKETS, np.int64)
+        self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
 
     def __len__(self) -> int:
         return min(self.inserted, self.capacity)
@@ -277,5 +277,5 @@ class Table:
 
 
 def _reuse_histogram(reuse: NDArray[np.int32]) -> NDArray[np.intp]:
-    """Transitions by the bit length of their draws: int [_REUSE_BUCKETS], the last entry open-ended."""
-    return np.bincount(_BUCKETS.searchsorted(reuse, "right"), minlength=_REUSE_BUCKETS)
+    """Transitions by the bit length of their draws: int [REUSE_BUCKETS], the last entry open-ended."""
+    return np.bincount(_BUCKETS.searchsorted(reuse, "right"), minlength=REUSE_BUCKETS)
