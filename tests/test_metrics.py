@@ -10,7 +10,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from coop.records.sources import base_config
 from msgspec.structs import replace
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -26,6 +25,7 @@ from coop.monitor.facts import facts, values
 from coop.monitor.live_page import LivePage
 from coop.monitor.screen import RunScreen
 from coop.records.run_directory import RunDirectory
+from coop.records.run_options import base_config
 from website.assemble import assembled
 
 # Names that dashboards rely on; they stay. Those of metrics.jsonl are in tests/test_topology.py.
