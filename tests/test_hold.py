@@ -131,3 +131,9 @@ def test_a_study_goes_on_where_it_stopped_and_is_packed(tmp_path: Path) -> None:
     assert not runs["well"].any()
     assert runs["finite"].all()
     assert len(hold_verdict.cells(runs)) == 2
+    for path in tmp_path.glob("*.npz"):
+        path.unlink()
+    hold.play(grid, tmp_path, Stop(), steps=450, packed=hold.packed_rows(tmp_path / "packed.parquet"))
+    assert [path.name for path in tmp_path.iterdir()] == ["packed.parquet"], "packed cells are not played again"
+    assert hold.pack(grid, tmp_path, tmp_path / "packed.parquet") == 2
+    assert hold_verdict.load(tmp_path / "packed.parquet").equals(runs)

@@ -1,7 +1,7 @@
 """The study of results/cartpole/hold/plan.md: why two networks hold on CartPole.
 
     python -m coop.studies.stacked.hold runs/hold     # plays what is not there yet, and goes on where it stopped
-    python -m coop.studies.stacked.hold runs/hold --pack results/cartpole/hold/hold.parquet
+    python -m coop.studies.stacked.hold runs/hold --pack results/cartpole/hold/hold.parquet     # adds what is complete
 
 The seeds of a cell are played side by side, each in a run directory as `coop-lockstep` leaves it; once all are over,
 they become one file of the cell. A packed row is a run, with all its returns; a return of CartPole is the length of its
@@ -17,7 +17,7 @@ import json
 import math
 import shutil
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import product
@@ -91,13 +91,13 @@ def read_grid(path: Path = GRID) -> HoldGrid:
     return HoldGrid(tuple(cells.values()), tuple(range(first_last[0], first_last[1] + 1)))
 
 
-def play(grid: HoldGrid, out: Path, stop: Stop, steps: int | None = None) -> None:
-    """Play every cell that has no file yet; steps: of each run, in place of the grid's."""
+def play(grid: HoldGrid, out: Path, stop: Stop, steps: int | None = None, packed: Collection[str] = ()) -> None:
+    """Play every cell that has no file yet and is not packed; steps: of each run, in place of the grid's."""
     out.mkdir(parents=True, exist_ok=True)
     for cell in grid.cells:
         if stop.is_set():
             return
-        if not (out / f"{cell.name}.npz").exists():
+        if cell.name not in packed and not (out / f"{cell.name}.npz").exists():
             config = cell.config if steps is None else replace(cell.config, total_steps=steps)
             play_cell(cell, config, grid.seeds, out, stop)
 
@@ -194,15 +194,40 @@ def sealed(plan: Path = PLAN, grid: Path = GRID) -> dict[str, str]:
 
 
 def pack(grid: HoldGrid, out: Path, path: Path) -> int:
-    """Write the complete cells of the folder `out` into one Parquet file; return their number. Raises UsageError."""
-    done = [cell for cell in grid.cells if (out / f"{cell.name}.npz").exists()]
-    if not done:
+    """Add the complete cells of the folder `out` to a Parquet file; return the number that it then holds.
+
+    Raises:
+        UsageError: there is none, or the file is of another plan or grid.
+    """
+    before = packed_rows(path)
+    done = [cell for cell in grid.cells if (out / f"{cell.name}.npz").exists() and cell.name not in before]
+    if not done and not before:
         raise UsageError(f"{out}: no cell is complete")
-    frame = pd.DataFrame([row for cell in done for row in rows_of(cell, out / f"{cell.name}.npz")])
+    rows = before | {cell.name: list(rows_of(cell, out / f"{cell.name}.npz")) for cell in done}
+    frame = pd.DataFrame([row for cell in grid.cells for row in rows.get(cell.name, ())])
     frame = frame.astype(dict.fromkeys(("area", "last", "churn", "q_share"), np.float32))
     table = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata({SEAL: json.dumps(sealed())})
     pq.write_table(table, path, compression="zstd", compression_level=22)
-    return len(done)
+    return len(rows)
+
+
+def packed_rows(path: Path = FILE) -> dict[str, list[dict[str, Any]]]:
+    """The rows of a packed file by the name of their cell; none if there is no file.
+
+    Raises UsageError if it is of another plan or grid.
+    """
+    if not path.exists():
+        return {}
+    table = pq.read_table(path)
+    if json.loads((table.schema.metadata or {}).get(SEAL, b"{}")) != sealed():
+        raise UsageError(f"{path}: of another plan or grid")
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in table.to_pylist():
+        name = "-".join(
+            (row["variant"], row["eviction"], str(row["capacity"]), "double" if row["double"] else "single")
+        )
+        found.setdefault(name, []).append(row)
+    return found
 
 
 def main() -> None:
@@ -221,7 +246,7 @@ def _run() -> None:
         return
     stop = Stop()
     stop.on_signals()
-    play(grid, args.out, stop)
+    play(grid, args.out, stop, packed=packed_rows())
     if stop.is_set():
         stop.leave()
 
