@@ -24,7 +24,7 @@ from coop.records.checkpoints import RECORDS, SWEEP
 from coop.records.curve import draw_learning_curve
 from coop.records.resumption import Survey, go_back
 from coop.records.run_ids import claim, has_run_id, read_run_id
-from coop.records.sinks import DEFAULT_LOG, ChosenSinks, Kept, Run, Sink, chosen_sinks
+from coop.records.sinks import DEFAULT_LOG, ChosenSinks, Kept, RecordedRun, Sink, chosen_sinks
 from coop.records.sinks.files import RecordFiles
 from coop.records.summaries import SUMMARY, Summary, summary_text
 
@@ -63,7 +63,7 @@ class RunDirectory:
             goes_on, names = number is not None, chosen_sinks(log)
             if goes_on and (path / "tb").exists():
                 names = tuple(dict.fromkeys((*names, DEFAULT_LOG)))  # which has to be cut back as well
-            run = Run(path, run_id, path.parent.name if (path.parent / SWEEP).exists() else "")
+            run = RecordedRun(path, run_id, path.parent.name if (path.parent / SWEEP).exists() else "")
             self._sinks = ChosenSinks(run, names)
             opened.callback(self._sinks.close)
             (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at

@@ -23,7 +23,7 @@ from coop.common.types import EpisodeRow
 EPISODE, ROW = "charts/episodic_return", "losses/q_values"
 
 
-class Run(NamedTuple):
+class RecordedRun(NamedTuple):
     """The run that a sink records: its directory, its id, and the name of the sweep that it belongs to, or nothing."""
 
     path: Path
@@ -54,7 +54,7 @@ class Sink:
     extra: ClassVar[str] = ""
     library: ClassVar[str] = ""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RecordedRun) -> None:
         """Get ready. Whatever it raises refuses the run, before any record has been changed."""
 
     @property
@@ -139,7 +139,7 @@ def chosen_sinks(log: str | Iterable[str]) -> tuple[str, ...]:
 class ChosenSinks:
     """The sinks that `--log` names; one that fails is left out from then on, and a line says so."""
 
-    def __init__(self, run: Run, names: Iterable[str]) -> None:
+    def __init__(self, run: RecordedRun, names: Iterable[str]) -> None:
         """Open them; raises UsageError if one refuses."""
         self._run = run
         self._sinks: list[Sink] = []

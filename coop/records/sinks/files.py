@@ -16,7 +16,7 @@ from coop.common.process.files import FileDigest, LineFile, aside_folder
 from coop.common.process.untrusted import read_bytes
 from coop.common.types import EpisodeRow
 from coop.records.checkpoints import EVALUATIONS, RECORDS
-from coop.records.sinks import Kept, Run, Sink
+from coop.records.sinks import Kept, RecordedRun, Sink
 
 EPISODE_FIELDS = (
     "episode", "env_step", "update", "actor", "stream", "return", "length",
@@ -28,7 +28,7 @@ FIELDS = EvaluationRow.__struct_fields__
 class RecordFiles(Sink):
     """Writes the tables; when a call returns, its lines are complete if the disk has space."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RecordedRun) -> None:
         self._path = run.path
         self._files: tuple[LineFile, ...] = ()
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from coop.common.process.files import make_folder
 from coop.records.locks import FileLock
-from coop.records.sinks import Kept, Run, ScalarSink
+from coop.records.sinks import Kept, RecordedRun, ScalarSink
 
 BATCH = 1000  # metrics in a request, MLflow's own bound
 PARAMS = 100  # settings in a request, likewise
@@ -31,7 +31,7 @@ class MlflowSink(ScalarSink):
 
     name, extra, library = "mlflow", "mlflow", "mlflow"
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RecordedRun) -> None:
         """Begin the run, or continue it where the id is known."""
         store = os.environ.get(ITS_STORE)
         folder = run.path.parent / "mlruns" if run.sweep else run.path / "logs" / "mlruns"

@@ -20,7 +20,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 from coop.common.process.files import LineFile, write_atomic
 from coop.common.process.untrusted import read_bytes
-from coop.records.sinks import EPISODE, ROW, Kept, Run, ScalarSink
+from coop.records.sinks import EPISODE, ROW, Kept, RecordedRun, ScalarSink
 
 FOLDER = "tb"
 SETTINGS = "hyperparameters"  # the first tag of an event that each file begins with
@@ -35,7 +35,7 @@ class TensorBoardSink(ScalarSink):
 
     name = "tensorboard"
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RecordedRun) -> None:
         self._folder = run.path / FOLDER
         self._trial = f"{run.run_id:x}"
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from coop.common.errors import UsageError
-from coop.records.sinks import Kept, Run, ScalarSink
+from coop.records.sinks import Kept, RecordedRun, ScalarSink
 
 STEP = "env_step"
 
@@ -21,7 +21,7 @@ class WandbSink(ScalarSink):
 
     name, extra, library = "wandb", "wandb", "wandb"
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: RecordedRun) -> None:
         """Begin the run, or continue it where the id is known; its files are in wandb/ of the run directory.
 
         Raises:

@@ -43,7 +43,8 @@ def gather(
 
     obs, next_obs: [n, capacity, 4], and the other columns [n, capacity]. rows: int64 [n, batch]. x: [n, 2 batch, 4],
     written, obs before next_obs. taken: int64 [n, batch], and discounts [n, batch], powers of gamma, written.
-    seen: int64 [n, 4, batch], written: ids, ages, draws and weight lags. now: int64 [2], transitions and updates.
+    seen: int64 [n, 5, batch], written: ids, ages, draws, weight lags, terminations. now: int64 [2], transitions and
+    updates.
     """
     for k in range(rows.shape[0]):
         size = rows.shape[1]
@@ -60,6 +61,7 @@ def gather(
             seen[k, 1, b] = now[0] - 1 - ids[k, row]
             seen[k, 2, b] = reuse[k, row]
             seen[k, 3, b] = now[1] - versions[k, row]
+            seen[k, 4, b] = 1 if terminated[k, row] else 0
 
 
 @_jit

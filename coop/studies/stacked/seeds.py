@@ -191,7 +191,7 @@ class Seeds:
         restarts: list[list[tuple[int, bytes]]] = [[] for _ in self.runs]
         actions = np.zeros((count, len(self.runs)), np.int64)
         self._errors = np.zeros((sum(block.due), len(self.runs), size), np.float32)
-        self._seen = np.zeros((sum(block.due), len(self.runs), 4, size), np.int64)
+        self._seen = np.zeros((sum(block.due), len(self.runs), 5, size), np.int64)
         done = 0
         for place in range(count):
             player = self._role if self._player is None else self._player
@@ -312,9 +312,9 @@ class Seeds:
         """Hand the updates of the block to the telemetry."""
         for k, run in enumerate(self.runs):
             for number in range(len(self._errors[:done])):
-                ids, age, reuse, lag = self._seen[number, k]
+                ids, age, reuse, lag, terminated = self._seen[number, k]
                 run.trainer.telemetry.add_errors(self._errors[number, k])
-                run.trainer.telemetry._batches.append((age, reuse, lag, ids))
+                run.trainer.telemetry._batches.append((age, reuse, lag, terminated, ids))
         self._errors, self._seen = self._errors[done:], self._seen[done:]
 
     def _follow(self, actions: Ints, shown: NDArray[Any], restarts: Sequence[Sequence[tuple[int, bytes]]]) -> None:

@@ -120,7 +120,7 @@ class Tables:
         }  # fmt: skip
 
     def batch(self, k: int, rows: Ints, seen: Ints) -> Batch:
-        """A batch of table k as lockstep has it; rows int64 [batch], seen int64 [4, batch] of `read`."""
+        """A batch of table k as lockstep has it; rows int64 [batch], seen int64 [5, batch] of `read`."""
         size = len(rows)
         here, there = np.arange(2 * size, dtype=np.int32).reshape(2, size, 1)
         return Batch(
