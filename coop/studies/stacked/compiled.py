@@ -199,28 +199,6 @@ def temporal(
 
 
 @_jit
-def masked(
-    delta: Array,
-    h: Array,
-    bias: Array,
-) -> None:
-    """Delta [n, batch, units] <- delta * (h > 0); bias [n, units] <- its sums over the batch."""
-    zero, one = np.float32(0), np.float32(1)
-    for k in range(delta.shape[0]):
-        sums = bias[k]
-        for b in range(delta.shape[1]):
-            line, active = delta[k, b], h[k, b]
-            for i in range(line.shape[0]):
-                line[i] *= one if active[i] > zero else zero
-            if b == 0:
-                for i in range(line.shape[0]):
-                    sums[i] = line[i]
-            else:
-                for i in range(line.shape[0]):
-                    sums[i] += line[i]
-
-
-@_jit
 def summed(
     delta: Array,
     bias: Array,
@@ -234,6 +212,22 @@ def summed(
             line = delta[k, b]
             for i in range(sums.shape[0]):
                 sums[i] += line[i]
+
+
+@_jit
+def masked(
+    delta: Array,
+    h: Array,
+    bias: Array,
+) -> None:
+    """Delta [n, batch, units] <- delta * (h > 0); bias [n, units] <- its sums over the batch."""
+    zero, one = np.float32(0), np.float32(1)
+    for k in range(delta.shape[0]):
+        for b in range(delta.shape[1]):
+            line, active = delta[k, b], h[k, b]
+            for i in range(line.shape[0]):
+                line[i] *= one if active[i] > zero else zero
+    summed(delta, bias)
 
 
 @_jit

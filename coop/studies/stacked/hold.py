@@ -11,7 +11,6 @@ episode. The schema's metadata hold the SHA-256 of the plan, and of the grid.
 from __future__ import annotations
 
 import argparse
-import csv
 import hashlib
 import json
 import math
@@ -37,15 +36,21 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import merged
 from coop.common.settings.tables import load_tables, resolve
 from coop.lockstep.run import LockstepRun
+from coop.records.reading import read_csv, read_jsonl
 from coop.records.resumption import Start
 from coop.records.summaries import read_summary
-from coop.studies.stacked.packed import summary
+from coop.studies.stacked.packed import registered, summary
 from coop.studies.stacked.together import play_together
 
 HERE = Path("results/cartpole/hold")
 PLAN, GRID, FILE = HERE / "plan.md", HERE / "grid.toml", HERE / "hold.parquet"
 SEAL = b"hold"
 _KEPT = ("update", "policy_churn", "q_abs_mean", "q_bound")  # of metrics.jsonl
+
+
+def cell_name(variant: str, eviction: str, capacity: int, double: bool) -> str:
+    """Of a cell's files, and of its rows."""
+    return f"{variant}-{eviction}-{capacity}-{'double' if double else 'single'}"
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class HoldCell:
     @property
     def name(self) -> str:
         """Of its files."""
-        return f"{self.variant}-{self.eviction}-{self.capacity}-{'double' if self.double else 'single'}"
+        return cell_name(self.variant, self.eviction, self.capacity, self.double)
 
 
 @dataclass(frozen=True)
@@ -134,10 +139,8 @@ def _over(path: Path) -> bool:
 
 def _kept(seed: int, path: Path) -> dict[str, Any]:
     """What is kept of a run."""
-    with (path / "episodes.csv").open(encoding="utf-8") as file:
-        returns = [int(float(row["return"])) for row in csv.DictReader(file)]
-    with (path / "metrics.jsonl").open(encoding="utf-8") as file:
-        rows = [[json.loads(line).get(name, np.nan) for name in _KEPT] for line in file]
+    returns = [int(float(row["return"])) for row in read_csv(path / "episodes.csv")]
+    rows = [[row.get(name, np.nan) for name in _KEPT] for row in read_jsonl(path / "metrics.jsonl")]
     about = read_summary(path)
     finite, steps = str(about["exit"]).startswith("complete"), int(about["env_steps"])
     return {"seed": seed, "finite": finite, "steps": steps, "returns": returns, "rows": rows}
@@ -188,9 +191,8 @@ def _of(statistic: Callable[[Any], Any], values: NDArray[np.float32]) -> float:
 
 
 def sealed(plan: Path = PLAN, grid: Path = GRID) -> dict[str, str]:
-    """The SHA-256 of the plan as it began, and of the grid; what changes in the plan later stands below its heading."""
-    begun = plan.read_bytes().split(b"\n## Changes")[0]
-    return {"plan": hashlib.sha256(begun).hexdigest(), "grid": hashlib.sha256(grid.read_bytes()).hexdigest()}
+    """The SHA-256 of the plan as it began, and of the grid."""
+    return {"plan": registered(plan), "grid": hashlib.sha256(grid.read_bytes()).hexdigest()}
 
 
 def pack(grid: HoldGrid, out: Path, path: Path) -> int:
@@ -223,9 +225,7 @@ def packed_rows(path: Path = FILE) -> dict[str, list[dict[str, Any]]]:
         raise UsageError(f"{path}: of another plan or grid")
     found: dict[str, list[dict[str, Any]]] = {}
     for row in table.to_pylist():
-        name = "-".join(
-            (row["variant"], row["eviction"], str(row["capacity"]), "double" if row["double"] else "single")
-        )
+        name = cell_name(*(row[axis] for axis in ("variant", "eviction", "capacity", "double")))
         found.setdefault(name, []).append(row)
     return found
 

@@ -137,11 +137,15 @@ def pack(out: Path, path: Path, plan: Path) -> int:
         ]  # fmt: skip
     frame = pd.DataFrame(rows).astype({"area": np.float32, "recorded": np.float32, "last": np.float32})
     rates = (out / RATE_FILE).read_text() if (out / RATE_FILE).exists() else "{}"
-    begun = plan.read_bytes().split(b"\n## Changes")[0]  # what changes later stands below
-    about = {"plan": hashlib.sha256(begun).hexdigest(), "rates": json.loads(rates)}
+    about = {"plan": registered(plan), "rates": json.loads(rates)}
     table = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata({SEAL: json.dumps(about)})
     pq.write_table(table, path, compression="zstd", compression_level=22)
     return count
+
+
+def registered(plan: Path) -> str:
+    """The SHA-256 of a plan as it began; what changes later stands below its heading Changes."""
+    return hashlib.sha256(plan.read_bytes().split(b"\n## Changes")[0]).hexdigest()
 
 
 def unpacked(path: Path) -> tuple[pd.DataFrame, Mapping[str, Any]]:

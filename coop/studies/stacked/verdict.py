@@ -7,7 +7,6 @@ plan must be the one whose SHA-256 the packed file holds.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import math
 from collections.abc import Sequence
 from itertools import product
@@ -22,7 +21,7 @@ from scipy.special import stdtr
 
 from coop.studies.report.intervals import Interval, over_seeds
 from coop.studies.report.plots import Figure, Line, Panel, draw
-from coop.studies.stacked.packed import PLAN, unpacked
+from coop.studies.stacked.packed import PLAN, registered, unpacked
 
 FILE = Path("results/cartpole/edl/dissection.parquet")
 MARGIN = 3.0  # percent of none's mean area
@@ -245,8 +244,7 @@ class Data(NamedTuple):
 def load(path: Path = FILE) -> Data:
     """Raises ValueError if the plan beside the file is not the one that was in force."""
     rows, about = unpacked(path)
-    begun = path.with_name(PLAN).read_bytes().split(b"\n## Changes")[0]
-    if hashlib.sha256(begun).hexdigest() != about["plan"]:
+    if registered(path.with_name(PLAN)) != about["plan"]:
         raise ValueError(f"{path.with_name(PLAN)}: not the plan of {path.name}; changes go below its last heading")
     study, tuning, layers = (rows[rows["phase"] == name].dropna(axis=1, how="all") for name in PHASES)
     return Data(study, tuning, layers, about["rates"])
