@@ -40,6 +40,7 @@ from coop.common.process.processes import command
 
 LIMIT = 120  # seconds for a command, on a busy machine
 PAGE = 4096
+SHOWN = 200  # mutations between two lines of progress
 RUN = ("--total-steps=260", "--replay.capacity=100", "--replay.learning-starts=40", "--network.hidden=8")
 SIZED = ("--checkpoint-every=100", "--eval-every=100", "--eval-episodes=1")
 MUTATIONS = ("bit", "page", "cut", "other checkpoint", "other run")
@@ -164,6 +165,8 @@ def corrupt(
         if verdict in BAD:
             failures += 1
             print(f"{verdict}: {subject}/{file}, {mutation}; {reader.name}: {got.text[-1500:]}", flush=True)
+        if (number + 1) % SHOWN == 0 and number + 1 < count:
+            print(f"{number + 1:,} of {count:,}: {failures} silent, traceback, hang or changed", flush=True)
     print(table(told))
     print(f"{count:,} mutations in {time.monotonic() - began:.0f} s: {failures} silent, traceback, hang or changed")
     return 1 if failures else 0
