@@ -16,9 +16,9 @@ from pathlib import Path
 
 import torch
 
-from coop.studies.stacked import dissect
 from coop.studies.stacked.settings import Runs, StackSettings
 from coop.studies.stacked.stack import Stack
+from results.cartpole.edl import dissect
 
 JAX = {1: 13_631, 64: 548_809, 1024: 1_119_797}
 

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,6 +27,9 @@ os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"
 
 # What a user has trained is noted in the user's home; the tests' own is elsewhere.
 os.environ["XDG_STATE_HOME"] = str(Path(tempfile.gettempdir()) / f"coop-tests-{os.getpid()}")
+
+# Under nohup, children would ignore SIGHUP too, and some tests are about what it does.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # With their default threads, several processes starve each other.
 use_threads(1)

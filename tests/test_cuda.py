@@ -19,7 +19,7 @@ from coop.learner.edl import kernels
 from coop.learner.edl.completed import Jacobians
 from coop.learner.recorded import captured
 from coop.replay.table.table import Table
-from coop.studies.stacked.dissect import AGREE, agreement
+from results.cartpole.edl.dissect import AGREE, agreement
 
 pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU"),

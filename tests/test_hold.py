@@ -9,18 +9,18 @@ import pytest
 from scipy.stats import binomtest
 
 from coop.common.process.lifecycle import Stop
-from coop.studies.stacked import hold, hold_verdict
+from results.cartpole.hold import play, verdict
 
 SEEDS = range(500, 530)
 
 
 def test_the_grid_is_the_plans() -> None:
-    grid = hold.read_grid()
+    grid = play.read_grid()
     assert grid.seeds == tuple(SEEDS)
     cells = {(cell.variant, cell.eviction, cell.capacity, cell.double): cell for cell in grid.cells}
     sizes, methods = (50, 100, 300, 1000, 2000, 5000), ("dqn", "edql", "g-coop", "coop")
     first = set(product(methods, ("fifo", "reservoir"), sizes, (True,)))
-    second = set(product(("g-coop", *hold_verdict.OTHERS), ("fifo", "reservoir"), (300, 5000), (True, False)))
+    second = set(product(("g-coop", *verdict.OTHERS), ("fifo", "reservoir"), (300, 5000), (True, False)))
     assert len(grid.cells) == len(cells) == 88
     assert set(cells) == first | second
     for (variant, eviction, capacity, double), cell in cells.items():
@@ -41,7 +41,7 @@ def runs_of(well: dict[str, float]) -> pd.DataFrame:
         {"variant": name, "eviction": eviction, "capacity": capacity, "double": double, "seed": seed,
          "well": (seed * 7 + capacity) % 30 < 30 * share}
         for name, share in well.items()
-        for eviction, capacity, double in hold_verdict.SETTINGS
+        for eviction, capacity, double in verdict.SETTINGS
         for seed in SEEDS
     ]  # fmt: skip
     return pd.DataFrame(rows)
@@ -55,16 +55,16 @@ BAD, GOOD = 0.5, 1.0
     [
         ((), ["it takes two networks"]),
         (("one-actor",), ["it takes two networks"]),
-        (("copy-acts",), [hold_verdict.SAYS["copy-acts"], "it is who acts"]),
-        (("copy-acts", "one-actor", "half"), [hold_verdict.SAYS["copy-acts"], hold_verdict.SAYS["half"]]),
-        (("slow", "one-actor"), [hold_verdict.SAYS["slow"]]),
+        (("copy-acts",), [verdict.SAYS["copy-acts"], "it is who acts"]),
+        (("copy-acts", "one-actor", "half"), [verdict.SAYS["copy-acts"], verdict.SAYS["half"]]),
+        (("slow", "one-actor"), [verdict.SAYS["slow"]]),
     ],
 )
 def test_the_answer_names_what_is_as_good_as_two_networks(good: tuple[str, ...], answer: list[str]) -> None:
-    shares = {name: GOOD if name in good else BAD for name in hold_verdict.OTHERS} | {"g-coop": GOOD}
-    table = hold_verdict.parts(runs_of(shares))
+    shares = {name: GOOD if name in good else BAD for name in verdict.OTHERS} | {"g-coop": GOOD}
+    table = verdict.parts(runs_of(shares))
     assert table is not None
-    assert hold_verdict.answer(table) == answer
+    assert verdict.answer(table) == answer
     outcomes = dict(zip(table["g-coop minus"], table["outcome"], strict=True))
     assert {name for name, outcome in outcomes.items() if outcome == "as good"} == set(good)
     assert set(outcomes.values()) <= {"as good", "g-coop ends well more often"}
@@ -72,23 +72,23 @@ def test_the_answer_names_what_is_as_good_as_two_networks(good: tuple[str, ...],
 
 def test_a_rule_whose_cells_are_not_complete_says_nothing() -> None:
     runs = runs_of({"g-coop": GOOD, "dqn": BAD})
-    assert hold_verdict.parts(runs) is None
-    assert hold_verdict.evictions(runs) is None
+    assert verdict.parts(runs) is None
+    assert verdict.evictions(runs) is None
 
 
 def test_evictions_count_sizes_that_end_well_by_seed_and_pair() -> None:
     shares = {("g-coop", "fifo"): 0.5, ("dqn", "fifo"): 0.5, ("g-coop", "reservoir"): 1.0, ("dqn", "reservoir"): 0.2}
-    shares |= {("coop", eviction): 0.5 for eviction in hold_verdict.EVICTIONS}
-    shares |= {("edql", eviction): 0.5 for eviction in hold_verdict.EVICTIONS}
+    shares |= {("coop", eviction): 0.5 for eviction in verdict.EVICTIONS}
+    shares |= {("edql", eviction): 0.5 for eviction in verdict.EVICTIONS}
     rng = np.random.default_rng(0)
     rows = [
         {"variant": name, "eviction": eviction, "capacity": size, "double": True, "seed": seed,
          "well": bool(rng.random() < share)}
         for (name, eviction), share in shares.items()
-        for size, seed in product(hold_verdict.SIZES, SEEDS)
+        for size, seed in product(verdict.SIZES, SEEDS)
     ]  # fmt: skip
     runs = pd.DataFrame(rows)
-    table = hold_verdict.evictions(runs)
+    table = verdict.evictions(runs)
     assert table is not None
     found = table.set_index("rule")
     assert found["outcome"].to_dict()["reservoir"] == "two networks hold"
@@ -102,38 +102,38 @@ def test_evictions_count_sizes_that_end_well_by_seed_and_pair() -> None:
 @pytest.mark.parametrize(("hits", "count"), [(0, 30), (1, 30), (17, 30), (30, 30)])
 def test_intervals_of_shares_are_exact(hits: int, count: int) -> None:
     interval = binomtest(hits, count).proportion_ci(method="exact")
-    assert hold_verdict.exact(hits, count) == pytest.approx(tuple(interval))
+    assert verdict.exact(hits, count) == pytest.approx(tuple(interval))
 
 
 def test_mcnemar_counts_the_pairs_that_differ() -> None:
     one, other = [True] * 8 + [False, True, False], [False] * 8 + [True, True, False]
-    assert hold_verdict.mcnemar(one, other) == pytest.approx(20 / 512)
-    assert hold_verdict.mcnemar([True], [True]) == 1
+    assert verdict.mcnemar(one, other) == pytest.approx(20 / 512)
+    assert verdict.mcnemar([True], [True]) == 1
 
 
 @pytest.mark.timeout(300)
 def test_a_study_goes_on_where_it_stopped_and_is_packed(tmp_path: Path) -> None:
     pytest.importorskip("numba")
-    whole = hold.read_grid()
+    whole = play.read_grid()
     by_name = {cell.name: cell for cell in whole.cells}
     cells = (by_name["copy-acts-reservoir-300-double"], by_name["half-fifo-300-single"])
-    grid, stop = hold.HoldGrid(cells, (500, 501)), Stop()
+    grid, stop = play.HoldGrid(cells, (500, 501)), Stop()
     stop.set("stopped")
-    hold.play_cell(cells[0], cells[0].config, grid.seeds, tmp_path, stop)
+    play.play_cell(cells[0], cells[0].config, grid.seeds, tmp_path, stop)
     assert not list(tmp_path.glob("*.npz")), "no run is over"
-    hold.play(grid, tmp_path, Stop(), steps=450)
+    play.play(grid, tmp_path, Stop(), steps=450)
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{cell.name}.npz" for cell in cells]
-    assert hold.pack(grid, tmp_path, tmp_path / "packed.parquet") == 2
-    runs = hold_verdict.load(tmp_path / "packed.parquet")
+    assert play.pack(grid, tmp_path, tmp_path / "packed.parquet") == 2
+    runs = verdict.load(tmp_path / "packed.parquet")
     assert list(runs["seed"]) == [500, 501] * 2
     assert all(400 < sum(returns) <= 450 for returns in runs["returns"])
     assert runs["last"].to_list() == pytest.approx([np.mean(returns) for returns in runs["returns"]])
     assert not runs["well"].any()
     assert runs["finite"].all()
-    assert len(hold_verdict.cells(runs)) == 2
+    assert len(verdict.cells(runs)) == 2
     for path in tmp_path.glob("*.npz"):
         path.unlink()
-    hold.play(grid, tmp_path, Stop(), steps=450, packed=hold.packed_rows(tmp_path / "packed.parquet"))
+    play.play(grid, tmp_path, Stop(), steps=450, packed=play.packed_rows(tmp_path / "packed.parquet"))
     assert [path.name for path in tmp_path.iterdir()] == ["packed.parquet"], "packed cells are not played again"
-    assert hold.pack(grid, tmp_path, tmp_path / "packed.parquet") == 2
-    assert hold_verdict.load(tmp_path / "packed.parquet").equals(runs)
+    assert play.pack(grid, tmp_path, tmp_path / "packed.parquet") == 2
+    assert verdict.load(tmp_path / "packed.parquet").equals(runs)

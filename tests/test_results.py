@@ -19,8 +19,8 @@ from coop.studies.report.baseline import baseline_table, find_baseline
 from coop.studies.report.measures import shorter_runs
 from coop.studies.report.sources import open_source
 from coop.studies.report.study import Study, load_study
-from coop.studies.stacked import verdict
 from results import controls
+from results.cartpole.edl import verdict
 from results.minatar import registered
 
 RESULTS = Path(__file__).parent.parent / "results"

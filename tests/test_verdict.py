@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from coop.studies.stacked import packed, verdict
+from results.cartpole.edl import packed, verdict
 
 RESULTS = Path(__file__).parent.parent / "results"
 EDL = RESULTS / "cartpole" / "edl"

@@ -1,6 +1,6 @@
 """The rules of the dissection of error-driven learning (results/cartpole/edl/plan.md), applied to its packed runs.
 
-`python -m coop.studies.stacked.verdict` prints the tables of the page as Markdown, `figures` draws its figures; the
+`python -m results.cartpole.edl.verdict` prints the tables of the page as Markdown, `figures` draws its figures; the
 plan must be the one whose SHA-256 the packed file holds.
 """
 
@@ -21,7 +21,7 @@ from scipy.special import stdtr
 
 from coop.studies.report.intervals import Interval, over_seeds
 from coop.studies.report.plots import Figure, Line, Panel, draw
-from coop.studies.stacked.packed import PLAN, registered, unpacked
+from results.cartpole.edl.packed import PLAN, registered, unpacked
 
 FILE = Path("results/cartpole/edl/dissection.parquet")
 MARGIN = 3.0  # percent of none's mean area
@@ -346,7 +346,7 @@ def printed(table: pd.DataFrame) -> str:
 def main() -> None:
     """Print the tables, or draw the figures."""
     parser = argparse.ArgumentParser(
-        "python -m coop.studies.stacked.verdict", description=(__doc__ or "").split("\n")[0]
+        "python -m results.cartpole.edl.verdict", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument("what", nargs="?", default="tables", choices=["tables", "figures"])
     parser.add_argument("--file", type=Path, default=FILE)

@@ -1,6 +1,6 @@
 """The dissection of error-driven learning: which part of it does what, by optimizer and depth, on CartPole.
 
-    python -m coop.studies.stacked.dissect --out runs/dissect --device cuda --minutes 6
+    python -m results.cartpole.edl.dissect --out runs/dissect --device cuda --minutes 6
 
 Conditions x optimizers x depths, each cell with the learning rate that the tuning chose for it. It goes on where it
 stopped: every stack of runs is a file in --out. The rules are those of
@@ -26,9 +26,9 @@ import torch
 from numpy.typing import NDArray
 
 from coop.common.numbers import running_mean
-from coop.studies.stacked.diagnostics import NAMES, measure
 from coop.studies.stacked.settings import OPTIMIZERS, Runs, StackSettings
 from coop.studies.stacked.stack import Episodes, Stack
+from results.cartpole.edl.layers import NAMES, measure
 
 S = 0.1
 CONDITIONS: dict[str, dict[str, Any]] = {
@@ -257,7 +257,7 @@ def run_slow(plan: Plan, first: int, every: int, deadline: float) -> int:
 def _worker(plan: Plan, number: int, deadline: float) -> subprocess.Popen[bytes]:
     """A process that plays its share of weight-gradient's seeds, and ends by itself at the deadline."""
     command = [
-        sys.executable, "-m", "coop.studies.stacked.dissect", "--out", str(plan.out), "--conditions", SLOW,
+        sys.executable, "-m", "results.cartpole.edl.dissect", "--out", str(plan.out), "--conditions", SLOW,
         "--depths", *map(str, plan.depths), "--steps", str(plan.steps), "--width", str(plan.width),
         "--slow-seeds", str(plan.slow_seeds), "--share", str(number), str(plan.workers),
         "--minutes", str((deadline - time.monotonic()) / 60),
@@ -286,7 +286,7 @@ def warm(plan: Plan) -> list[str]:
     """
     began = time.monotonic()
     code = (
-        f"from coop.studies.stacked.dissect import *; print(agreement(sys.argv[1], {plan.width}, {plan.precision!r}))"
+        f"from results.cartpole.edl.dissect import *; print(agreement(sys.argv[1], {plan.width}, {plan.precision!r}))"
     )
     names = [name for name in plan.conditions if name not in (SLOW, "transform-normal")]
     started = {
@@ -389,7 +389,7 @@ def main() -> None:
     if 0 in plan.seeds:
         plan = fitted(plan, deadline - time.monotonic())
     left = run(plan, deadline)
-    from coop.studies.stacked.packed import pack  # noqa: PLC0415 (needs the extra "report")
+    from results.cartpole.edl.packed import pack  # noqa: PLC0415 (needs the extra "report")
 
     packed = args.out / "dissection.parquet"
     print(f"{packed}: {pack(args.out, packed, PLAN)} runs; {left} stacks left", flush=True)

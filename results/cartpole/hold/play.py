@@ -1,7 +1,7 @@
 """The study of results/cartpole/hold/plan.md: why two networks hold on CartPole.
 
-    python -m coop.studies.stacked.hold runs/hold     # plays what is not there yet, and goes on where it stopped
-    python -m coop.studies.stacked.hold runs/hold --pack results/cartpole/hold/hold.parquet     # adds what is complete
+    python -m results.cartpole.hold.play runs/hold     # plays what is not there yet, and goes on where it stopped
+    python -m results.cartpole.hold.play runs/hold --pack results/cartpole/hold/hold.parquet     # adds what is complete
 
 The seeds of a cell are played side by side, each in a run directory as `coop-lockstep` leaves it; once all are over,
 they become one file of the cell. A packed row is a run, with all its returns; a return of CartPole is the length of its
@@ -39,8 +39,8 @@ from coop.lockstep.run import LockstepRun
 from coop.records.reading import read_csv, read_jsonl
 from coop.records.resumption import Start
 from coop.records.summaries import read_summary
-from coop.studies.stacked.packed import registered, summary
 from coop.studies.stacked.together import play_together
+from results.cartpole.edl.packed import registered, summary
 
 HERE = Path("results/cartpole/hold")
 PLAN, GRID, FILE = HERE / "plan.md", HERE / "grid.toml", HERE / "hold.parquet"
@@ -116,7 +116,7 @@ def play_cell(cell: HoldCell, config: RunConfig, seeds: tuple[int, ...], out: Pa
         for seed, path in paths.items():
             if not _over(path):
                 path.mkdir(parents=True, exist_ok=True)
-                run = LockstepRun(replace(config, seed=seed), path, "coop.studies.stacked.hold", Start(resume=True))
+                run = LockstepRun(replace(config, seed=seed), path, "results.cartpole.hold.play", Start(resume=True))
                 stack.callback(run.close)
                 runs.append(run)
         if runs:
@@ -232,11 +232,11 @@ def packed_rows(path: Path = FILE) -> dict[str, list[dict[str, Any]]]:
 
 def main() -> None:
     """Entry point."""
-    run_main("coop.studies.stacked.hold", _run)
+    run_main("results.cartpole.hold.play", _run)
 
 
 def _run() -> None:
-    parser = argparse.ArgumentParser("python -m coop.studies.stacked.hold", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser("python -m results.cartpole.hold.play", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("out", type=Path, help="folder of the cells")
     parser.add_argument("--pack", type=Path, metavar="FILE", help="write the complete cells as Parquet, and play none")
     args = parser.parse_args()

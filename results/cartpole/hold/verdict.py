@@ -1,6 +1,6 @@
 """The rules of results/cartpole/hold/plan.md, applied to its packed runs: E, P and the answer.
 
-`python -m coop.studies.stacked.hold_verdict` prints the tables of the complete cells as Markdown; a rule whose
+`python -m results.cartpole.hold.verdict` prints the tables of the complete cells as Markdown; a rule whose
 cells are not says so. The plan and the grid must be those whose SHA-256 the packed file holds.
 """
 
@@ -22,8 +22,8 @@ from scipy.special import betaincinv, stdtr
 from scipy.stats import binomtest
 
 from coop.studies.report.intervals import over_seeds
-from coop.studies.stacked.hold import FILE, SEAL, sealed
-from coop.studies.stacked.verdict import holm, printed
+from results.cartpole.edl.verdict import holm, printed
+from results.cartpole.hold.play import FILE, SEAL, sealed
 
 ENDS_WELL, LEVEL, MARGIN = 195, 0.05, 0.5  # the margin in settings of eight
 SIZES = (50, 100, 300, 1000, 2000, 5000)
@@ -187,7 +187,7 @@ def settings_of(runs: pd.DataFrame) -> pd.DataFrame:
 def main() -> None:
     """Print the tables and the answer."""
     parser = argparse.ArgumentParser(
-        "python -m coop.studies.stacked.hold_verdict", description=(__doc__ or "").split("\n")[0]
+        "python -m results.cartpole.hold.verdict", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument("--file", type=Path, default=FILE)
     runs = load(parser.parse_args().file)
