@@ -9,20 +9,20 @@ import numpy as np
 from coop.actors.policy import EpsilonGreedy
 from coop.common.errors import JoinError
 from coop.common.imports import check_allowed
-from coop.common.messaging.messages.join import Joined
+from coop.common.messaging.messages.join import JoinReply
 from coop.common.networks.acting import acting_network
 
 
-def make_policy(joined: Joined, allow_import: Collection[str], rng: np.random.Generator) -> EpsilonGreedy:
+def make_policy(reply: JoinReply, allow_import: Collection[str], rng: np.random.Generator) -> EpsilonGreedy:
     """A policy with networks of the run's layout, whose parameters the learner will send.
 
     Raises:
         JoinError: the run needs a module that this process may not import, or this process builds another layout than
             the learner does.
     """
-    for field, path in joined.config.imports.items():
+    for field, path in reply.config.imports.items():
         check_allowed(path, allow_import, field)
-    first, second = (acting_network(joined.config.network, joined.spec) for _ in range(2))
-    if first.layout_digest() != joined.layout:
-        raise JoinError(f"network layout here {first.layout_digest()}, the learner's {joined.layout}")
-    return EpsilonGreedy((first, second), joined.spec, rng)
+    first, second = (acting_network(reply.config.network, reply.spec) for _ in range(2))
+    if first.layout_digest() != reply.layout:
+        raise JoinError(f"network layout here {first.layout_digest()}, the learner's {reply.layout}")
+    return EpsilonGreedy((first, second), reply.spec, rng)

@@ -43,7 +43,7 @@ class ActorService:
         settings = config.actor
         self._player = Player(env, policy, partial(schedules.epsilon, settings))
         self._weights = WeightsFollower(node, policy)
-        self._inserts = InsertClient(route, stop, settings.window * env.num_envs, self._publish_status)
+        self._inserts = InsertClient(route, stop, settings.max_in_flight * env.num_envs, self._publish_status)
         self._segments = SegmentAssembler(
             env.spec,
             env.num_envs,

@@ -34,7 +34,7 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.types import Array, Batch, EnvSpec
 from coop.learner.edl.arrays import convert_like
-from coop.learner.edl.beside import Branches
+from coop.learner.edl.branches import Branches
 from coop.learner.given import Given
 from coop.learner.losses import LOSSES, Values, output_error, td_errors
 from coop.learner.methods.rule import UpdateRule

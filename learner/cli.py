@@ -33,7 +33,7 @@ def _run() -> None:
         LearnerOptions, "coop-learner", "Train the networks of a run; the other roles join it through this process."
     )
     if options.restart and not options.resume:
-        raise UsageError("--restart: needs --resume; it applies where that finds no epoch to continue from")
+        raise UsageError("--restart: needs --resume; it applies where that finds no checkpoint to continue from")
     for flag, address in (("--prometheus", options.prometheus), ("--health", options.health)):
         if address:
             check_can_listen(flag, address)

@@ -41,7 +41,7 @@ class MemberTracker:
         self._away: set[int] = set()
         self._lost: dict[int, float] = {}  # members away that no other has replaced, and since when
 
-    def joined(self, request: Join, name: str) -> None:
+    def add(self, request: Join, name: str) -> None:
         """Note a join: the first of a process, or one after the learner's restart."""
         with self._lock:
             who = request.incarnation

@@ -42,10 +42,10 @@ def _run() -> None:
     stop.on_signals()
     request = Join("watch", new_incarnation(), [])  # asks for the replay service's endpoints
     with Node(open_session((), options.connect, options.zenoh_config), options.run, "watch", 0) as node:
-        joined = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
-    if joined is None:
+        reply = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
+    if reply is None:
         return
-    endpoints = (*options.connect, *joined.replay_endpoints)
+    endpoints = (*options.connect, *reply.replay_endpoints)
     with Node(open_session((), endpoints, options.zenoh_config), options.run, "watch", 0) as node:
         now = _ask(node, LimitsQuestion().encode(node.run))
         if options.ratio is not None or options.tolerance is not None:

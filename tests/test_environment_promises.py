@@ -322,7 +322,7 @@ def test_the_arguments_of_an_evaluation_are_checked(arguments: dict[str, Any], w
 def trained(tmp_path_factory: pytest.TempPathFactory) -> coop.SavedRun:
     """A short run on pictures."""
     path = tmp_path_factory.mktemp("runs") / "catch"
-    settings: Any = {**SHORT, "network": {"kind": "mlp", "hidden": [8]}, "actor": {"envs": 1}}
+    settings: Any = {**SHORT, "network": {"kind": "mlp", "hidden": [8]}, "actor": {"num_envs": 1}}
     coop.train("catch", run_dir=path, env={"stack": 1}, **settings).wait()
     return coop.load(path)
 

@@ -111,7 +111,7 @@ def _schemas() -> dict[str, Mapping[str, Any]]:
     for name, schema in whole["properties"].items():
         if "$ref" in schema:
             found[name] = whole["$defs"][schema["$ref"].rpartition("/")[2]]["properties"]
-        elif name not in ("own", "methods"):
+        elif name not in ("method_settings", "methods"):
             found[""] = {**found[""], name: schema}
     for method in map(METHODS.get, METHODS.names()):
         if method.settings is not None:

@@ -168,11 +168,11 @@ class Node:
         """
         with self._counting:
             self.bad_messages += 1
-            told = self._refusals.setdefault(place, set())
-            if error.field in told or len(told) >= MOST_REFUSALS:
+            reported = self._refusals.setdefault(place, set())
+            if error.field in reported or len(reported) >= MOST_REFUSALS:
                 return
-            told.add(error.field)
-            last = "; further ones are only counted" if len(told) == MOST_REFUSALS else ""
+            reported.add(error.field)
+            last = "; further ones are only counted" if len(reported) == MOST_REFUSALS else ""
         text = str(error)[:LONGEST_REFUSAL].encode("unicode_escape").decode()  # it holds what the sender wrote
         say(stamped(f"refused a message at {place}: {text}{last}"))
 

@@ -94,7 +94,7 @@ class Stop:
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # under nohup, output may go away
             on_output_gone(lambda: self.set("interrupted", exit_status=status_after(signal.SIGPIPE)))
 
-    def leave(self) -> None:
+    def raise_for_status(self) -> None:
         """End the process with the status that the stop requires; return if that is 0.
 
         Raises:

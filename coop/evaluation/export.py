@@ -34,10 +34,10 @@ _ARGUMENTS: dict[type[nn.Module], tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Exported:
-    """What has been written: names of files, in order; epoch and acting network (1 or 2); why there is no ONNX."""
+    """What has been written: names of files, in order; checkpoint and acting network (1 or 2); why there is no ONNX."""
 
     names: list[str]
-    epoch: int
+    checkpoint: int
     acting: int
     without_onnx: str
 
@@ -67,7 +67,7 @@ def export(run_dir: Path, out: Path) -> Exported:
         _write(out, contents)
     except OSError as error:
         raise RunError(f"{error.filename or out}: {error.strerror or error}") from error
-    return Exported(list(contents), checkpoint.epoch, checkpoint.acting + 1, without_onnx)
+    return Exported(list(contents), checkpoint.number, checkpoint.acting + 1, without_onnx)
 
 
 def _card(config: RunConfig, checkpoint: Checkpoint) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def _card(config: RunConfig, checkpoint: Checkpoint) -> dict[str, Any]:
         "method": config.method,
         "seed": config.seed,
         "env_steps": checkpoint.env_steps,
-        "updates": checkpoint.epoch,
+        "updates": checkpoint.number,
         "acting_network": checkpoint.acting + 1,
         "return_mean_100": float(np.mean(returns)) if returns else None,
     }

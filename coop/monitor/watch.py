@@ -69,9 +69,7 @@ class RunStatus:
     def why_nothing(self, waited: float) -> str:
         """Why there has been no status for `waited` seconds, in words."""
         if self.learner_is_there():
-            return (
-                f"the learner of run {self.run!r} has told nothing within {waited:g} s; it may wait for the other roles"
-            )
+            return f"the learner of run {self.run!r} has sent no status in {waited:g} s; it may wait for other roles"
         return no_learner(self._node, (self._endpoint,), waited)
 
     def follow_stop(self, stop: Stop) -> None:
@@ -245,7 +243,7 @@ def _print_once(status: RunStatus, options: WatchOptions, ctrl_c: Stop) -> None:
     """Wait for a status, and print it."""
     while status.learner is None:
         if ctrl_c.wait(TICK):
-            ctrl_c.leave()
+            ctrl_c.raise_for_status()
         status.refresh()
         _check(status, options)
     if options.json:

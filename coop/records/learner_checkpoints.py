@@ -19,7 +19,7 @@ from coop.records.checkpoints import LEARNER, Manifest, begin, checkpoint_path, 
 from coop.records.resumption import Whole, survey
 
 
-def save_epoch(
+def save_checkpoint(
     run_dir: Path,
     run_id: int,
     number: int,
@@ -54,7 +54,7 @@ def save_epoch(
     return path
 
 
-def newest_epoch(run_dir: Path, settings: str = "") -> Whole | None:
+def newest_checkpoint(run_dir: Path, settings: str = "") -> Whole | None:
     """The newest whole checkpoint of a run, with the learner's state, for readers; None if there is none.
 
     A warning names those that were passed over. settings: see `survey`.

@@ -54,12 +54,12 @@ class StreamAgent:
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
         """Raise UsageError for a network that the method can't train."""
-        assert isinstance(config.own, StreamQSettings)
+        assert isinstance(config.method_settings, StreamQSettings)
         self.config = config
         self.spec = spec
         self.loss = LOSSES["squared"]
         self.updates = 0
-        self._settings = config.own
+        self._settings = config.method_settings
         self.device = torch.device("cpu")
         self.rule = UpdateRule(config, np.random.default_rng(0))  # which draws no numbers
         self._network = make_network(config, spec, 0, self.device)

@@ -20,16 +20,16 @@ from coop.common.settings.tables import to_tables, validated
 from coop.common.types import EnvSpec
 
 Endpoints = Annotated[list[Name], Meta(max_length=16)]
-MOST_EPOCHS = 16  # epochs in one request
-Epochs = Annotated[list[Updates], Meta(max_length=MOST_EPOCHS)]
+MOST_CHECKPOINTS = 16  # checkpoints in one request
+Checkpoints = Annotated[list[Updates], Meta(max_length=MOST_CHECKPOINTS)]
 
 
 class Join(Body, frozen=True):
     """A process asks to be part of the run.
 
     endpoints: where others can reach it; empty for actors, and if a replay service only asks which run this is.
-    index: the index from an earlier join, or -1. epochs: the epochs that a replay service can restore, in ascending
-    order. serving: its table is in memory already and can continue from any epoch of the learner's.
+    index: the index from an earlier join, or -1. checkpoints: those that a replay service can restore, in ascending
+    order. serving: its table is in memory already and can continue from any checkpoint of the learner's.
     origin: its host and process id.
     """
 
@@ -39,24 +39,24 @@ class Join(Body, frozen=True):
     incarnation: Incarnation
     endpoints: Endpoints
     index: Annotated[int, Meta(ge=-1, le=MAX_COUNT)] = -1
-    epochs: Epochs = msgspec.field(default_factory=list)
+    checkpoints: Checkpoints = msgspec.field(default_factory=list)
     serving: bool = False
     origin: Origin = msgspec.field(default_factory=Origin.here)
 
 
-class Joined(Body, frozen=True):
+class JoinReply(Body, frozen=True):
     """All that a role needs to take part.
 
     replay_endpoints: where the replay service listens; empty while none has joined.
     index: number of processes of this role that joined the run before (makes actors' random streams distinct).
     layout: digest of the network layout, which the role compares with its own.
     run_id: random id from the run's beginning, which distinguishes it from other runs of the same name.
-    epoch: number of the newest finished epoch, which a replay service restores; 0 if there is none.
+    checkpoint: number of the newest finished checkpoint, which a replay service restores; 0 if there is none.
     anew: the training starts again from the beginning, so a replay service discards its data of the run.
     learner, replay: their hosts and process ids; `replay` is None while no replay service has joined.
     """
 
-    kind: ClassVar[str] = "joined"
+    kind: ClassVar[str] = "join-reply"
 
     config: RunConfig
     spec: EnvSpec
@@ -64,7 +64,7 @@ class Joined(Body, frozen=True):
     index: Count
     replay_endpoints: Endpoints
     run_id: Incarnation
-    epoch: Updates
+    checkpoint: Updates
     anew: bool = False
     learner: Origin = msgspec.field(default_factory=Origin.here)
     replay: Origin | None = None

@@ -41,7 +41,7 @@ def paper_table(study: Study) -> ResultTable:
             env if axis == "env.id" else value for axis, value in zip(study.axes, study.reference, strict=True)
         )
         for method in study.methods:
-            if runs := study.of_beside(method, setting):
+            if runs := study.compared(method, setting):
                 rows.append([env, method, *column.get(method, (None, None)), *_over_runs(runs), *_lengths(runs)])
     columns = [
         *("environment", "method", "paper mean", "paper sd"),
@@ -54,8 +54,8 @@ def paper_table(study: Study) -> ResultTable:
         "over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval over seeds."
         + (f" Runs at {at}, the values nearest to the preset's." if at else "")
     )
-    beside = {"paper mean": ["paper sd"], **OVER_RUNS}
-    return ResultTable("table1", "The paper's Table 1 beside these runs", columns, rows, note, beside)
+    spreads = {"paper mean": ["paper sd"], **OVER_RUNS}
+    return ResultTable("table1", "The paper's Table 1 beside these runs", columns, rows, note, spreads)
 
 
 def settings_table(study: Study) -> ResultTable:
@@ -103,8 +103,8 @@ def breaking_table(study: Study) -> ResultTable:
         "low and high: its 95 % bootstrap interval over seeds. gaps: some larger capacity falls below 95 %. Where the "
         "return at the largest is poor, nothing was learnt that could break. Empty: no run at the largest."
     )
-    beside = {"breaking point": ["low", "high"]}
-    return ResultTable("breaking_points", "Breaking points", columns, rows, note, beside)
+    spreads = {"breaking point": ["low", "high"]}
+    return ResultTable("breaking_points", "Breaking points", columns, rows, note, spreads)
 
 
 def aggregate_table(study: Study) -> ResultTable:
@@ -128,8 +128,8 @@ def improvement_table(study: Study) -> ResultTable:
         values = [float(interval.value[0]), float(interval.low[0]), float(interval.high[0])]
         rows.append([x, y, *values, len(scores[x]), len(scores[y]), scores[x].shape[1]])
     columns = ["x", "y", "P(x > y)", "low", "high", "seeds of x", "seeds of y", "settings"]
-    note, beside = _matrix_note(study), {"P(x > y)": ["low", "high"]}
-    return ResultTable("improvement", "Probability of improvement", columns, rows, note, beside)
+    note, spreads = _matrix_note(study), {"P(x > y)": ["low", "high"]}
+    return ResultTable("improvement", "Probability of improvement", columns, rows, note, spreads)
 
 
 def runs_table(study: Study) -> ResultTable:

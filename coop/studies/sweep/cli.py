@@ -21,13 +21,13 @@ from coop.common.process.limits import cores
 from coop.common.suggestions import closest, refusal
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.studies.sweep import slurm
-from coop.studies.sweep.beside import side_by_side
 from coop.studies.sweep.display import SweepDisplay
 from coop.studies.sweep.executor import Executor
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
 from coop.studies.sweep.grid import Grid, GridFile, load_grid
 from coop.studies.sweep.local import LocalProcesses
 from coop.studies.sweep.runner import Runner
+from coop.studies.sweep.stacking import stacks_of
 
 TICK = 0.2  # seconds
 
@@ -90,10 +90,10 @@ def _run() -> None:
 
 def _executor(options: SweepOptions, grid: GridFile, folders: Sequence[CellFolder]) -> AbstractContextManager[Executor]:
     if options.dask is None:
-        beside, reasons = side_by_side(grid, folders, options.jobs or cores(), options.stack)
+        stacks, reasons = stacks_of(grid, folders, options.jobs or cores(), options.stack)
         for line in reasons if (options.stack or 1) > 1 else ():
             say(f"--stack: {line}")
-        return nullcontext(LocalProcesses(grid, options.jobs, beside=beside))
+        return nullcontext(LocalProcesses(grid, options.jobs, stacks=stacks))
     from coop.studies.sweep.dask import workers_at  # noqa: PLC0415 - takes a second, and may not be installed
 
     return workers_at(options.dask, grid, options.jobs)

@@ -222,8 +222,8 @@ def _check_environments(cells: list[Cell]) -> None:
 
 
 def _check_lockstep(config: RunConfig) -> None:
-    if config.actor.envs != 1:
-        raise UsageError(f"actor.envs = {config.actor.envs}: lockstep cells play one emulator; fix it to 1")
+    if config.actor.num_envs != 1:
+        raise UsageError(f"actor.num_envs = {config.actor.num_envs}: lockstep cells play one emulator; fix it to 1")
 
 
 def _check_collisions(cells: list[Cell]) -> None:

@@ -10,13 +10,13 @@ from coop.studies.stacked.eligible import why_not
 from coop.studies.sweep.folder import CellFolder
 from coop.studies.sweep.grid import GridFile
 
-Beside = Mapping[str, tuple[CellFolder, ...]]
+Stacks = Mapping[str, tuple[CellFolder, ...]]
 """The cells that share a process, by the name of each."""
 
 MOST = 32  # cells of a process, if nothing else is asked for
 
 
-def side_by_side(
+def stacks_of(
     grid: GridFile, cells: Sequence[CellFolder], jobs: int, most: int | None
 ) -> tuple[dict[str, tuple[CellFolder, ...]], list[str]]:
     """The cells that each cell shares a process with, itself among them, by its name; and why others are alone.
