@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from coop.common.imports import importing
 from coop.common.process import cli
-from coop.common.process.importing import importing
 from coop.common.process.lifecycle import run_main
 from coop.common.settings.options import HealthOptions, RoleOptions
 

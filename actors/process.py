@@ -8,12 +8,12 @@ import numpy as np
 import zenoh
 
 from coop.actors.cli import ActorOptions
-from coop.actors.joined import make_policy
 from coop.actors.service import ActorService
+from coop.actors.weights import make_policy
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import JoinError
 from coop.common.messaging.joining import Membership, join, leave_run
-from coop.common.messaging.messages.join import Join, JoinReply
+from coop.common.messaging.messages.control import Join, JoinReply
 from coop.common.messaging.route import ReplayRoute, RoutedReplay, open_client
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation

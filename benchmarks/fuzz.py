@@ -31,8 +31,7 @@ from coop.common.errors import BadMessage, CoopError, RunError
 from coop.common.messaging import wire
 from coop.common.messaging.joining import join
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.checkpoint import Snapshot, Written
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join, Snapshot, Written
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, Pending, Refused, new_incarnation

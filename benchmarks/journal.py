@@ -21,7 +21,7 @@ from made_up import ATARI, segments
 
 from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.checkpoint import Snapshot, Written
+from coop.common.messaging.messages.control import Snapshot, Written
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
 from coop.common.process.lifecycle import Stop

@@ -14,7 +14,7 @@ import zenoh
 from coop.common.errors import RunError
 from coop.common.messaging import wire
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.transport import Node
 from coop.common.process.processes import ChildProcess, command
 from coop.records.summaries import read_summary

@@ -26,8 +26,8 @@ from coop.common.messaging.joining import RETRY_PAUSE
 from coop.common.messaging.keys import join_key, replay_key, role_key, run_key, status_key, weights_key
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.messages.control import Join, Leave
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.messages.join import Join, Leave
 from coop.common.messaging.messages.status import ActorStatus
 from coop.common.messaging.messages.weights import Current, Role
 from coop.common.messaging.session import open_session

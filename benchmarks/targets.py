@@ -24,14 +24,11 @@ from coop.common.bounds import (
 from coop.common.errors import BadMessage
 from coop.common.messaging.keys import evaluations_key, join_key, replay_key, role_key, stop_key, weights_key
 from coop.common.messaging.members import Origin
-from coop.common.messaging.messages.checkpoint import Snapshot, Written
+from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Limit, LimitsQuestion, Snapshot, Written
 from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
 from coop.common.messaging.messages.insert import SegmentReader, encode_segment
-from coop.common.messaging.messages.join import Join, JoinReply
-from coop.common.messaging.messages.limits import Limit, LimitsQuestion
 from coop.common.messaging.messages.sample import DrawRequest
-from coop.common.messaging.messages.stats import StatsQuestion
-from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.status import StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message

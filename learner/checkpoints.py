@@ -10,7 +10,7 @@ from typing import Any
 from coop.common.errors import CoopError, RunError
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Retry
-from coop.common.messaging.messages.checkpoint import Snapshot, Written
+from coop.common.messaging.messages.control import Snapshot, Written
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.messaging.wire import Message

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from coop.common.envs.make import env_spec
 from coop.common.errors import UsageError
-from coop.common.process.importing import importing
+from coop.common.imports import importing
 from coop.common.process.lifecycle import run_main
 from coop.common.process.ports import check_can_listen
 from coop.common.settings.capacity import check_messages

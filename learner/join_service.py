@@ -11,14 +11,13 @@ from coop.common.errors import BadMessage
 from coop.common.messaging.keys import join_key
 from coop.common.messaging.members import JOINING, ROLES, Origin
 from coop.common.messaging.messages.answers import Retry
-from coop.common.messaging.messages.join import Farewell, Join, JoinReply, Leave
+from coop.common.messaging.messages.control import Farewell, Join, JoinReply, Leave
 from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import to_tables
 from coop.common.types import EnvSpec
-from coop.learner.members import MemberTracker
-from coop.learner.roster import AlreadyServed, Roster
+from coop.learner.roster import AlreadyServed, MemberTracker, Roster
 from coop.learner.shared_checkpoints import SharedCheckpoints
 
 

@@ -9,10 +9,9 @@ import msgspec
 
 from coop.common.errors import RunError
 from coop.common.messaging.keys import replay_key, stop_key
+from coop.common.messaging.messages.control import EndOfRun
 from coop.common.messaging.messages.evaluate import EvaluationRow
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
-from coop.common.messaging.messages.status import LearnerStatus
-from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.status import LearnerStatus, ReplayStats, StatsQuestion
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.process.console import Console, progress_line

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Sequence
 
 from coop.common.errors import UsageError
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join
 from coop.common.process.lifecycle import Stop
 
 LOOK_EVERY = 0.1  # seconds

@@ -12,7 +12,7 @@ from coop.common.errors import RunError
 from coop.common.messaging.endpoints import check_endpoints
 from coop.common.messaging.joining import Membership, join, leave_run
 from coop.common.messaging.links import locators
-from coop.common.messaging.messages.join import MOST_CHECKPOINTS, Join, JoinReply
+from coop.common.messaging.messages.control import MOST_CHECKPOINTS, Join, JoinReply
 from coop.common.messaging.presence import LEASE
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from coop.common.errors import RunError
 from coop.common.messaging.joining import join
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.join import Join
-from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from coop.common.messaging.messages.control import Join, Limit, Limits, LimitsQuestion
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process import cli

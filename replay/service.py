@@ -19,12 +19,10 @@ from coop.common.errors import BadMessage, CoopError, RunError
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack, Retry
-from coop.common.messaging.messages.checkpoint import Snapshot, Written
+from coop.common.messaging.messages.control import Limit, Limits, LimitsQuestion, Snapshot, Written
 from coop.common.messaging.messages.insert import SegmentReader
-from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
 from coop.common.messaging.messages.sample import DrawRequest, Draws, Memory, encode_batch, encode_named
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
-from coop.common.messaging.messages.status import Ratio, ReplayStatus
+from coop.common.messaging.messages.status import Ratio, ReplayStats, ReplayStatus, StatsQuestion
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.messaging.wire import Message
 from coop.common.process.console import Console

@@ -7,7 +7,7 @@ import pytest
 
 from coop.common.errors import UsageError
 from coop.common.messaging import wire
-from coop.common.messaging.messages.join import JoinReply
+from coop.common.messaging.messages.control import JoinReply
 from coop.common.process.cli import parse
 from coop.common.settings.config import RunConfig
 from coop.common.settings.environment import EnvSettings

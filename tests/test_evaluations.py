@@ -21,9 +21,8 @@ from coop.common.envs.make import make_vector_env
 from coop.common.errors import UsageError
 from coop.common.messaging.keys import evaluations_key, stop_key
 from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.messages.control import EndOfRun, JoinReply
 from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow
-from coop.common.messaging.messages.join import JoinReply
-from coop.common.messaging.messages.stop import EndOfRun
 from coop.common.messaging.transport import Node, Refused
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop

@@ -23,8 +23,7 @@ from coop.common.networks.network import FlatNetwork, build_network, sample_obse
 from coop.common.settings.tables import resolve
 from coop.common.types import EnvSpec
 from coop.evaluation import export_cli
-from coop.evaluation.export import export
-from coop.evaluation.export_onnx import NotExportedError, onnx_model
+from coop.evaluation.export import NotExportedError, export, onnx_model
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_directory import RunDirectory
 from website.pages import blocks

@@ -8,9 +8,9 @@ from samples import await_service, make_segment, until
 
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Ack, Retry
-from coop.common.messaging.messages.checkpoint import Snapshot
+from coop.common.messaging.messages.control import Snapshot
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, Refused, new_incarnation

@@ -14,8 +14,7 @@ from typing import Any, get_type_hints
 
 import pytest
 
-from coop.common.process.cli import PACKAGE
-from coop.common.process.help import EXIT_STATUSES
+from coop.common.process.cli import EXIT_STATUSES, PACKAGE
 from coop.common.settings.methods import METHODS
 from coop.records.run_options import COMMON, RunOptions, parse_run
 from website.reference import COMMANDS as OPTIONS

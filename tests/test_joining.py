@@ -13,10 +13,8 @@ from coop.common.messaging import joining, wire
 from coop.common.messaging.joining import difference, join, leave_run
 from coop.common.messaging.keys import join_key, replay_key
 from coop.common.messaging.members import Origin
-from coop.common.messaging.messages.join import Join, JoinReply, Leave
-from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Leave, Limit, Limits, LimitsQuestion
 from coop.common.messaging.messages.sample import DrawRequest
-from coop.common.messaging.messages.stop import EndOfRun
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, Refused

@@ -30,11 +30,9 @@ from coop.common.errors import BadMessage, RunError
 from coop.common.messaging import wire
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.answers import Ack, Error, Retry
-from coop.common.messaging.messages.checkpoint import Snapshot, Written
+from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Leave, Limit, Limits, Snapshot, Written
 from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
 from coop.common.messaging.messages.insert import SegmentReader, encode_segment
-from coop.common.messaging.messages.join import Join, JoinReply, Leave
-from coop.common.messaging.messages.limits import Limit, Limits
 from coop.common.messaging.messages.sample import (
     BatchReader,
     Drawn,
@@ -44,8 +42,7 @@ from coop.common.messaging.messages.sample import (
     encode_batch,
     encode_named,
 )
-from coop.common.messaging.messages.stats import ReplayStats
-from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.status import ReplayStats
 from coop.common.messaging.messages.weights import Current, Role, Weights
 from coop.common.messaging.wire import Message
 from coop.common.settings.config import RunConfig

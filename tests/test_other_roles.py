@@ -21,7 +21,7 @@ import coop
 from coop.common.bounds import LONGEST_EPISODE
 from coop.common.envs.make import make_filmed_env, make_vector_env
 from coop.common.errors import CoopError, RunError, UsageError
-from coop.common.process import notices
+from coop.common.process import output
 from coop.common.settings.environment import EnvSettings
 from coop.evaluation.episodes import Evaluator
 from coop.evaluation.film import Film, short_gif
@@ -319,7 +319,7 @@ def test_what_a_job_allows_holds_for_sweeps_and_in_python(folder: Path, monkeypa
 def test_films_and_evaluations_of_a_training_are_bounded(
     trained: SavedRun, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(notices, "_told", set())
+    monkeypatch.setattr(output, "_warned", set())
     endless = EnvSettings(id=ODD, kwargs={"wrong": "endless"})
     film = Film(lambda obs: 0, endless, 0)
     assert sum(1 for _ in film) == film.steps == LONGEST_EPISODE

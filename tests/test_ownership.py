@@ -18,7 +18,7 @@ from test_checkpoints import CONFIG, save, save_learner
 
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.joining import join
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.files import FileDigest, truncate

@@ -17,10 +17,10 @@ from coop.common.messaging.keys import replay_key
 from coop.common.messaging.links import locators
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack, Retry
-from coop.common.messaging.messages.checkpoint import Snapshot, Written
+from coop.common.messaging.messages.control import Snapshot, Written
 from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.messages.sample import DrawRequest
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation

@@ -33,8 +33,7 @@ from coop.studies.report.intervals import (
     tail,
 )
 from coop.studies.report.measures import breaking_point
-from coop.studies.report.paper import table_1
-from coop.studies.report.results import breaking_table
+from coop.studies.report.results import breaking_table, table_1
 from coop.studies.report.study import load_study
 from coop.studies.report.writer import write_report
 from coop.studies.sweep.grid import load_grid

@@ -23,8 +23,8 @@ from test_screen import STATUS
 
 import coop
 from coop.common.errors import UsageError
+from coop.common.imports import check_extra
 from coop.common.messaging.messages.status import LearnerStatus
-from coop.common.process.extras import check_extra
 from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import free_endpoint
 from coop.common.registry import Registry

@@ -16,13 +16,10 @@ from samples import until
 
 from coop.common.messaging.keys import evaluations_key, join_key, replay_key
 from coop.common.messaging.members import ROUTE
-from coop.common.messaging.messages.checkpoint import Snapshot
+from coop.common.messaging.messages.control import EndOfRun, Join, Leave, Limit, Snapshot
 from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow
-from coop.common.messaging.messages.join import Join, Leave
-from coop.common.messaging.messages.limits import Limit
 from coop.common.messaging.messages.sample import DrawRequest
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
-from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation

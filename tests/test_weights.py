@@ -9,12 +9,11 @@ import zenoh
 from msgspec.structs import replace as changed
 from samples import await_service
 
-from coop.actors.joined import make_policy
 from coop.actors.policy import EpsilonGreedy
-from coop.actors.weights import GRACE, WeightsFollower
+from coop.actors.weights import GRACE, WeightsFollower, make_policy
 from coop.common.errors import JoinError
 from coop.common.messaging.keys import role_key, weights_key
-from coop.common.messaging.messages.join import JoinReply
+from coop.common.messaging.messages.control import JoinReply
 from coop.common.messaging.messages.weights import Role, Weights
 from coop.common.messaging.transport import Node
 from coop.common.networks.network import FlatNetwork, build_network

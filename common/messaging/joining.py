@@ -13,7 +13,7 @@ from coop.common.errors import BadMessage, JoinError
 from coop.common.messaging.endpoints import unknown_hosts
 from coop.common.messaging.keys import join_key
 from coop.common.messaging.messages.answers import Retry
-from coop.common.messaging.messages.join import Join, JoinReply, Leave
+from coop.common.messaging.messages.control import Join, JoinReply, Leave
 from coop.common.messaging.transport import NoAnswer, Node, Refused
 from coop.common.process.console import PeerMonitor, StallDetector
 from coop.common.process.lifecycle import Stop

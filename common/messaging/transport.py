@@ -21,8 +21,8 @@ from coop.common.messaging.faults import Faults
 from coop.common.messaging.keys import run_key, stop_key
 from coop.common.messaging.links import close
 from coop.common.messaging.messages.answers import Error
+from coop.common.messaging.messages.control import EndOfRun
 from coop.common.messaging.messages.status import Status
-from coop.common.messaging.messages.stop import EndOfRun
 from coop.common.messaging.presence import Presence
 from coop.common.messaging.wire import Message
 from coop.common.process.console import say, stamped

@@ -13,13 +13,12 @@ from typing import Any
 import pydantic
 import tomli_w
 
-from coop.common.errors import RunError, UsageError
+from coop.common.errors import RunError, UsageError, not_among
 from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.settings.overrides import merged, of_method
 from coop.common.settings.rules import check_rules
-from coop.common.suggestions import not_among
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
 CONFIG = "config.toml"

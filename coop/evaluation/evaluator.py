@@ -8,14 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coop.actors.joined import make_policy
-from coop.actors.weights import WeightsFollower
+from coop.actors.weights import WeightsFollower, make_policy
 from coop.common.envs.make import check_filmed
 from coop.common.errors import UsageError
 from coop.common.messaging.joining import Membership, join, leave_run
 from coop.common.messaging.keys import evaluations_key
+from coop.common.messaging.messages.control import Join, JoinReply
 from coop.common.messaging.messages.evaluate import Evaluated, Video
-from coop.common.messaging.messages.join import Join, JoinReply
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process.console import Console, counted

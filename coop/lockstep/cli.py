@@ -7,9 +7,9 @@ from collections.abc import Callable
 from contextlib import closing
 
 from coop.common.errors import RunError
+from coop.common.imports import importing
 from coop.common.places import shown
 from coop.common.process.console import say
-from coop.common.process.importing import importing
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.output import out
 from coop.records.run_options import RunOptions, parse_run

@@ -13,7 +13,7 @@ import torch
 
 from coop.common.errors import CoopError, UsageError
 from coop.common.process.files import FileDigest, write_atomic
-from coop.common.process.notices import warn
+from coop.common.process.output import warn
 from coop.common.process.untrusted import check_torch_file
 from coop.records.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
 from coop.records.resumption import Whole, survey

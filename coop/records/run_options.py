@@ -15,12 +15,11 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from coop.common.errors import RunError, UsageError
-from coop.common.imports import hand_over, permit
+from coop.common.imports import check_extra, hand_over, permit
 from coop.common.places import absolute
 from coop.common.process import cli
-from coop.common.process.extras import check_extra
-from coop.common.process.flags import HttpAddress
-from coop.common.process.notices import warn
+from coop.common.process.cli import HttpAddress
+from coop.common.process.output import warn
 from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig
 from coop.common.settings.effects import without_effect

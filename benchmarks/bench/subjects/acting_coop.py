@@ -18,7 +18,7 @@ from work import EMULATORS, EPSILON, acting_config
 
 from coop.common.envs.make import env_spec
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
 from coop.common.process.processes import ChildProcess, command, free_endpoint

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from coop.common.errors import UsageError
-from coop.common.suggestions import closest, refusal
+from coop.common.errors import UsageError, closest, refusal
 from coop.studies.report.comparisons import MEASURES
 from coop.studies.report.intervals import Estimate, over_seeds
 from coop.studies.report.learning import by_seed, differences

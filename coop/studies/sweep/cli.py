@@ -11,22 +11,20 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from coop.common.errors import Interrupted, RunError, UsageError
+from coop.common.errors import Interrupted, RunError, UsageError, closest, refusal
+from coop.common.imports import check_extra
 from coop.common.places import absolute, shown
 from coop.common.process.cli import parse
 from coop.common.process.console import say
-from coop.common.process.extras import check_extra
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.limits import cores
-from coop.common.suggestions import closest, refusal
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.studies.sweep import slurm
 from coop.studies.sweep.display import SweepDisplay
-from coop.studies.sweep.executor import Executor
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
 from coop.studies.sweep.grid import Grid, GridFile, load_grid
 from coop.studies.sweep.local import LocalProcesses
-from coop.studies.sweep.runner import Runner
+from coop.studies.sweep.runner import Executor, Runner
 from coop.studies.sweep.stacking import stacks_of
 
 TICK = 0.2  # seconds

@@ -17,7 +17,7 @@ import tomli_w
 from pydantic import ConfigDict, Field
 
 from coop.common.envs.make import env_spec
-from coop.common.errors import UsageError
+from coop.common.errors import UsageError, closest, refusal
 from coop.common.process.untrusted import check_run_name
 from coop.common.settings.config import RunConfig, check_distributed
 from coop.common.settings.environment import EnvSettings
@@ -26,7 +26,6 @@ from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
 from coop.common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
-from coop.common.suggestions import closest, refusal
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 

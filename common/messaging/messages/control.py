@@ -1,4 +1,4 @@
-"""Joining and leaving: a role asks the learner for the run's data, and tells it before it stops."""
+"""What directs a run: joining and leaving, checkpoints, the limiter's settings, and the end."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated, Any, ClassVar, Self
 import msgspec
 from msgspec import Meta
 
-from coop.common.bounded import Count, Incarnation, Name, Updates
-from coop.common.bounds import MAX_COUNT
+from coop.common.bounded import Count, Counter, Incarnation, Name, Real, Text, Updates
+from coop.common.bounds import MAX_COUNT, MAX_RATIO, MAX_TOLERANCE
 from coop.common.errors import BadMessage, UsageError
 from coop.common.messaging import wire
 from coop.common.messaging.members import JOINING, Origin
@@ -105,3 +105,73 @@ class Farewell(Body, frozen=True):
     """The learner's permission to leave."""
 
     kind: ClassVar[str] = "farewell"
+
+
+class Snapshot(Body, frozen=True):
+    """Begins the part of checkpoint `number`; of the older checkpoints, only `keep` is kept."""
+
+    kind: ClassVar[str] = "snapshot"
+
+    number: Updates
+    keep: Checkpoints
+
+
+class Written(Body, frozen=True):
+    """Asks whether the part of checkpoint `number` is on disk."""
+
+    kind: ClassVar[str] = "written"
+
+    number: Updates
+
+
+class LimitsQuestion(Body, frozen=True):
+    """Asks for the settings."""
+
+    kind: ClassVar[str] = "limits"
+
+
+class Limit(Body, frozen=True):
+    """New settings; answered like the question.
+
+    ratio: updates per environment step. tolerance: environment steps by which acting and learning may differ.
+    """
+
+    kind: ClassVar[str] = "limit"
+
+    ratio: Annotated[float, Meta(gt=0, le=MAX_RATIO)]
+    tolerance: Annotated[float, Meta(ge=0, le=MAX_TOLERANCE)]
+
+
+class Limits(Body, frozen=True):
+    """The state of a running replay service's limiter.
+
+    ratio, tolerance: see `Limit`. inserted: transitions so far.
+    drawn: batches so far, out of `planned` in the complete run.
+    inserts_wait_for, samples_wait_for: why they wait, in words; empty if they do not.
+    """
+
+    kind: ClassVar[str] = "limits"
+
+    ratio: Real
+    tolerance: Real
+    inserted: Counter
+    drawn: Counter
+    planned: Counter
+    inserts_wait_for: Text
+    samples_wait_for: Text
+
+
+MAX_REASON = 1024  # characters
+
+
+class EndOfRun(Body, frozen=True):
+    """Says that the run is over, and why."""
+
+    kind: ClassVar[str] = "stop"
+
+    reason: Text
+
+    @classmethod
+    def because(cls, reason: str) -> Self:
+        """Build it with a reason, cut to `MAX_REASON` characters."""
+        return cls(reason[:MAX_REASON])
