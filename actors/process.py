@@ -19,8 +19,8 @@ from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.console import Console, counted
 from coop.common.process.lifecycle import Stop
+from coop.common.process.limits import use_threads
 from coop.common.process.memory import keep_freed_memory
-from coop.common.process.threads import use_threads
 from coop.monitor.health import answering
 
 

@@ -13,9 +13,9 @@ from coop.common.envs.protocol import VectorEnv
 from coop.common.messaging.insert_client import InsertClient, QuerySender
 from coop.common.messaging.messages.status import ActorStatus
 from coop.common.messaging.transport import Node
+from coop.common.numbers import Rate
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
-from coop.common.process.rates import Rate
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
 

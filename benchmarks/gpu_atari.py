@@ -94,7 +94,7 @@ class Run:
     def __init__(self, options: argparse.Namespace, method: str) -> None:
         import torch
 
-        from coop.common.process.threads import use_threads
+        from coop.common.process.limits import use_threads
         from coop.learner.agent import Agent
         from coop.learner.device_table import DeviceTable
 

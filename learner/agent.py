@@ -26,8 +26,8 @@ from torch import Tensor
 
 from coop.common.errors import UsageError, first_line
 from coop.common.networks.network import FlatNetwork
+from coop.common.numbers import generator_state, set_generator_state
 from coop.common.process.output import warn
-from coop.common.process.randomness import generator_state, set_generator_state
 from coop.common.registry import loaded
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig

@@ -13,7 +13,7 @@ from coop.common.messaging.session import SHORT_QUEUE, open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.console import Console, say
 from coop.common.process.lifecycle import Stop
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.capacity import mirror_slots
 from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest

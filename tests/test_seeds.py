@@ -22,9 +22,9 @@ from coop.lockstep.memory import TableMemory
 from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start
 from coop.records.summaries import read_summary
-from coop.studies.stacked.eligible import why_not
 from coop.studies.stacked.seeds import Seeds
 from coop.studies.stacked.together import play_together
+from coop.studies.sweep.stacking import why_not
 
 pytest.importorskip("numba")
 

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.control import Join
 from coop.common.messaging.messages.status import ActorStatus, Held, Member, Ratio, ReplayStatus, Wait
-from coop.common.process.rates import Rate
+from coop.common.numbers import Rate
 from coop.learner.roster import FORGOTTEN, MemberTracker
 from coop.learner.status import waits
 from coop.learner.telemetry import ReturnHistory

@@ -19,7 +19,7 @@ from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process.console import Console, counted
 from coop.common.process.lifecycle import Stop
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.options import RoleOptions
 from coop.evaluation.episodes import AT_ONCE, Evaluator
 

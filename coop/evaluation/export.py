@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from coop.common.errors import CoopError, RunError, UsageError
 from coop.common.imports import describe
-from coop.common.networks.inputs import preprocess
+from coop.common.networks.forward import preprocess
 from coop.common.networks.network import FlatNetwork, sample_observations
 from coop.common.numbers import strict_json
 from coop.common.process.files import SyncedFile, make_folder, sync_folder

@@ -14,7 +14,7 @@ from coop.actors.player import Player, Turn
 from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import RunError, UsageError
-from coop.common.process.randomness import generator_state, set_generator_state
+from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.config import RunConfig
 from coop.common.types import EpisodeRecord
 from coop.learner.trainer import Effects, Trainer

@@ -12,7 +12,7 @@ import torch
 from coop.common.envs.make import env_spec
 from coop.common.errors import RunError, UsageError
 from coop.common.imports import hand_over
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest

@@ -10,7 +10,7 @@ from coop.common.envs.make import check_filmed
 from coop.common.errors import CoopError, RunError, first_line
 from coop.common.process.console import say
 from coop.common.process.lifecycle import Stop
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest
 from coop.evaluation.episodes import Evaluator

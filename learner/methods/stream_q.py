@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from coop.common.networks.inputs import preprocess
+from coop.common.networks.forward import preprocess
 from coop.common.networks.network import FlatNetwork
 from coop.common.networks.normalised import NormalisedNetwork
 from coop.common.settings import schedules

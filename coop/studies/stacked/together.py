@@ -28,8 +28,8 @@ from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
 from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import Summary
-from coop.studies.stacked.eligible import why_not
 from coop.studies.stacked.seeds import MOST, Seeds
+from coop.studies.sweep.stacking import why_not
 
 PROGRAM = "coop-lockstep"
 
