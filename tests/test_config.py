@@ -186,7 +186,7 @@ def test_refused_in_one_line(flags: list[str], words: list[str], monkeypatch: py
     [
         ({"replay": {"capcity": 5}}, "replay.capcity = 5: no such field; did you mean capacity? allowed: capacity, "),
         ({"speed": 5}, "speed = 5: no such field; did you mean seed? allowed: run, method"),
-        ({"method_settings": 5}, "method_settings = 5: no such field; allowed: run, method"),
+        ({"method_settings": 5}, "method_settings = 5: no such field; did you mean methods? allowed: run, method"),
         (
             {"method": "medqn", "medqn": {"lambda": 5}},
             "medqn.lambda = 5: no such field; did you mean lambda_end?",

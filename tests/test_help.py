@@ -114,7 +114,7 @@ def settings(kind: type[Any], prefix: str = "--") -> Iterator[str]:
         if dataclasses.is_dataclass(inner := hints[field.name]):
             assert isinstance(inner, type)
             yield from settings(inner, f"{name}.")
-        elif name not in ("--own", "--methods"):
+        elif name not in ("--method-settings", "--methods"):
             yield name
 
 

@@ -1,4 +1,4 @@
-"""What this process may use: memory and processors of its job, where that is less than the machine has.
+"""What this process may use: memory and processors of its job, where that is less than the machine has, and threads.
 
 Sources are the machine, the process's own limits (ulimit), its control groups (version 1 and 2, with all above it) and
 Slurm's variables. A source that is absent or unreadable limits nothing.
