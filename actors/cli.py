@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from coop.common.imports import importing
 from coop.common.process import cli
-from coop.common.process.importing import importing
 from coop.common.process.lifecycle import run_main
 from coop.common.settings.options import HealthOptions, RoleOptions
 
@@ -18,7 +18,7 @@ class ActorOptions(RoleOptions, HealthOptions):
     mode: Literal["peer", "client"] = "peer"
     """client: --connect names a router, and this process has no other link."""
     envs: int | None = None
-    """Emulators in this process; the run's actor.envs if not given."""
+    """Emulators in this process; the run's actor.num_envs if not given."""
     allow_import: tuple[str, ...] = ()
     """Modules, such as my_envs, that this process may import if the run's environment or network is theirs."""
 

@@ -8,19 +8,19 @@ import numpy as np
 import zenoh
 
 from coop.actors.cli import ActorOptions
-from coop.actors.joined import make_policy
 from coop.actors.service import ActorService
+from coop.actors.weights import make_policy
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import JoinError
 from coop.common.messaging.joining import Membership, join, leave_run
-from coop.common.messaging.messages.join import Join, Joined
+from coop.common.messaging.messages.control import Join, JoinReply
 from coop.common.messaging.route import ReplayRoute, RoutedReplay, open_client
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.console import Console, counted
 from coop.common.process.lifecycle import Stop
+from coop.common.process.limits import use_threads
 from coop.common.process.memory import keep_freed_memory
-from coop.common.process.threads import use_threads
 from coop.monitor.health import answering
 
 
@@ -34,20 +34,20 @@ def play(options: ActorOptions) -> None:
     incarnation, console = new_incarnation(), Console()
     session = _open(options, stop)
     if session is None:
-        stop.leave()
+        stop.raise_for_status()
         return
     with Node(session, options.run, "actor", incarnation) as node, answering(options.health, console):
         node.follow_stop(stop)
         request = Join("actor", incarnation, [])
         try:
-            joined = join(
+            reply = join(
                 node, stop, request, options.connect, options.join_timeout, need_replay=True, event=console.event
             )
-            if joined is not None:
-                _play(node, stop, options, request, joined, console)
+            if reply is not None:
+                _play(node, stop, options, request, reply, console)
         finally:
             leave_run(node, request)
-    stop.leave()
+    stop.raise_for_status()
 
 
 def _open(options: ActorOptions, stop: Stop) -> zenoh.Session | None:
@@ -58,21 +58,21 @@ def _open(options: ActorOptions, stop: Stop) -> zenoh.Session | None:
     return open_session((), *connection)
 
 
-def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: Joined, console: Console) -> None:
+def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, reply: JoinReply, console: Console) -> None:
     """Play until the stop.
 
     Raises:
         JoinError: the run needs a module that this process may not import, or this process's environment or network
             differs from the learner's.
     """
-    config = joined.config
+    config = reply.config
     # The learner gives each number once per run, also across restarts, so no two processes play the same seeds.
-    seed = np.random.SeedSequence([config.seed, 3, joined.index])
+    seed = np.random.SeedSequence([config.seed, 3, reply.index])
     env_seed, policy_seed = seed.spawn(2)
-    policy = make_policy(joined, options.allow_import, np.random.default_rng(policy_seed))
-    env = make_vector_env(config.env, options.envs or config.actor.envs, int(env_seed.generate_state(1)[0]))
-    if env.spec != joined.spec:
-        raise JoinError(f"environment here {env.spec}, the learner's {joined.spec}")
+    policy = make_policy(reply, options.allow_import, np.random.default_rng(policy_seed))
+    env = make_vector_env(config.env, options.envs or config.actor.num_envs, int(env_seed.generate_state(1)[0]))
+    if env.spec != reply.spec:
+        raise JoinError(f"environment here {env.spec}, the learner's {reply.spec}")
 
     def open_route(endpoints: Sequence[str]) -> zenoh.Session:
         return open_session((), endpoints, options.zenoh_config, options.shared_memory)
@@ -80,18 +80,18 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, joined: 
     with (
         RoutedReplay(node)
         if options.mode == "client"
-        else ReplayRoute(options.run, request.incarnation, open_route, joined.replay_endpoints)
+        else ReplayRoute(options.run, request.incarnation, open_route, reply.replay_endpoints)
     ) as route:
 
-        def learned(answer: Joined, _: float) -> None:
+        def learned(answer: JoinReply, _: float) -> None:
             route.follow(answer.replay_endpoints)
 
         console.event(
-            f"joined run {options.run!r} on {joined.learner} as actor {joined.index}; "
-            f"plays {counted(env.num_envs, 'emulator')} of {config.env.id} for the replay service on {joined.replay}"
+            f"joined run {options.run!r} on {reply.learner} as actor {reply.index}; "
+            f"plays {counted(env.num_envs, 'emulator')} of {config.env.id} for the replay service on {reply.replay}"
         )
         service = ActorService(node, route, stop, config, env, policy, request.incarnation, console)
-        with Membership(node, stop, request, joined, options.patience, learned, console.event, lambda: route.is_up):
+        with Membership(node, stop, request, reply, options.patience, learned, console.event, lambda: route.is_up):
             service.run()
     console.event(f"{stop.reason}; {service.progress()}")
     env.close()

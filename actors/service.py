@@ -13,9 +13,9 @@ from coop.common.envs.protocol import VectorEnv
 from coop.common.messaging.insert_client import InsertClient, QuerySender
 from coop.common.messaging.messages.status import ActorStatus
 from coop.common.messaging.transport import Node
+from coop.common.numbers import Rate
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
-from coop.common.process.rates import Rate
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
 
@@ -43,7 +43,7 @@ class ActorService:
         settings = config.actor
         self._player = Player(env, policy, partial(schedules.epsilon, settings))
         self._weights = WeightsFollower(node, policy)
-        self._inserts = InsertClient(route, stop, settings.window * env.num_envs, self._publish_status)
+        self._inserts = InsertClient(route, stop, settings.max_in_flight * env.num_envs, self._publish_status)
         self._segments = SegmentAssembler(
             env.spec,
             env.num_envs,

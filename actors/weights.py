@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Collection
+
+import numpy as np
 
 from coop.actors.policy import EpsilonGreedy
-from coop.common.errors import BadMessage
+from coop.common.errors import BadMessage, JoinError
+from coop.common.imports import check_allowed
 from coop.common.messaging.keys import role_key, weights_key
+from coop.common.messaging.messages.control import JoinReply
 from coop.common.messaging.messages.weights import Current, Role, Weights
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.messaging.wire import Message
+from coop.common.networks.acting import acting_network
 
 UNKNOWN = -1  # a version: no weights, or no role, received yet
 GRACE = 0.5  # seconds to wait for a broadcast before asking for the weights
@@ -98,3 +104,18 @@ class WeightsFollower:
         self._told = list(role.versions)
         self.progress = role.updates, role.env_step
         self._policy.acting = role.acting - 1
+
+
+def make_policy(reply: JoinReply, allow_import: Collection[str], rng: np.random.Generator) -> EpsilonGreedy:
+    """A policy with networks of the run's layout, whose parameters the learner will send.
+
+    Raises:
+        JoinError: the run needs a module that this process may not import, or this process builds another layout than
+            the learner does.
+    """
+    for field, path in reply.config.imports.items():
+        check_allowed(path, allow_import, field)
+    first, second = (acting_network(reply.config.network, reply.spec) for _ in range(2))
+    if first.layout_digest() != reply.layout:
+        raise JoinError(f"network layout here {first.layout_digest()}, the learner's {reply.layout}")
+    return EpsilonGreedy((first, second), reply.spec, rng)

@@ -1,6 +1,6 @@
 """Counts missing and duplicate transitions in a CartPole run's table by its contents, not by its counters.
 
-The table of the closing epoch must hold the whole run (a capacity that was never reached).
+The table of the closing checkpoint must hold the whole run (a capacity that was never reached).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from coop.common.errors import RunError
 from coop.common.types import Array
 from coop.records.checkpoints import REPLAY
-from coop.records.learner_checkpoints import newest_epoch
+from coop.records.learner_checkpoints import newest_checkpoint
 
 RESET = 0.05  # CartPole begins an episode with all four numbers within this
 
@@ -22,9 +22,9 @@ def audit(run_dir: Path) -> tuple[int, int]:
 
     A gap is an observation without a predecessor that begins no episode: the transition before it is missing.
     """
-    closing = newest_epoch(run_dir)
+    closing = newest_checkpoint(run_dir)
     if closing is None:
-        raise RunError(f"{run_dir}: has no epoch")
+        raise RunError(f"{run_dir}: has no checkpoint")
     table = closing.path / REPLAY
     slots, frames = np.load(table / "slots.npy"), np.load(table / "frames.npy")
     obs, next_obs = frames[slots[:, 0]], frames[slots[:, 1]]

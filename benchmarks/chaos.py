@@ -37,7 +37,7 @@ class ChaosOptions:
     total_steps: int = 50_000
     """Environment steps of the run."""
     checkpoint_every: int = 500
-    """Updates between epochs."""
+    """Updates between checkpoints."""
     seed: int = 0
     """Seed of the run, and of the times and targets of the kills."""
     longest_pause: float = 3.0
@@ -79,7 +79,7 @@ class ChaosMonkey:
         if not self._left:
             return
         updates = progress[1]
-        self._at_work_since = min(self._at_work_since, updates)  # the learner may have returned to an epoch
+        self._at_work_since = min(self._at_work_since, updates)  # the learner may have returned to a checkpoint
         if self._next == float("inf") and updates >= self._at_work_since + SETTLED:
             self._next = now + self._chance.uniform(0, self._options.longest_pause)
         if now >= self._next and self._kill(self._left[-1]):
@@ -109,11 +109,11 @@ def _children(pid: int) -> list[tuple[int, str]]:
     return found
 
 
-def _repeated(told: str) -> str:
+def _repeated(printed: str) -> str:
     """How many transitions of the closing table are there twice, from what coop-reexecute has printed."""
-    found = re.search(r"([\d,]+) of ([\d,]+) in the closing table", told)
+    found = re.search(r"([\d,]+) of ([\d,]+) in the closing table", printed)
     if found is None:
-        raise RunError(f"coop-reexecute does not tell of the closing table: {told.strip()}")
+        raise RunError(f"coop-reexecute does not tell of the closing table: {printed.strip()}")
     return f"{found[1]} of {found[2]}"
 
 

@@ -111,7 +111,7 @@ def main() -> None:
         if options.processes:
             flags = ("--resume", "--run-dir", "{}", "--total-steps", "300", "--actors", "1")
             # Its processes never play the same steps twice; `restore` compares what they begin with.
-            local = Reader("coop-local", flags, same=r"goes on from checkpoint \d+|complete: \d+ steps")
+            local = Reader("coop-local", flags, same=r"resuming from checkpoint \d+|complete: \d+ steps")
             subjects["distributed"] = (*subjects["distributed"], local)
         sys.exit(corrupt(Path(folder), subjects, options.mutations, random.Random(options.seed), options.only))
 
@@ -153,7 +153,7 @@ def corrupt(
     for (subject, reader), outcome in expected.items():
         if outcome.status:
             sys.exit(f"{subject}, {reader.name}, undamaged: {outcome.text}")
-    told: Counter[tuple[str, str, str]] = Counter()
+    tally: Counter[tuple[str, str, str]] = Counter()
     failures = 0
     began = time.monotonic()
     for number in range(count):
@@ -161,13 +161,13 @@ def corrupt(
         file, mutation, change = choose(folder, subject, rng)
         got = read(folder / subject, reader, change)
         verdict = judge(expected[plan], got, file)
-        told[f"{subject}: {kind_of(file)}", reader.name, verdict] += 1
+        tally[f"{subject}: {kind_of(file)}", reader.name, verdict] += 1
         if verdict in BAD:
             failures += 1
             print(f"{verdict}: {subject}/{file}, {mutation}; {reader.name}: {got.text[-1500:]}", flush=True)
         if (number + 1) % SHOWN == 0 and number + 1 < count:
             print(f"{number + 1:,} of {count:,}: {failures} silent, traceback, hang or changed", flush=True)
-    print(table(told))
+    print(table(tally))
     print(f"{count:,} mutations in {time.monotonic() - began:.0f} s: {failures} silent, traceback, hang or changed")
     return 1 if failures else 0
 
@@ -306,16 +306,16 @@ def restore(path: Path) -> None:
     from coop.records.resumption import Start, go_back  # noqa: PLC0415
     from coop.records.run_ids import read_run_id  # noqa: PLC0415
     from coop.replay.core import ReplayCore  # noqa: PLC0415
-    from coop.replay.persistence.epochs import ReplayEpochs  # noqa: PLC0415
+    from coop.replay.persistence.checkpoints import ReplayCheckpoints  # noqa: PLC0415
     from coop.replay.persistence.recovery import recover  # noqa: PLC0415
 
     config = read_run_config(path)
-    found, told = Start(resume=True).prepare(path, replay=True, load=load_learner)
-    print(*told, sep="\n")
+    found, notices = Start(resume=True).prepare(path, replay=True, load=load_learner)
+    print(*notices, sep="\n")
     assert found.newest is not None
     run_id, core = read_run_id(path), ReplayCore(config, env_spec(config.env))
     Roster(path, run_id=run_id)
-    first, text = ReplayEpochs(path, run_id).restore(core, found.newest.number)
+    first, text = ReplayCheckpoints(path, run_id).restore(core, found.newest.number)
     _, lines = recover(core, path / "journal", first, run_id)
     print(text, *lines, sep="\n")
     go_back(found, found.newest.number)
@@ -367,14 +367,14 @@ def judge(expected: Outcome, got: Outcome, file: str) -> str:
     return "harmless" if got.digest == expected.digest and not got.status else "silent"
 
 
-def table(told: Counter[tuple[str, str, str]]) -> str:
+def table(tally: Counter[tuple[str, str, str]]) -> str:
     """The outcomes by kind of file and reader, in Markdown."""
     verdicts = ("named", "harmless", *BAD)
     lines = [f"| file | read by | {' | '.join(verdicts)} |", f"| --- | --- |{' ---: |' * len(verdicts)}"]
-    for file, reader in sorted({(file, reader) for file, reader, _ in told}):
-        counts = [str(told[file, reader, verdict]) for verdict in verdicts]
+    for file, reader in sorted({(file, reader) for file, reader, _ in tally}):
+        counts = [str(tally[file, reader, verdict]) for verdict in verdicts]
         lines.append(f"| {file} | {reader} | {' | '.join(counts)} |")
-    sums = [str(sum(count for (_, _, each), count in told.items() if each == verdict)) for verdict in verdicts]
+    sums = [str(sum(count for (_, _, each), count in tally.items() if each == verdict)) for verdict in verdicts]
     return "\n".join([*lines, f"| all | | {' | '.join(sums)} |"])
 
 

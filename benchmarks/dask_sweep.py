@@ -99,7 +99,7 @@ class Sweep:
             if (count := sum(line.startswith("complete:") for line in log.splitlines())) != 1:
                 raise RunError(f"{cell} was completed {count} times")
             if cell in hit:
-                if "goes on from checkpoint" not in log:
+                if "resuming from checkpoint" not in log:
                     raise RunError(f"{cell} began anew")
                 alone = self._folder / "alone"
                 subprocess.run(self.command(alone, f"--cell={cell}"), stdout=subprocess.DEVNULL, check=True)
@@ -108,18 +108,18 @@ class Sweep:
                     raise RunError(f"{cell} has other episodes than an undisturbed run")
 
     def _running(self, host: str) -> tuple[int, str]:
-        """A cell that runs on the host, once one has a saved epoch of its first half: its process and its name."""
+        """A cell that runs on the host, once one has a saved checkpoint of its first half: its process and its name."""
         found: list[tuple[int, str]] = []
 
         def early(cell: str) -> bool:
-            epochs = [int(done.parent.name) for done in self.runs.glob(f"{cell}/checkpoints/*/DONE")]
-            return 0 < max(epochs, default=0) <= TOTAL_STEPS // 2
+            checkpoints = [int(done.parent.name) for done in self.runs.glob(f"{cell}/checkpoints/*/DONE")]
+            return 0 < max(checkpoints, default=0) <= TOTAL_STEPS // 2
 
         def saved() -> bool:
             found[:] = [(pid, cell) for pid, cell in self._cells(host).items() if early(cell)]
             return bool(found)
 
-        wait_until(f"a cell with an epoch on {host}", saved, PATIENCE)
+        wait_until(f"a cell with a checkpoint on {host}", saved, PATIENCE)
         return found[0]
 
     def _cells(self, host: str) -> dict[int, str]:

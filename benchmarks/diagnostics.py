@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from coop.common.numbers import METRICS_EVERY
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_options import base_config
 

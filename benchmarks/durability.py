@@ -101,7 +101,7 @@ def atari(folder: Path) -> Figures:
     from coop.records.run_directory import RunDirectory  # noqa: PLC0415
 
     tables = load_tables("breakout", None)
-    few = {"replay": {**tables["replay"], "capacity": 5_000, "learning_starts": 4_990}, "actor": {"envs": 1}}
+    few = {"replay": {**tables["replay"], "capacity": 5_000, "learning_starts": 4_990}, "actor": {"num_envs": 1}}
     saves = []
     run = Lockstep(resolve({**tables, **few}))
     with RunDirectory(folder / "breakout", run.config) as directory:

@@ -20,7 +20,7 @@ import torch
 from made_up import random_batch
 
 from coop.common.networks.network import build_network
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import validated
 from coop.common.types import Batch, EnvSpec

@@ -31,15 +31,14 @@ from coop.common.errors import BadMessage, CoopError, RunError
 from coop.common.messaging import wire
 from coop.common.messaging.joining import join
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.epoch import Snapshot, Written
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join, Snapshot, Written
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, Pending, Refused, new_incarnation
 from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import free_endpoint
 
-EPOCH = 1  # the same number in the snapshots before and after
+CHECKPOINT = 1  # the same number in the snapshots before and after
 WINDOW = 64  # broken messages in flight
 QUIET = 2.0  # seconds without a change that count as idle
 VALID_EVERY = 15  # broken messages for each valid one
@@ -134,7 +133,7 @@ class Watch:
         self.node = node
         self._folder = folder
         self._status = node.latest(node.key("metrics", "learner", "*"))
-        self._told: dict[str, Any] = {}
+        self._newest: dict[str, Any] = {}
 
     def steps(self) -> int:
         """The replay service's count of transitions."""
@@ -144,8 +143,8 @@ class Watch:
         """A field of the learner's status."""
         message = self._status.poll()
         if message is not None:
-            self._told = dict(message.fields)
-        return int(self._told.get(field, 0))
+            self._newest = dict(message.fields)
+        return int(self._newest.get(field, 0))
 
     def rest(self) -> None:
         """Wait until table and learner are idle."""
@@ -160,10 +159,10 @@ class Watch:
     def everything(self) -> dict[str, bytes]:
         """The states of both roles, as bytes."""
         key = replay_key(self.node, "snapshot")
-        self.node.ask(key, Snapshot(EPOCH, []).encode(RUN), 60.0)
-        while self.node.ask(key, Written(EPOCH).encode(RUN), 60.0).kind == "retry":
+        self.node.ask(key, Snapshot(CHECKPOINT, []).encode(RUN), 60.0)
+        while self.node.ask(key, Written(CHECKPOINT).encode(RUN), 60.0).kind == "retry":
             pass
-        saved = self._folder / "checkpoints" / str(EPOCH) / "replay"
+        saved = self._folder / "checkpoints" / str(CHECKPOINT) / "replay"
         state = {path.name: path.read_bytes() for path in saved.iterdir()}
         question = Current().encode(RUN)
         for key in (("weights", "1"), ("weights", "2"), ("role",)):
@@ -181,9 +180,9 @@ def fuzz(count: int, seed: int, folder: Path) -> None:
     roles = Roles.of_run(folder, RUN, at, flags, actors=2)
     actor = roles.processes["actor 1"]
     with running(roles, "actor 2"), Node(open_session((), at), RUN, "watch", new_incarnation()) as node:
-        joined = join(node, Stop(), Join("actor", new_incarnation(), []), at, 60.0, need_replay=True)
-        assert joined is not None
-        watch, flood = Watch(node, folder), Flood(node, targets(node, joined), random.Random(seed), ports)
+        reply = join(node, Stop(), Join("actor", new_incarnation(), []), at, 60.0, need_replay=True)
+        assert reply is not None
+        watch, flood = Watch(node, folder), Flood(node, targets(node, reply), random.Random(seed), ports)
         wait_until("the first updates", lambda: watch.learner("updates") > 0)
 
         before, began = watch.steps(), time.monotonic()
@@ -222,7 +221,7 @@ def fuzz(count: int, seed: int, folder: Path) -> None:
         print(f"the run went on to {stats.inserted:,} steps: lost {stats.lost}, duplicated {stats.duplicates}")
         if stats.lost or stats.duplicates:
             raise RunError("the counters of the run are wrong")
-        survive(roles, watch, flood, [*extremes(node, joined.spec), *flood.still_valid(count // VALID_EVERY)], at[0])
+        survive(roles, watch, flood, [*extremes(node, reply.spec), *flood.still_valid(count // VALID_EVERY)], at[0])
 
 
 def survive(roles: Roles, watch: Watch, flood: Flood, messages: list[tuple[str, bytes]], learner_at: str) -> None:

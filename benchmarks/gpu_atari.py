@@ -3,7 +3,7 @@
 The emulators' frames go into a table on the GPU, from which recorded updates draw: 10,000 transitions, an update every
 four steps, s = 0.1. Each method plays for a slice of time, saves itself in the folder, and the next one goes on. The
 same command resumes from the folder, elsewhere too: networks and running means of squares are kept (61 MB at most, no
-file above 11 MB), the table and the emulators begin anew, and a copied target is copied again.
+file above 11 MB), the table and the emulators start over, and a copied target is copied again.
 
     gpu_atari.py --out FOLDER [--minutes 8] [--game pong] [--device cuda] [--emulators 32] [--slice 20]
                  [--methods dqn ...] [--kind nature] [--starts 2000] [--seed 0]
@@ -94,7 +94,7 @@ class Run:
     def __init__(self, options: argparse.Namespace, method: str) -> None:
         import torch
 
-        from coop.common.process.threads import use_threads
+        from coop.common.process.limits import use_threads
         from coop.learner.agent import Agent
         from coop.learner.device_table import DeviceTable
 
@@ -124,7 +124,7 @@ class Run:
         on_gpu = device.type == "cuda"
         shape, count = self.env.obs.shape, self.streams
         self.host_obs = torch.empty(shape, dtype=torch.uint8, pin_memory=on_gpu)
-        self.host_told = torch.empty(3, count, pin_memory=on_gpu)
+        self.host_outcomes = torch.empty(3, count, pin_memory=on_gpu)
         self.host_actions = torch.empty(count, dtype=torch.int64, pin_memory=on_gpu)
         self.last: deque[float] = deque(self.counts.get("last", ()), maxlen=100)
         self.begun = 0
@@ -159,9 +159,9 @@ class Run:
         agent, table, env, counts = self.agent, self.table, self.env, self.counts
         device = agent.device
         self.host_obs.copy_(torch.from_numpy(env.obs))
-        self.host_told.copy_(torch.from_numpy(env.told))
-        obs, told = (one.to(device, non_blocking=True) for one in (self.host_obs, self.host_told))
-        table.show(obs, *told)
+        self.host_outcomes.copy_(torch.from_numpy(env.outcomes))
+        obs, outcomes = (one.to(device, non_blocking=True) for one in (self.host_obs, self.host_outcomes))
+        table.show(obs, *outcomes)
         actor = self.config.actor
         at = min(1.0, counts["steps"] / actor.epsilon_steps)
         self.epsilon.fill_(actor.epsilon_start + at * (actor.epsilon_final - actor.epsilon_start))
@@ -256,7 +256,7 @@ class Run:
 class Emulators:
     """Emulators that show the end of an episode, and begin the next one a step later.
 
-    obs: uint8 [streams, 4, 84, 84]. told: float32 [3, streams]: rewards for learning, terminated and truncated.
+    obs: uint8 [streams, 4, 84, 84]. outcomes: float32 [3, streams]: rewards for learning, terminated and truncated.
     """
 
     def __init__(self, config: Any, streams: int, seed: int) -> None:
@@ -272,7 +272,7 @@ class Emulators:
         seeds = np.random.SeedSequence(seed).generate_state(streams) & 0x7FFFFFFF
         self.obs, info = self._ale.reset(seed=seeds)
         self._start = info["frame_number"] - info["episode_frame_number"]
-        self.told = np.zeros((3, streams), np.float32)
+        self.outcomes = np.zeros((3, streams), np.float32)
         self._returns = np.zeros(streams)
 
     def step(self, actions: Any) -> list[float]:
@@ -287,7 +287,7 @@ class Emulators:
         over = self._returns[restarted].tolist()
         self._returns[restarted] = 0
         self._returns += rewards
-        self.told = np.stack((np.clip(rewards, -1, 1), terminated, truncated)).astype(np.float32)
+        self.outcomes = np.stack((np.clip(rewards, -1, 1), terminated, truncated)).astype(np.float32)
         return over
 
     def close(self) -> None:

@@ -173,7 +173,7 @@ def part_updates(options: argparse.Namespace) -> None:
     from made_up import random_batch
     from work import ATARI
 
-    from coop.common.process.threads import use_threads
+    from coop.common.process.limits import use_threads
     from coop.learner.agent import Agent
 
     use_threads(1)

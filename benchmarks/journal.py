@@ -2,7 +2,7 @@
 
 Real `coop-replay` processes on TCP, one inserting client with a window of 16 segments. Both services take turns
 for a second each, so that the ratio holds on a busy machine. Prints transitions/s and the processor time that the
-service spent on them, which other load affects less. After each turn an epoch releases the journal's files.
+service spent on them, which other load affects less. After each turn a checkpoint releases the journal's files.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from made_up import ATARI, segments
 
 from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.control import Snapshot, Written
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
 from coop.common.process.lifecycle import Stop
@@ -30,7 +30,7 @@ from coop.common.process.processes import ChildProcess, command, free_endpoint
 from coop.common.settings.tables import validated
 from coop.learner.join_service import JoinService
 from coop.learner.roster import Roster
-from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.shared_checkpoints import SharedCheckpoints
 
 STEPS, WINDOW, CAPACITY = 64, 16, 5000
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -52,7 +52,14 @@ class Service:
         head, at = free_endpoint(), free_endpoint()
         learner = stack.enter_context(Node(open_session((head,)), run, "learner", new_incarnation()))
         JoinService(
-            learner, config, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster(), event=print
+            learner,
+            config,
+            ATARI,
+            "",
+            run_id=0,
+            shared=SharedCheckpoints([], "benchmark"),
+            roster=Roster(),
+            event=print,
         )
         flags = ("--run", run, "--connect", head, "--listen", at, "--run-dir", str(folder))
         self._process = ChildProcess("replay", command("coop-replay", *flags), folder.with_suffix(".log"))
@@ -63,7 +70,7 @@ class Service:
         self._node = stack.enter_context(Node(open_session((), (at,)), run, "actor", incarnation))
         self._client = InsertClient(self._node, Stop(), WINDOW)
         self._stream = (msgspec.structs.replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
-        self._epoch = 0
+        self._checkpoint = 0
         self.insert(1.0)
 
     def insert(self, seconds: float) -> tuple[float, float]:
@@ -82,9 +89,9 @@ class Service:
         return (int(fields[11]) + int(fields[12])) / TICKS
 
     def _save(self) -> None:
-        self._epoch += 1
-        self._ask(Snapshot(self._epoch, []).encode(self._node.run))
-        while self._ask(Written(self._epoch).encode(self._node.run)) == "retry":
+        self._checkpoint += 1
+        self._ask(Snapshot(self._checkpoint, []).encode(self._node.run))
+        while self._ask(Written(self._checkpoint).encode(self._node.run)) == "retry":
             pass
 
     def _ask(self, question: bytearray) -> str:

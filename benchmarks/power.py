@@ -166,7 +166,7 @@ def resume(kind: str, at: Path, folder: Path) -> tuple[str, int, int]:
     try:
         while process.poll() is None and time.monotonic() < deadline:
             text = log.read_text(errors="replace")
-            if "goes on from checkpoint" in text or "starts in" in text:
+            if "resuming from checkpoint" in text or "starts in" in text:
                 size = path.stat().st_size if size < 0 and path.exists() else size
                 if size >= 0 and path.exists() and path.stat().st_size > size:
                     break  # it trains
@@ -176,7 +176,7 @@ def resume(kind: str, at: Path, folder: Path) -> tuple[str, int, int]:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-    found = re.search(r"goes on from checkpoint (\d+)", log.read_text(errors="replace"))
+    found = re.search(r"resuming from checkpoint (\d+)", log.read_text(errors="replace"))
     return problem, step_of(at / "run", int(found[1]) if found else 0), 0
 
 
@@ -205,9 +205,9 @@ def resume_sweep(at: Path, folder: Path) -> tuple[str, int, int]:
     whole = 0
     for summary in at.glob("sweep/*/summary.json"):
         with contextlib.suppress(ValueError, KeyError, OSError):
-            told = json.loads(summary.read_text())
+            summed_up = json.loads(summary.read_text())
             rows = summary.with_name("episodes.csv").read_text().splitlines()
-            whole += told["exit"] == "complete" and len(rows) == told["episodes"] + 1
+            whole += summed_up["exit"] == "complete" and len(rows) == summed_up["episodes"] + 1
     return "", 0, max(0, int(found[1]) - whole)
 
 

@@ -14,7 +14,7 @@ import zenoh
 from coop.common.errors import RunError
 from coop.common.messaging import wire
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.transport import Node
 from coop.common.process.processes import ChildProcess, command
 from coop.records.summaries import read_summary
@@ -113,7 +113,7 @@ class RunWatch:
         config.insert_json5("connect/timeout_ms", "-1")
         self._session = zenoh.open(config)
         self._fields: dict[str, dict[str, Any]] = {}
-        self._told = self._session.declare_subscriber(f"coop/{run}/metrics/*/*", zenoh.handlers.RingChannel(256))
+        self._statuses = self._session.declare_subscriber(f"coop/{run}/metrics/*/*", zenoh.handlers.RingChannel(256))
 
     def acked(self) -> dict[str, int]:
         """The latest number of acknowledged transitions of each actor, by incarnation."""
@@ -125,7 +125,7 @@ class RunWatch:
 
     def _read(self, role: str) -> dict[str, dict[str, Any]]:
         """The latest status of each process of a role, by key."""
-        while (sample := self._told.try_recv()) is not None:
+        while (sample := self._statuses.try_recv()) is not None:
             self._fields[str(sample.key_expr)] = wire.decode(sample.payload.to_bytes()).fields
         return {key: fields for key, fields in self._fields.items() if key.split("/")[-2] == role}
 

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.tables import load_tables, resolve
 from coop.lockstep.lockstep import Lockstep
 from coop.studies.stacked.seeds import Seeds

@@ -26,8 +26,8 @@ from coop.common.messaging.joining import RETRY_PAUSE
 from coop.common.messaging.keys import join_key, replay_key, role_key, run_key, status_key, weights_key
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.messages.control import Join, Leave
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.messages.join import Join, Leave
 from coop.common.messaging.messages.status import ActorStatus
 from coop.common.messaging.messages.weights import Current, Role
 from coop.common.messaging.session import open_session
@@ -91,7 +91,7 @@ class SyntheticActor:
         self._again_at = 0.0
         self._asked: list[Pending] = []  # answers that nobody reads
         self._fetched = False
-        self._held, self._told, self._acting = [-1, -1], [-1, -1], 0
+        self._held, self._named, self._acting = [-1, -1], [-1, -1], 0
         self._incarnation = new_incarnation()
         self._request = Join("actor", self._incarnation, [])
         self._session = open_session((), (learner,))
@@ -160,15 +160,15 @@ class SyntheticActor:
         sample = self._role.try_recv()
         if sample is not None:
             role = Role.decode(wire.decode(sample.payload.to_bytes()))
-            self._acting, self._told = role.acting - 1, list(role.versions)
-        for network, version in enumerate(self._told):
+            self._acting, self._named = role.acting - 1, list(role.versions)
+        for network, version in enumerate(self._named):
             self._broadcasts.named(network, version)
             # A role follows each broadcast, so it tells the version of what came before it.
             if came[network] or self._fetched:
                 self._held[network] = version
         self._fetched = self._fetched and sample is None
-        held, told = self._held[self._acting], self._told[self._acting]
-        if held < told and time.monotonic() - self._broadcasts.named(self._acting, told) > GRACE:
+        held, named = self._held[self._acting], self._named[self._acting]
+        if held < named and time.monotonic() - self._broadcasts.named(self._acting, named) > GRACE:
             self.missing += 1
             self._fetch()
         return time.monotonic() - self._broadcasts.named(self._acting, held)

@@ -24,14 +24,11 @@ from coop.common.bounds import (
 from coop.common.errors import BadMessage
 from coop.common.messaging.keys import evaluations_key, join_key, replay_key, role_key, stop_key, weights_key
 from coop.common.messaging.members import Origin
-from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Limit, LimitsQuestion, Snapshot, Written
 from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
 from coop.common.messaging.messages.insert import SegmentReader, encode_segment
-from coop.common.messaging.messages.join import Join, Joined
-from coop.common.messaging.messages.limits import Limit, LimitsQuestion
 from coop.common.messaging.messages.sample import DrawRequest
-from coop.common.messaging.messages.stats import StatsQuestion
-from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.status import StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message
@@ -55,9 +52,9 @@ class Target:
     public: bool = False
 
 
-def targets(node: Node, joined: Joined) -> list[Target]:
+def targets(node: Node, reply: JoinReply) -> list[Target]:
     """All keys to which learner and replay service listen."""
-    spec, batch_size = joined.spec, joined.config.learner.batch_size
+    spec, batch_size = reply.spec, reply.config.learner.batch_size
     segment = _segment(spec)
 
     def sample(message: Message) -> None:

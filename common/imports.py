@@ -1,4 +1,4 @@
-"""Imports of users' own code, which settings name as "module:name" or as a module.
+"""Imports: of users' own code, which settings name as "module:name" or as a module; of extras; of large libraries.
 
 The settings of a run may be somebody else's. Then its code must not be: a module that lies in the run's folder or
 beside it is not imported, unless this process's user has named it, or has trained this very run with this very file.
@@ -7,12 +7,15 @@ beside it is not imported, unless this process's user has named it, or has train
 from __future__ import annotations
 
 import contextlib
+import gc
 import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial, reduce
+from importlib.util import find_spec
 from pathlib import Path
 from secrets import token_hex
 from types import ModuleType
@@ -171,3 +174,20 @@ def check_allowed(path: str, allowed: Collection[str], field: str) -> None:
 def describe(error: BaseException) -> str:
     """An exception of a user's code in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+
+
+def check_extra(flag: str, extra: str, module: str) -> None:
+    """Raise UsageError if the library that a flag needs is not installed."""
+    if find_spec(module) is None:
+        raise UsageError(f"{flag}: needs the extra {extra!r}: pip install 'coop-rl[{extra}]'")
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Import modules within it: they leave no garbage, and looking for it takes a tenth of their time."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()

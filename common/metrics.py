@@ -73,7 +73,7 @@ def _list(name: str, meaning: str, unit: str = "") -> Metric:
 
 METRICS = (
     _live("env_steps", "environment steps: one decision of one emulator each", "steps", counter=True),
-    _live("updates", "updates done; after a resumption they go on from its epoch", "updates", counter=True),
+    _live("updates", "updates done; after a resumption they go on from its checkpoint", "updates", counter=True),
     _live("episodes", "episodes that have ended", "episodes", counter=True),
     _live("bad_messages", "messages that the learner refused", "messages", counter=True),
     _live("faults", "errors of this program that the learner survived", "errors", counter=True),

@@ -1,9 +1,14 @@
-"""Numbers: the running mean of returns over the last 100 episodes, the paper's measure, exact text, strict JSON."""
+"""Numbers: running means of returns, exact text, strict JSON, the speed of a count, states of random generators.
+
+The running mean over the last 100 episodes is the paper's measure.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -44,3 +49,39 @@ def finite(value: Any) -> Any:  # noqa: ANN401 (as `strict_json`)
         case list() | tuple():
             return [finite(each) for each in value]
     return value
+
+
+def generator_state(rng: np.random.Generator) -> dict[str, Any]:
+    """The state of a Generator over PCG64, for `set_generator_state`.
+
+    128-bit numbers become text, because msgpack's integers have 64 bits.
+    """
+    state = rng.bit_generator.state
+    return {**state, "state": {name: str(number) for name, number in state["state"].items()}}
+
+
+def set_generator_state(rng: np.random.Generator, state: Mapping[str, Any]) -> None:
+    """Set `rng` to a state from `generator_state`."""
+    rng.bit_generator.state = {**state, "state": {name: int(digits) for name, digits in state["state"].items()}}
+
+
+class Rate:
+    """The growth per second of a count over the last seconds.
+
+    Args:
+        window: seconds to look back.
+    """
+
+    def __init__(self, window: float) -> None:
+        self._window = window
+        self._points: deque[tuple[float, int]] = deque()
+
+    def at(self, now: float, count: int) -> float:
+        """Note the count; return its rate, 0 at the first call."""
+        if self._points and now <= self._points[-1][0]:
+            self._points.pop()
+        self._points.append((now, count))
+        while len(self._points) > 2 and self._points[1][0] <= now - self._window:
+            self._points.popleft()
+        then, before = self._points[0]
+        return max(0.0, (count - before) / (now - then)) if now > then else 0.0

@@ -7,9 +7,8 @@ from functools import cached_property
 from importlib.metadata import entry_points
 from typing import Any, Generic, Protocol, TypeVar
 
-from coop.common.errors import UsageError
+from coop.common.errors import UsageError, not_among
 from coop.common.imports import import_object
-from coop.common.suggestions import not_among
 
 
 class Named(Protocol):

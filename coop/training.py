@@ -81,7 +81,7 @@ class TrainingRun:
             running = self.running  # read before the file, so that its last lines are not missed
             if path.exists():
                 if path.stat().st_size < place:
-                    place = 0  # a learner that was killed has gone back to its epoch; rows are not yielded twice
+                    place = 0  # a learner that was killed has gone back to its checkpoint; rows are not yielded twice
                 with path.open("rb") as file:
                     file.seek(place)
                     lines = file.read().rpartition(b"\n")[0]
@@ -97,7 +97,7 @@ class TrainingRun:
         self.wait()
 
     def stop(self) -> dict[str, Any] | None:
-        """Stop the run cleanly, with a closing epoch from which `resume=True` goes on; returns as `wait`."""
+        """Stop the run cleanly, with a closing checkpoint from which `resume=True` goes on; returns as `wait`."""
         self._stop.set("stopped")
         return self.wait()
 
@@ -161,7 +161,7 @@ def train(
         actors: actor processes of a distributed run.
         resume: continue the run in `run_dir`, from its newest whole checkpoint; start it if there is none yet.
         resume_from: as `resume`, but go back to the checkpoint with this number first.
-        overwrite: begin anew where `run_dir` holds a run, which is moved to its folder aside/.
+        overwrite: start over where `run_dir` holds a run, which is moved to its folder aside/.
         allow_import: modules of a resumed run's environment or network that may be imported even if they lie in its
             folder or beside it; those that `settings` name need not be listed.
         log: where metrics go beside the run's own files: names of sinks in a list, or in a text with commas:
@@ -183,7 +183,7 @@ def train(
             raise UsageError(f"actors = {actors}: in distributed runs only; a lockstep run is one process")
         directory = options.directory()
         run = LockstepRun(run_config, directory, "coop.train", options.start, log=names)
-        for line in run.told:
+        for line in run.notices:
             say(line)
         return TrainingRun(run_config, directory, lambda stop: _play(run, stop))
     if actors < 1:

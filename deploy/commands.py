@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
+from coop.common.imports import importing
 from coop.common.places import remember_working_directory
-from coop.common.process.importing import importing
 from coop.common.process.lifecycle import despite_threads, end_on_signals
 from coop.common.process.limits import limit_threads
 from coop.common.process.output import take_standard_files

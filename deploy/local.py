@@ -10,9 +10,9 @@ from coop.common.envs.make import check_filmed, env_spec
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.transport import new_incarnation
 from coop.common.places import shown
+from coop.common.process.cli import HttpAddress
 from coop.common.process.console import say, stamped
 from coop.common.process.files import make_folder, write_atomic
-from coop.common.process.flags import HttpAddress
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.ports import check_can_listen, check_loopback
 from coop.common.process.processes import ChildProcess, command, free_endpoint
@@ -63,7 +63,7 @@ class Topology:
         common = [f"--zenoh-config={options.zenoh_config}"] if options.zenoh_config else []
         common += ["--shared-memory"] if options.shared_memory else []
         joining = [f"--run={config.run}", "--connect", self.endpoint, f"--join-timeout={JOIN_TIMEOUT}", *common]
-        # --resume also at the first start, so that a restarted role continues from the newest epoch.
+        # --resume also at the first start, so that a restarted role continues from the newest checkpoint.
         files = [f"--run-dir={directory}", "--resume", *common]
         learning = [f"--config={resolved}", "--listen", self.endpoint, *files]
         learning += [f"--log={options.log}", *(["--restart"] if options.restart else [])]
@@ -177,8 +177,8 @@ def _run() -> None:
             check_can_listen("--prometheus", options.prometheus)
         with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
             # Before anything is written; what the roles find, they find by the same code.
-            _, told = options.start.prepare(directory, replay=not options.restart, settings=settings_digest(config))
-            for line in told:
+            _, notices = options.start.prepare(directory, replay=not options.restart, settings=settings_digest(config))
+            for line in notices:
                 say(line)
             lock.sign()
             _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)
@@ -210,7 +210,7 @@ def _supervise(
     if topology.learner.was_interrupted():
         topology.abort()
         say(f"{topology.learner.last_line()}; coop-local --resume --run-dir {shown(directory)} goes on")
-        stop.leave()
+        stop.raise_for_status()
         raise RunError(topology.learner.why())  # the learner alone was interrupted
     topology.finish()
     say(topology.learner.last_line())

@@ -47,7 +47,7 @@ def _run() -> None:
                 console.progress(0, "", lambda: links(session))
     finally:
         close(session)
-    stop.leave()
+    stop.raise_for_status()
 
 
 def links(session: zenoh.Session) -> str:

@@ -26,15 +26,15 @@ from torch import Tensor
 
 from coop.common.errors import UsageError, first_line
 from coop.common.networks.network import FlatNetwork
-from coop.common.process.notices import warn
-from coop.common.process.randomness import generator_state, set_generator_state
+from coop.common.numbers import generator_state, set_generator_state
+from coop.common.process.output import warn
 from coop.common.registry import loaded
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.types import Array, Batch, EnvSpec
 from coop.learner.edl.arrays import convert_like
-from coop.learner.edl.beside import Branches
+from coop.learner.edl.branches import Branches
 from coop.learner.given import Given
 from coop.learner.losses import LOSSES, Values, output_error, td_errors
 from coop.learner.methods.rule import UpdateRule

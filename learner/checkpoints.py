@@ -1,4 +1,4 @@
-"""Saves the epochs of a distributed run: begins them between two updates, writes them while training goes on."""
+"""Saves the checkpoints of a distributed run: begins them between two updates, writes them while training goes on."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 from coop.common.errors import CoopError, RunError
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Retry
-from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.control import Snapshot, Written
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.messaging.wire import Message
 from coop.common.process.files import FileDigest
-from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.shared_checkpoints import SharedCheckpoints
 from coop.records.checkpoints import DONE, KEPT, checkpoint_numbers
-from coop.records.learner_checkpoints import save_epoch
+from coop.records.learner_checkpoints import save_checkpoint
 from coop.records.run_directory import RunDirectory
 
 PATIENCE = 5.0  # seconds to wait for the replay service's answer
@@ -25,13 +25,13 @@ PAUSE = 0.05  # seconds between requests
 
 
 class Checkpoints:
-    """Saves epochs, one at a time.
+    """Saves checkpoints, one at a time.
 
-    If an epoch cannot be saved, one event says so, and the run continues without it.
+    If a checkpoint cannot be saved, one event says so, and the run continues without it.
 
     Args:
-        epochs: notes the finished epochs.
-        event: called with a line for each epoch.
+        shared: notes the finished checkpoints.
+        event: called with a line for each checkpoint.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Checkpoints:
         node: Node,
         directory: RunDirectory,
         samples: SampleClient,
-        epochs: SharedEpochs,
+        shared: SharedCheckpoints,
         event: Callable[[str], None],
     ) -> None:
         self._node = node
@@ -47,20 +47,20 @@ class Checkpoints:
         self._run_dir = directory.path
         self._event = event
         self._samples = samples
-        self._epochs = epochs
+        self._shared = shared
         self._writer: threading.Thread | None = None
 
     def begin(self, state: Callable[[], dict[str, Any]]) -> bool:
-        """Begin an epoch between two updates; do nothing and return False while the last one is being written."""
+        """Begin a checkpoint between two updates; do nothing and return False while the last one is being written."""
         if self._writing():
             return False
         number, frozen, records = self._samples.pin(), state(), self._directory.records()
-        self._writer = threading.Thread(target=self._try, args=(number, frozen, records), name=f"epoch {number}")
+        self._writer = threading.Thread(target=self._try, args=(number, frozen, records), name=f"checkpoint {number}")
         self._writer.start()
         return True
 
     def save(self, state: dict[str, Any]) -> None:
-        """Save an epoch and wait until it is written.
+        """Save a checkpoint and wait until it is written.
 
         Raises:
             RunError: it could not be saved; the message gives the reason.
@@ -69,7 +69,7 @@ class Checkpoints:
         self._save(self._samples.pin(), state, self._directory.records())
 
     def wait(self) -> None:
-        """Wait for the epoch being written, if there is one."""
+        """Wait for the checkpoint being written, if there is one."""
         if self._writer is not None:
             self._writer.join()
 
@@ -90,7 +90,7 @@ class Checkpoints:
             finally:
                 self._samples.release()
             written = Written(number).encode(self._node.run)
-            save_epoch(
+            save_checkpoint(
                 self._run_dir,
                 self._directory.run_id(),
                 number,
@@ -101,11 +101,11 @@ class Checkpoints:
                 settings=self._directory.settings,
             )
         except OSError as error:
-            raise RunError(f"epoch {number} in {self._run_dir}: {error.strerror or error}") from error
+            raise RunError(f"checkpoint {number} in {self._run_dir}: {error.strerror or error}") from error
         except CoopError as error:
-            raise RunError(f"epoch {number}: {error}") from error
-        self._epochs.finished(number)
-        self._event(f"epoch {number} saved, {time.monotonic() - began:.1f} s")
+            raise RunError(f"checkpoint {number}: {error}") from error
+        self._shared.finished(number)
+        self._event(f"checkpoint {number} saved, {time.monotonic() - began:.1f} s")
 
     def _wait_for(self, question: bytearray) -> None:
         while self._ask(question).kind == Retry.kind:

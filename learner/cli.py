@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from coop.common.envs.make import env_spec
 from coop.common.errors import UsageError
-from coop.common.process.importing import importing
+from coop.common.imports import importing
 from coop.common.process.lifecycle import run_main
 from coop.common.process.ports import check_can_listen
 from coop.common.settings.capacity import check_messages
@@ -33,7 +33,7 @@ def _run() -> None:
         LearnerOptions, "coop-learner", "Train the networks of a run; the other roles join it through this process."
     )
     if options.restart and not options.resume:
-        raise UsageError("--restart: needs --resume; it applies where that finds no epoch to continue from")
+        raise UsageError("--restart: needs --resume; it applies where that finds no checkpoint to continue from")
     for flag, address in (("--prometheus", options.prometheus), ("--health", options.health)):
         if address:
             check_can_listen(flag, address)

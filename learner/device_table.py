@@ -60,8 +60,8 @@ class DeviceTable:
     def sample(self, size: int, s: Any, rate: Any) -> Given:  # noqa: ANN401
         """Draw transitions uniformly, with replacement; s and rate: see `Given`."""
         chance = torch.rand(2, size, device=self._obs.device)
-        told = (self._ended, self._terminated, self._rewards, self._actions)
-        drawn = kernels.draws(chance, self.steps, told, self._powers, len(self._stack))
+        outcomes = (self._ended, self._terminated, self._rewards, self._actions)
+        drawn = kernels.draws(chance, self.steps, outcomes, self._powers, len(self._stack))
         *columns, index = self._drawn(chance) if drawn is None else drawn
         return Given(self._frames, index, BatchColumns(*columns), s, rate)
 

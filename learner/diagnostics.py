@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from coop.common.networks.inputs import preprocess
+from coop.common.networks.forward import preprocess
 from coop.common.types import Batch
 from coop.learner.losses import columns, td_errors
 from coop.learner.protocol import AnyAgent

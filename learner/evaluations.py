@@ -39,7 +39,7 @@ class EvaluationInbox:
         given = (Video if message.kind == Video.kind else Evaluated).decode(message)
         result = given if isinstance(given, Video) else given.result
         steps = self._env_step()
-        if result.env_step > steps:  # of a learner that has been killed and has gone back to its epoch since
+        if result.env_step > steps:  # of a learner that has been killed and has gone back to its checkpoint since
             raise RunError(f"an evaluation after {result.env_step:,} steps; this run has done {steps:,}")
         if given.number >= self._next.get(given.incarnation, 0):
             self._next[given.incarnation] = given.number + 1

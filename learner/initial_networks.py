@@ -6,7 +6,7 @@ from coop.common.errors import UsageError
 from coop.common.places import absolute
 from coop.common.process.untrusted import check_links
 from coop.learner.protocol import AnyAgent
-from coop.records.learner_checkpoints import fitting, newest_epoch
+from coop.records.learner_checkpoints import fitting, newest_checkpoint
 
 
 def load_initial_networks(agent: AnyAgent) -> None:
@@ -20,11 +20,11 @@ def load_initial_networks(agent: AnyAgent) -> None:
         return
     path = absolute(folder, "learner.initial_networks")
     check_links(path)
-    setting, epoch = f"learner.initial_networks = {folder!r}", newest_epoch(path)
-    if epoch is None:
+    setting, checkpoint = f"learner.initial_networks = {folder!r}", newest_checkpoint(path)
+    if checkpoint is None:
         raise UsageError(f"{setting}: holds no complete checkpoint of a run")
-    with fitting(epoch.path):
-        networks, size = epoch.state["agent"]["networks"], agent.networks[0].size
+    with fitting(checkpoint.path):
+        networks, size = checkpoint.state["agent"]["networks"], agent.networks[0].size
         if networks[0].numel() != size:
             own = networks[0].numel()
             raise UsageError(f"{setting}: its networks have {own:,} parameters; this run's have {size:,}")

@@ -11,15 +11,14 @@ from coop.common.errors import BadMessage
 from coop.common.messaging.keys import join_key
 from coop.common.messaging.members import JOINING, ROLES, Origin
 from coop.common.messaging.messages.answers import Retry
-from coop.common.messaging.messages.join import Farewell, Join, Joined, Leave
+from coop.common.messaging.messages.control import Farewell, Join, JoinReply, Leave
 from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import to_tables
 from coop.common.types import EnvSpec
-from coop.learner.members import MemberTracker
-from coop.learner.roster import AlreadyServed, Roster
-from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.roster import AlreadyServed, MemberTracker, Roster
+from coop.learner.shared_checkpoints import SharedCheckpoints
 
 
 class Departure:
@@ -33,7 +32,7 @@ class Departure:
 
     @property
     def is_due(self) -> bool:
-        """True while a replay service waits for an epoch to be saved."""
+        """True while a replay service waits for a checkpoint to be saved."""
         with self._lock:
             return self._asked is not None and self._asked != self._granted
 
@@ -58,7 +57,7 @@ class JoinService:
     """Answers requests to join or leave, and remembers where the replay service listens.
 
     Args:
-        epochs: determine the epoch from which the run continues.
+        shared: determine the checkpoint from which the run continues.
         event: called with a line when a member comes or goes.
 
     Attributes:
@@ -73,7 +72,7 @@ class JoinService:
         spec: EnvSpec,
         layout: str,
         run_id: int,
-        epochs: SharedEpochs,
+        shared: SharedCheckpoints,
         roster: Roster,
         event: Callable[[str], None],
     ) -> None:
@@ -85,7 +84,7 @@ class JoinService:
         self._spec = spec
         self._layout = layout
         self._run_id = run_id
-        self._epochs = epochs
+        self._shared = shared
         self._roster = roster
         self._replay_endpoints: list[str] = []
         self._replay: Origin | None = None
@@ -103,30 +102,30 @@ class JoinService:
         request = Join.decode(message)
         if key != join_key(self._node, request.role):
             raise BadMessage("fields.role", f"{request.role!r} asks at {join_key(self._node, request.role)}")
-        epoch, anew, index = self._epochs.newest, False, 0
+        checkpoint, anew, index = self._shared.newest, False, 0
         try:
             if request.role == "actor":
                 index = self._roster.actor(request)
             elif request.role == "replay" and request.endpoints:  # without endpoints it only asks which run this is
                 index = self._admit(request)
-                epoch, anew = self._epochs.offered(request)
+                checkpoint, anew = self._shared.offered(request)
         except AlreadyServed as other:
             return Retry(str(other)).encode(self._node.run)
         names = {"actor": f"actor {index}", "evaluator": "evaluator"}
         if request.role in names or request.endpoints:
-            self.members.joined(request, names.get(request.role, "replay service"))
-        joined = Joined(
+            self.members.add(request, names.get(request.role, "replay service"))
+        reply = JoinReply(
             self._config,
             self._spec,
             self._layout,
             index,
             self._replay_endpoints,
             self._run_id,
-            epoch,
+            checkpoint,
             anew,
             replay=self._replay,
         )
-        return joined.answer(self._node.run, self._tables)
+        return reply.answer(self._node.run, self._tables)
 
     def _admit(self, request: Join) -> int:
         """Admit a replay service, and send actors to it; return its number. Raises as `Roster.replay`."""
@@ -142,7 +141,7 @@ class JoinService:
             if key != join_key(self._node, "replay"):
                 raise BadMessage("fields.incarnation", "not an actor's")
             if not self.departure.ask(incarnation):
-                return Retry("an epoch must be saved first").encode(self._node.run)
+                return Retry("a checkpoint must be saved first").encode(self._node.run)
             self._roster.dismiss(incarnation)
         self.members.leaving(incarnation)
         return Farewell().encode(self._node.run)

@@ -1,4 +1,4 @@
-"""The process of a run's learner: begins the training or continues it from an epoch, and ends it properly."""
+"""The process of a run's learner: begins the training or continues it from a checkpoint, and ends it properly."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coop.common.messaging.session import SHORT_QUEUE, open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.console import Console, say
 from coop.common.process.lifecycle import Stop
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.capacity import mirror_slots
 from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest
@@ -25,7 +25,7 @@ from coop.learner.initial_networks import load_initial_networks
 from coop.learner.join_service import JoinService
 from coop.learner.roster import Roster
 from coop.learner.service import LearnerService
-from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.shared_checkpoints import SharedCheckpoints
 from coop.learner.trainer import Trainer
 from coop.monitor.health import answering
 from coop.records.learner_checkpoints import fitting, load_learner
@@ -43,11 +43,11 @@ def learn(options: LearnerOptions, config: RunConfig, spec: EnvSpec) -> None:
     path = options.directory()
     with RunLock(path, "coop-learner", ("learner",)) as lock:
         console = Console()
-        found, told = options.start.prepare(
+        found, notices = options.start.prepare(
             path, replay=False, settings=settings_digest(config), load=load_learner, every=True
         )
         _check_origin(found)
-        for line in told:
+        for line in notices:
             console.event(line)
         lock.sign()
         _train(options, config, spec, found, stop, console)
@@ -62,32 +62,32 @@ def _train(
     agent = trainer.agent
     if not held:
         load_initial_networks(agent)
-    epochs = SharedEpochs(held, str(path), restart=options.restart)
+    shared = SharedCheckpoints(held, str(path), restart=options.restart)
     incarnation = new_incarnation()
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory, send_queue=SHORT_QUEUE)
     with Node(session, config.run, "learner", incarnation) as node, answering(options.health, console):
         run_id = claim_run_directory(path, config) if found.newest is None else found.newest.manifest.run
         roster = Roster(path, time.monotonic(), run_id)
         layout = agent.networks[0].layout_digest()
-        join_service = JoinService(node, config, spec, layout, run_id, epochs, roster, console.event)
+        join_service = JoinService(node, config, spec, layout, run_id, shared, roster, console.event)
         console.event(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}")
         if held:
-            console.event("waiting for the replay service's list of epochs")
-        number = epochs.wait(stop)
+            console.event("waiting for the replay service's list of checkpoints")
+        number = shared.wait(stop)
         if number is None:
-            stop.leave()
+            stop.raise_for_status()
             return
         state = found.of(number).state if number else None
         if state is not None:
             with fitting(found.of(number).path):
                 trainer.load_state(state, time.monotonic())
             found = found.cut_back(number, "the replay service has no whole part of it")
-            told = "; ".join(found.fallbacks(number))
-            console.event(f"goes on from checkpoint {number}{told and f'; passes over {told}'}")
+            skipped = "; ".join(found.fallbacks(number))
+            console.event(f"resuming from checkpoint {number}{skipped and f'; passes over {skipped}'}")
         elif held:
             load_initial_networks(agent)
-            console.event("begins anew: no epoch is held by both")
-        settings, episodes_received = config.learner, 0 if state is None else state["told"]
+            console.event("starting over: learner and replay service share no checkpoint")
+        settings, episodes_received = config.learner, 0 if state is None else state["episodes_received"]
         for each in found.whole:
             each.state.clear()  # only its memory
         samples = SampleClient(
@@ -106,7 +106,7 @@ def _train(
         with RunDirectory(path, config, found, number or None, steps, log=options.log) as directory:
             if directory.aside:
                 console.event(directory.aside)
-            checkpoints = Checkpoints(node, directory, samples, epochs, console.event)
+            checkpoints = Checkpoints(node, directory, samples, shared, console.event)
             service = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console)
             with _exported(options.prometheus, service):
                 summary = service.run()
@@ -114,7 +114,7 @@ def _train(
     if trainer.diverged:
         raise RunError(trainer.diverged)
     if stop.failed or summary.exit == stop.reason:  # otherwise the run was complete before the signal
-        stop.leave()
+        stop.raise_for_status()
 
 
 def _mirror(config: RunConfig, spec: EnvSpec, console: Console) -> FrameMirror | None:
@@ -138,5 +138,5 @@ def _exported(address: str, service: LearnerService) -> AbstractContextManager[o
 
 def _check_origin(found: Survey) -> None:
     """Raise UsageError for a checkpoint of a lockstep run, before anything is written."""
-    if found.newest is not None and "told" not in found.newest.state:
+    if found.newest is not None and "episodes_received" not in found.newest.state:
         raise UsageError(f"{found.newest.path}: saved by a lockstep run; coop-lockstep --resume goes on with it")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from coop.common.errors import UsageError
-from coop.common.networks.inputs import preprocess
+from coop.common.networks.forward import preprocess
 from coop.common.networks.network import FlatNetwork, sample_inputs
 from coop.common.registry import loaded
 from coop.common.settings.config import RunConfig

@@ -9,10 +9,9 @@ import msgspec
 
 from coop.common.errors import RunError
 from coop.common.messaging.keys import replay_key, stop_key
+from coop.common.messaging.messages.control import EndOfRun
 from coop.common.messaging.messages.evaluate import EvaluationRow
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
-from coop.common.messaging.messages.status import LearnerStatus
-from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.status import LearnerStatus, ReplayStats, StatsQuestion
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.process.console import Console, progress_line
@@ -37,7 +36,7 @@ class LearnerService:
     """Trains from a replay service until the run is complete or stopped.
 
     Args:
-        trainer: new, or restored from the same epoch as the samples.
+        trainer: new, or restored from the same checkpoint as the samples.
     """
 
     def __init__(
@@ -71,7 +70,7 @@ class LearnerService:
 
         Raises:
             CoopError: the replay service rejected a request, gave an invalid answer, or could not save its state; or
-                there is no space for the closing epoch or the summary.
+                there is no space for the closing checkpoint or the summary.
         """
         outcome = ""
         try:
@@ -101,8 +100,8 @@ class LearnerService:
             if effects.ids is not None and effects.priorities is not None:
                 self._samples.prioritise(effects.ids, effects.priorities)
             self._apply(effects)
-            if trainer.epoch_due() and self._checkpoints.begin(self._state):
-                trainer.epoch_begun()
+            if trainer.checkpoint_due() and self._checkpoints.begin(self._state):
+                trainer.checkpoint_begun()
         elif trainer.all_updates_done() and (stats := self._replay_stats()) is not None:
             self._apply(trainer.receive(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
         if got is None and self._join_service.departure.is_due:
@@ -139,7 +138,7 @@ class LearnerService:
         self._reporter.publish_members(now)
 
     def _save_for_departure(self) -> None:
-        """Save an epoch for a replay service that waits for it before leaving."""
+        """Save a checkpoint for a replay service that waits for it before leaving."""
         try:
             if self._agent.updates and self._trainer.saveable():
                 self._checkpoints.save(self._state())
@@ -149,7 +148,7 @@ class LearnerService:
             self._join_service.departure.grant()
 
     def _save(self) -> None:
-        """Save the closing epoch, unless there was no update, the agent diverged or the replay service is gone."""
+        """Save the closing checkpoint, unless there was no update, the agent diverged or the replay service is gone."""
         if not self._agent.updates or not self._trainer.saveable():
             return
         deadline = time.monotonic() + (0 if self._stop.is_set() else REPLAY_BACK)
@@ -187,7 +186,7 @@ class LearnerService:
     def _state(self) -> dict[str, Any]:
         return {
             **self._trainer.state(time.monotonic()),
-            "told": self._samples.episodes,  # a name of the file format
+            "episodes_received": self._samples.episodes,
         }
 
     def _farewell(self, outcome: str) -> None:

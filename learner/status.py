@@ -23,9 +23,8 @@ from coop.common.messaging.messages.status import (
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import Node
 from coop.common.metrics import MEASURED
-from coop.common.numbers import finite
+from coop.common.numbers import Rate, finite
 from coop.common.process.console import Console
-from coop.common.process.rates import Rate
 from coop.learner.join_service import JoinService
 from coop.learner.trainer import Trainer
 

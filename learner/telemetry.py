@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coop.common.bounds import MAX_POINTS
 from coop.common.messaging.messages.sample import Drawn
 from coop.common.numbers import RETURN_WINDOW
 from coop.common.types import Array, Batch
 from coop.learner.diagnostics import Diagnostics
 from coop.learner.losses import Values
 from coop.learner.protocol import AnyAgent
-from coop.learner.return_history import ReturnHistory
 
 
 class Telemetry:
@@ -143,3 +143,33 @@ def powers_of_two(values: NDArray[np.integer[Any]]) -> list[int]:
     """
     counts: list[int] = np.bincount(np.frexp(values)[1]).tolist()
     return counts
+
+
+class ReturnHistory:
+    """Keeps the running mean at every n-th episode; n doubles whenever there are `MAX_POINTS` values.
+
+    values: the running means, the oldest first.
+    """
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+        self._every = 1
+
+    def add(self, episodes: int, mean: float) -> None:
+        """Note the running mean after the given number of episodes; called after each episode."""
+        if episodes % self._every:
+            return
+        if len(self.values) == MAX_POINTS:
+            self._every *= 2
+            self.values = self.values[1::2]
+            if episodes % self._every:
+                return
+        self.values.append(mean)
+
+    def state(self) -> dict[str, Any]:
+        """The state for `load_state`; torch.load reads it with weights_only."""
+        return {"values": list(self.values), "every": self._every}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore a state from `state`."""
+        self.values, self._every = list(state["values"]), state["every"]

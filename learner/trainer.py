@@ -55,7 +55,7 @@ class Trainer:
         diverged: which values are no longer finite, in words; empty if all are finite.
 
     What a GPU measures in an update is read `agent.lag` updates later, so that neither waits for the other; where a
-    broadcast, a row or an epoch is due it is read at once.
+    broadcast, a row or a checkpoint is due it is read at once.
     """
 
     def __init__(self, agent: AnyAgent, now: float) -> None:
@@ -67,7 +67,7 @@ class Trainer:
         self._began = now
         self.diverged = ""
         self._unread: deque[tuple[int, NDArray[np.int64], Update]] = deque()
-        self._next_epoch = agent.updates + self._epoch_every
+        self._next_checkpoint = agent.updates + self._checkpoint_every
 
     def train(self, batch: Batch, drawn: Drawn, now: float) -> Effects:
         """Update the acting network from a batch, with the counters and episodes in `drawn`."""
@@ -77,7 +77,7 @@ class Trainer:
         self._unread.append((agent.updates, batch.ids, update))
         broadcast = update.swapped or agent.updates % self.config.learner.publish_every == 0
         row = agent.updates % METRICS_EVERY == 0
-        ids, priorities = self._read(0 if broadcast or row or agent.updates >= self._next_epoch else agent.lag)
+        ids, priorities = self._read(0 if broadcast or row or agent.updates >= self._next_checkpoint else agent.lag)
         if broadcast and not self.diverged and not agent.finite():
             self.diverged = f"diverged: parameters are not finite at update {agent.updates}"
         return Effects(
@@ -127,13 +127,13 @@ class Trainer:
         """True once every planned update is done, so that no further batch brings the counters of the last steps."""
         return 0 < self.drawn.planned <= self.agent.updates
 
-    def epoch_due(self) -> bool:
-        """True if an epoch should begin now; it stays due until `epoch_begun`."""
-        return self.agent.updates >= self._next_epoch and self.saveable()
+    def checkpoint_due(self) -> bool:
+        """True if a checkpoint should begin now; it stays due until `checkpoint_begun`."""
+        return self.agent.updates >= self._next_checkpoint and self.saveable()
 
-    def epoch_begun(self) -> None:
-        """Count updates to the next epoch from here."""
-        self._next_epoch = self.agent.updates + self._epoch_every
+    def checkpoint_begun(self) -> None:
+        """Count updates to the next checkpoint from here."""
+        self._next_checkpoint = self.agent.updates + self._checkpoint_every
 
     def saveable(self) -> bool:
         """True while the agent may be saved; a diverged state must not be resumed."""
@@ -165,10 +165,10 @@ class Trainer:
         self.telemetry.load_state(state["telemetry"])
         self.drawn = Drawn(**state["drawn"], episodes=())
         self._began = now - state["seconds"]
-        self.epoch_begun()
+        self.checkpoint_begun()
 
     @property
-    def _epoch_every(self) -> float:
+    def _checkpoint_every(self) -> float:
         return self.config.checkpoint_every or math.inf
 
     def _number_episodes(self, drawn: Drawn) -> list[EpisodeRow]:

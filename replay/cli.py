@@ -12,7 +12,7 @@ from coop.common.errors import RunError
 from coop.common.messaging.endpoints import check_endpoints
 from coop.common.messaging.joining import Membership, join, leave_run
 from coop.common.messaging.links import locators
-from coop.common.messaging.messages.join import MOST_EPOCHS, Join, Joined
+from coop.common.messaging.messages.control import MOST_CHECKPOINTS, Join, JoinReply
 from coop.common.messaging.presence import LEASE
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
@@ -24,7 +24,7 @@ from coop.common.process.memory import keep_freed_memory
 from coop.common.settings.options import HealthOptions, RoleOptions
 from coop.monitor.health import answering
 from coop.replay.core import ReplayCore
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.folder import ReplayFolder
 from coop.replay.persistence.journal import Journal
 from coop.replay.persistence.recovery import recover
@@ -40,7 +40,7 @@ class ReplayOptions(RoleOptions, HealthOptions):
     advertise: tuple[str, ...] = ()
     """Endpoints to tell actors, for example tls/replay:7448; those that it listens on, by address, if not given."""
     run_dir: Path | None = None
-    """Folder for this service's part of the epochs; runs/RUN-replay-ID if not given, with the run's name and id."""
+    """Folder of this service's parts of checkpoints; runs/RUN-replay-ID if not given, with the run's name and id."""
     resume: bool = False
     """Continue from the state in --run-dir; start afresh if it holds nothing of this run yet."""
 
@@ -67,16 +67,16 @@ def _run() -> None:
             folder = ReplayFolder(options.run_dir or _named(options.run, known.run_id), known.run_id)
             console.event(folder.check(resume=options.resume))
             with folder.lock():
-                parts = ReplayEpochs(folder.path, known.run_id)
+                parts = ReplayCheckpoints(folder.path, known.run_id)
                 held = parts.intact()
                 if problems := parts.passed_over():
                     console.event(f"passes over {problems}")
                 endpoints = list(options.advertise) or locators(session)
-                request = Join("replay", incarnation, endpoints, epochs=held[-MOST_EPOCHS:])
-                joined = joining(request)
-                if joined is not None:
-                    _serve(node, stop, options, folder, request, joined, console)
-    stop.leave()
+                request = Join("replay", incarnation, endpoints, checkpoints=held[-MOST_CHECKPOINTS:])
+                reply = joining(request)
+                if reply is not None:
+                    _serve(node, stop, options, folder, request, reply, console)
+    stop.raise_for_status()
 
 
 def _named(run: str, run_id: int) -> Path:
@@ -89,18 +89,18 @@ def _serve(
     options: ReplayOptions,
     folder: ReplayFolder,
     request: Join,
-    joined: Joined,
+    reply: JoinReply,
     console: Console,
 ) -> None:
-    """Serve a run that this process has joined until the stop, and then until the learner has saved an epoch."""
-    service = _service(node, joined, folder, console, shared_memory=options.shared_memory)
+    """Serve a run that this process has joined until the stop, and then until the learner has saved a checkpoint."""
+    service = _service(node, reply, folder, console, shared_memory=options.shared_memory)
 
-    def learned(_: Joined, asked: float) -> None:
+    def learned(_: JoinReply, asked: float) -> None:
         service.confirm(asked + LEASE)
 
-    console.event(f"joined run {options.run!r} on {joined.learner}; listens on {', '.join(request.endpoints)}")
+    console.event(f"joined run {options.run!r} on {reply.learner}; listens on {', '.join(request.endpoints)}")
     rejoining = msgspec.structs.replace(request, serving=True)
-    with Membership(node, stop, rejoining, joined, options.patience, learned, console.event):
+    with Membership(node, stop, rejoining, reply, options.patience, learned, console.event):
         service.start()
         service.run(stop, console)
     if not stop.failed:
@@ -110,35 +110,35 @@ def _serve(
 
 
 def _service(
-    node: Node, joined: Joined, folder: ReplayFolder, console: Console, *, shared_memory: bool
+    node: Node, reply: JoinReply, folder: ReplayFolder, console: Console, *, shared_memory: bool
 ) -> ReplayService:
-    """Build a service from the folder's state: the learner's epoch, and the journal after it if there is one.
+    """Build a service from the folder's state: the learner's checkpoint, and the journal after it if there is one.
 
     Raises:
         RunError: the folder belongs to another run, or the journal cannot be read or written.
         UsageError: the folder's table has other settings.
     """
-    if joined.run_id != folder.run_id:
+    if reply.run_id != folder.run_id:
         raise RunError(f"another learner of run {node.run!r} has begun while this one joined")
-    core = ReplayCore(joined.config, joined.spec, shared_memory=shared_memory)
-    epochs = ReplayEpochs(folder.path, folder.run_id)
+    core = ReplayCore(reply.config, reply.spec, shared_memory=shared_memory)
+    checkpoints = ReplayCheckpoints(folder.path, folder.run_id)
     try:
-        aside = epochs.go_back(joined.epoch, anew=joined.anew)
+        aside = checkpoints.go_back(reply.checkpoint, anew=reply.anew)
     except OSError as error:
         raise RunError(f"{folder.path}: {error.strerror or error}") from error
-    first, found = epochs.restore(core, joined.epoch)
+    first, found = checkpoints.restore(core, reply.checkpoint)
     for line in filter(None, (aside, found)):
         console.event(line)
-    if joined.config.replay.journal:
-        number, told = recover(core, folder.journal, first, folder.run_id)
-        for line in told:
+    if reply.config.replay.journal:
+        number, notices = recover(core, folder.journal, first, folder.run_id)
+        for line in notices:
             console.event(line)
         try:
-            settings = joined.config.replay
+            settings = reply.config.replay
             accepted = core.table.inserted
             journal = Journal(folder.journal, folder.run_id, number, keep=settings.journal_keep, accepted=accepted)
         except OSError as error:
             raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
         core.recorder = journal
-        epochs = ReplayEpochs(folder.path, folder.run_id, journal)
-    return ReplayService(node, core, epochs, confirmed=0.0)
+        checkpoints = ReplayCheckpoints(folder.path, folder.run_id, journal)
+    return ReplayService(node, core, checkpoints, confirmed=0.0)

@@ -63,7 +63,7 @@ class ReplayCore:
     """A table with its limiter and counters. One owner makes all calls.
 
     batch_size: transitions of a draw. segment_steps: of a segment, at most.
-    drawn: batches drawn, as the learner counts them: a learner restored from an epoch also resets this count.
+    drawn: batches drawn, as the learner counts them: a learner restored from a checkpoint also resets this count.
     mirrored: what the present learner's mirror holds.
     damaged: acknowledged transitions that damaged records of the journal held.
     problem: why no segment can be inserted although the limiter admits it, in words; empty if there is no problem.
@@ -231,7 +231,7 @@ class ReplayCore:
     def snapshot(self, base: int, keep: Sequence[int] = ()) -> CoreSnapshot:
         """Take a snapshot that can serve a learner restored at `base` updates.
 
-        keep: the older epochs to which a learner may return. Episodes that none of them needs are dropped.
+        keep: the older checkpoints to which a learner may return. Episodes that none of them needs are dropped.
         """
         again = (drawn.first_episode for _, drawn in self._replies.values() if drawn.sequence >= base)
         self._episodes.mark(base, min(again, default=self._next_episode), keep)
@@ -273,7 +273,7 @@ class ReplayCore:
         self._replies = {drawn.sequence: Reply(self.table.pin(batch), drawn) for batch, drawn in replies}
 
     def _follow(self, request: DrawRequest) -> None:
-        """Set the count of draws to the learner's count of updates if either side has returned to an epoch."""
+        """Set the count of draws to the learner's count of updates if either side has returned to a checkpoint."""
         known = self._learners[-1:] == [request.incarnation]
         if not known:
             if request.incarnation in self._learners:

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Sequence
 
 from coop.common.types import EpisodeRecord
 
-MOST = 131_072  # episodes kept; if a run saves no epoch, the oldest are dropped
+MOST = 131_072  # episodes kept; if a run saves no checkpoint, the oldest are dropped
 
 
 class EpisodeLog:
     """Episodes in the order in which they ended, numbered from 0.
 
-    first: number of the oldest episode kept. floors: by epoch, the first episode for which a learner restored from that
-    epoch asks.
+    first: number of the oldest episode kept. floors: by checkpoint, the first episode for which a learner restored from
+    it asks.
     """
 
     def __init__(self) -> None:
@@ -42,12 +42,12 @@ class EpisodeLog:
         """Make the log end at `total` at least: a learner has received that many, and their numbers must not change."""
         self.first = max(self.first, total - len(self._records))
 
-    def mark(self, epoch: int, floor: int, keep: Sequence[int]) -> None:
-        """Note the first episode that a learner restored from `epoch` needs; drop those that no epoch in `keep` needs.
+    def mark(self, checkpoint: int, floor: int, keep: Sequence[int]) -> None:
+        """Note the first episode that a learner restored from `checkpoint` needs; drop those that none in `keep` needs.
 
         If `keep` is empty, a restored learner begins at the first episode.
         """
-        self.floors = {number: self.floors.get(number, self.first) for number in keep} | {epoch: floor}
+        self.floors = {number: self.floors.get(number, self.first) for number in keep} | {checkpoint: floor}
         if keep:
             self._drop(min(self.floors.values()))
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from coop.common.errors import RunError
 from coop.common.messaging.joining import join
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.join import Join
-from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from coop.common.messaging.messages.control import Join, Limit, Limits, LimitsQuestion
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process import cli
@@ -42,10 +41,10 @@ def _run() -> None:
     stop.on_signals()
     request = Join("watch", new_incarnation(), [])  # asks for the replay service's endpoints
     with Node(open_session((), options.connect, options.zenoh_config), options.run, "watch", 0) as node:
-        joined = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
-    if joined is None:
+        reply = join(node, stop, request, options.connect, options.join_timeout, need_replay=True)
+    if reply is None:
         return
-    endpoints = (*options.connect, *joined.replay_endpoints)
+    endpoints = (*options.connect, *reply.replay_endpoints)
     with Node(open_session((), endpoints, options.zenoh_config), options.run, "watch", 0) as node:
         now = _ask(node, LimitsQuestion().encode(node.run))
         if options.ratio is not None or options.tolerance is not None:

@@ -19,19 +19,17 @@ from coop.common.errors import BadMessage, CoopError, RunError
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack, Retry
-from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.control import Limit, Limits, LimitsQuestion, Snapshot, Written
 from coop.common.messaging.messages.insert import SegmentReader
-from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
 from coop.common.messaging.messages.sample import DrawRequest, Draws, Memory, encode_batch, encode_named
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
-from coop.common.messaging.messages.status import Ratio, ReplayStatus
+from coop.common.messaging.messages.status import Ratio, ReplayStats, ReplayStatus, StatsQuestion
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.messaging.wire import Message
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
 from coop.replay.core import ReplayCore, Reply, RetryLater
 from coop.replay.gate import HOLD, Gate
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 
 LEAVING = "the replay service is stopping"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"
@@ -45,15 +43,17 @@ class ReplayService:
     """Serves one core on one node until the session closes.
 
     Args:
-        epochs: writes the core's part of epochs; the core may have been restored from one.
+        checkpoints: writes the core's part of checkpoints; the core may have been restored from one.
         confirmed: the time on the monotonic clock until which this service may acknowledge and draw (default: for
             ever). Later another one may serve, which a process that was frozen or cut off cannot know.
     """
 
-    def __init__(self, node: Node, core: ReplayCore, epochs: ReplayEpochs, confirmed: float = math.inf) -> None:
+    def __init__(
+        self, node: Node, core: ReplayCore, checkpoints: ReplayCheckpoints, confirmed: float = math.inf
+    ) -> None:
         self._node = node
         self._core = core
-        self._epochs = epochs
+        self._checkpoints = checkpoints
         self._confirmed = confirmed
         self._read_segment = SegmentReader(core.table.spec)
         self._changed = threading.Condition()
@@ -74,7 +74,7 @@ class ReplayService:
         node.serve(replay_key(node, "snapshot"), self._snapshot)
 
     def run(self, stop: Stop, console: Console) -> None:
-        """Publish the status until the stop; from then on save epochs, but acknowledge and draw nothing."""
+        """Publish the status until the stop; from then on save checkpoints, but acknowledge and draw nothing."""
         problem = ""
         while not stop.wait(STATUS_EVERY):
             if self._broken:
@@ -96,8 +96,8 @@ class ReplayService:
         return f"{stats.inserted:,} transitions inserted, {stats.size:,} held, {stats.drawn:,} batches drawn"
 
     def close(self) -> None:
-        """Wait for the epoch being written."""
-        self._epochs.close()
+        """Wait for the checkpoint being written."""
+        self._checkpoints.close()
 
     def confirm(self, until: float) -> None:
         """Permit acknowledging and drawing until then, see `confirmed`."""
@@ -268,7 +268,7 @@ class ReplayService:
         if message.kind == Snapshot.kind:
             request = Snapshot.decode(message)
             with self._changing():
-                self._epochs.begin(self._core, self._changed, request.number, request.keep)
-        elif not self._epochs.written(Written.decode(message).number, HOLD):
-            return Retry("the replay service is writing its part of the epoch").encode(self._node.run)
+                self._checkpoints.begin(self._core, self._changed, request.number, request.keep)
+        elif not self._checkpoints.written(Written.decode(message).number, HOLD):
+            return Retry("the replay service is writing its part of the checkpoint").encode(self._node.run)
         return Ack(self._core.table.inserted).encode(self._node.run)

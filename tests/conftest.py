@@ -18,7 +18,7 @@ import torch
 
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.methods import METHODS
 from coop.common.types import EnvSpec
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from coop.common.networks.convolution import ConvolutionNetwork
-from coop.common.networks.dense import Dense
+from coop.common.networks.convolution import ConvolutionNetwork, Dense
 from coop.learner.edl.backprop import UnsupportedLayerError
 from coop.learner.edl.convolution import ConvolutionBackprop
 from coop.learner.edl.numpy_backprop import NumpyBackprop

@@ -21,9 +21,9 @@ def test_a_kill_of_each_role(tmp_path: Path) -> None:
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
-    told = dict(re.split(r" {2,}", line, maxsplit=1) for line in done.stdout.splitlines())
-    assert told["kills"].startswith("3 (")
-    assert told["lost"] == "0"
-    assert re.fullmatch(r"0 of [12],\d{3}", told["duplicated"])
-    assert told["restarts"] == "3"
-    assert "bit for bit" in told["re-executed"]
+    report = dict(re.split(r" {2,}", line, maxsplit=1) for line in done.stdout.splitlines())
+    assert report["kills"].startswith("3 (")
+    assert report["lost"] == "0"
+    assert re.fullmatch(r"0 of [12],\d{3}", report["duplicated"])
+    assert report["restarts"] == "3"
+    assert "bit for bit" in report["re-executed"]

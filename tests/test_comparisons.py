@@ -29,8 +29,8 @@ def run(returns: list[float], ends: list[float]) -> Run:
 def test_the_course_of_a_run_that_collapses_once() -> None:
     # Means of 20 episodes: 200 at step 200, 195 at 210, 145 at 310, 100 at 400, 195 at 590, 200 at 600.
     returns = [200.0] * 20 + [100.0] * 20 + [200.0] * 20
-    told = course(run(returns, [10.0 * (n + 1) for n in range(60)]), 195.0)
-    assert told == (200.0, pytest.approx(30 / 400), 1, 110.0 + 10.0)
+    measured = course(run(returns, [10.0 * (n + 1) for n in range(60)]), 195.0)
+    assert measured == (200.0, pytest.approx(30 / 400), 1, 110.0 + 10.0)
 
 
 @pytest.mark.parametrize(
@@ -44,8 +44,8 @@ def test_the_course_of_a_run_that_collapses_once() -> None:
     ],
 )
 def test_courses(returns: list[float], threshold: float, expected: tuple[float, ...]) -> None:
-    told = course(run(returns, [float(n + 1) for n in range(len(returns))]), threshold)
-    assert told == pytest.approx(expected, nan_ok=True)
+    measured = course(run(returns, [float(n + 1) for n in range(len(returns))]), threshold)
+    assert measured == pytest.approx(expected, nan_ok=True)
 
 
 def test_area_and_running_mean() -> None:

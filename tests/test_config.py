@@ -161,8 +161,8 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
         (["--env.repeat-action-probability", "1.0"], ["env.repeat_action_probability", "1.0", "less than 1"]),
         (["--env.id", "x" * 257], ["env.id", "256"]),
         (["--actor.segment-steps", "100000"], ["actor.segment_steps", "100000", "4096"]),
-        (["--actor.envs", "65537"], ["actor.envs", "65536"]),
-        (["--actor.window", "1025"], ["actor.window", "1024"]),
+        (["--actor.num-envs", "65537"], ["actor.num_envs", "65536"]),
+        (["--actor.max-in-flight", "1025"], ["actor.max_in_flight", "1024"]),
         (["--learner.batch-size", "100000"], ["learner.batch_size", "100000", "65536"]),
         (["--replay.ratio", "1e7"], ["replay.ratio", "1000000"]),
         (["--replay.tolerance", "1e13"], ["replay.tolerance", "1000000000000"]),
@@ -186,7 +186,7 @@ def test_refused_in_one_line(flags: list[str], words: list[str], monkeypatch: py
     [
         ({"replay": {"capcity": 5}}, "replay.capcity = 5: no such field; did you mean capacity? allowed: capacity, "),
         ({"speed": 5}, "speed = 5: no such field; did you mean seed? allowed: run, method"),
-        ({"own": 5}, "own = 5: no such field; allowed: run, method"),
+        ({"method_settings": 5}, "method_settings = 5: no such field; did you mean methods? allowed: run, method"),
         (
             {"method": "medqn", "medqn": {"lambda": 5}},
             "medqn.lambda = 5: no such field; did you mean lambda_end?",

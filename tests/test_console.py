@@ -6,9 +6,9 @@ import pytest
 from msgspec.structs import replace
 
 from coop.common.messaging.members import Origin
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join
 from coop.common.process.console import RECENT, STALL_AFTER, Console, PeerMonitor, StallDetector, counted, progress_line
-from coop.learner.members import FORGOTTEN, MemberTracker
+from coop.learner.roster import FORGOTTEN, MemberTracker
 
 STATUS = {
     "env_steps": 9964,
@@ -60,7 +60,7 @@ def test_members_come_and_go() -> None:
     events: list[str] = []
     members = MemberTracker(events.append)
 
-    def told() -> list[str]:
+    def new_events() -> list[str]:
         new = list(events)
         events.clear()
         return new
@@ -68,31 +68,34 @@ def test_members_come_and_go() -> None:
     members.token(1, True, 0.0)
     service = Join("replay", 1, ["tcp/rep:1"], origin=Origin("rep", 7))
     actor = Join("actor", 2, [], origin=Origin("act", 8))
-    members.joined(service, "replay service")
-    members.joined(replace(service, index=0), "replay service")  # asks each moment
-    members.joined(actor, "actor 0")
-    assert told() == ["replay service on rep (pid 7) joined; it listens on tcp/rep:1", "actor 0 on act (pid 8) joined"]
+    members.add(service, "replay service")
+    members.add(replace(service, index=0), "replay service")  # asks each moment
+    members.add(actor, "actor 0")
+    assert new_events() == [
+        "replay service on rep (pid 7) joined; it listens on tcp/rep:1",
+        "actor 0 on act (pid 8) joined",
+    ]
     members.token(2, False, 1.0)
     members.token(99, False, 1.0)  # one that never joined
-    assert told() == ["actor 0 on act (pid 8) does not answer"]
+    assert new_events() == ["actor 0 on act (pid 8) does not answer"]
     assert members.missing(1.0) == ["actor 0 on act (pid 8)"]
     members.token(2, True, 2.0)
-    assert told() == ["actor 0 on act (pid 8) is back"]
+    assert new_events() == ["actor 0 on act (pid 8) is back"]
     assert members.missing(2.0) == []
     members.token(1, False, 3.0)
     members.token(2, False, 3.0)
-    told()
-    members.joined(replace(actor, incarnation=3, origin=Origin("act", 9)), "actor 1")
+    new_events()
+    members.add(replace(actor, incarnation=3, origin=Origin("act", 9)), "actor 1")
     assert members.missing(3.0) == ["replay service on rep (pid 7)"], "another one has taken the actor's place"
     assert members.missing(3.0 + FORGOTTEN) == []
-    told()
+    new_events()
     members.token(2, True, 4.0)
-    assert told() == ["actor 0 on act (pid 8) is back"], "although another one had taken its place"
+    assert new_events() == ["actor 0 on act (pid 8) is back"], "although another one had taken its place"
     members.leaving(2)
     members.token(2, False, 4.0)
-    assert told() == ["actor 0 on act (pid 8) left"]
-    members.joined(replace(actor, index=0), "actor 0")
-    assert told() == ["actor 0 on act (pid 8) is back"]
+    assert new_events() == ["actor 0 on act (pid 8) left"]
+    members.add(replace(actor, index=0), "actor 0")
+    assert new_events() == ["actor 0 on act (pid 8) is back"]
 
 
 def test_a_standstill_is_told_once() -> None:

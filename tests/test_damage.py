@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from commands import run_command
 from samples import make_segment
-from test_epochs import CONFIG, save, save_learner
+from test_checkpoints import CONFIG, save, save_learner
 from test_journal import _insert, _use
 
 import coop
@@ -33,7 +33,7 @@ from coop.records.locks import _place
 from coop.records.reading import read_csv, read_jsonl, read_lines
 from coop.records.resumption import survey
 from coop.replay.core import ReplayCore, RetryLater
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import HEADER_BYTES, SEGMENT, Header, Journal
 from coop.replay.persistence.journal import _packed as packed_header
 from coop.replay.persistence.recovery import recover
@@ -147,7 +147,7 @@ def test_a_fallback_is_said_everywhere_and_younger_ones_are_kept_aside(run: Path
     done = resume(run, "--total-steps", "300")
     assert done.returncode == 0, done.stderr
     why = "checkpoint 220: replay/frames.npy: wrong checksum"
-    assert done.stdout.startswith(f"goes on from checkpoint 200; passes over {why}\n")
+    assert done.stdout.startswith(f"resuming from checkpoint 200; passes over {why}\n")
     assert json.loads((run / "summary.json").read_text())["fallbacks"] == [why]
     (aside,) = (run / "aside").iterdir()
     assert contents(aside / "checkpoints" / "220") == damaged
@@ -161,13 +161,15 @@ def test_readers_of_networks_take_the_older_one_and_say_so(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (run / "checkpoints" / "220" / "learner.pt").unlink()
-    told = f"warning: {run}: takes checkpoint 200; passes over checkpoint 220: learner.pt: No such file or directory\n"
-    assert next(evaluate_checkpoint(run, 1, 0)).epoch == 200
-    assert capsys.readouterr().err == told
-    assert export(run, tmp_path / "out").epoch == 200
-    assert capsys.readouterr().err == told
-    assert coop.load(run).checkpoint().epoch == 200
-    assert capsys.readouterr().err == told
+    warning = (
+        f"warning: {run}: takes checkpoint 200; passes over checkpoint 220: learner.pt: No such file or directory\n"
+    )
+    assert next(evaluate_checkpoint(run, 1, 0)).checkpoint == 200
+    assert capsys.readouterr().err == warning
+    assert export(run, tmp_path / "out").checkpoint == 200
+    assert capsys.readouterr().err == warning
+    assert coop.load(run).checkpoint().number == 200
+    assert capsys.readouterr().err == warning
 
 
 @pytest.mark.parametrize("other", ["best", "0220", "٣", "-1", "2.5", "1000"])
@@ -181,7 +183,7 @@ def test_folders_of_the_user_among_the_checkpoints_are_the_users(other: str, run
     done = resume(run, "--total-steps", "500", "--checkpoint-every", "50")
     assert done.returncode == 0, done.stderr
     assert contents(mine) == before
-    assert next(evaluate_checkpoint(run, 1, 0)).epoch == 460
+    assert next(evaluate_checkpoint(run, 1, 0)).checkpoint == 460
 
 
 def test_a_file_of_the_user_in_an_old_checkpoint_outlives_it(tmp_path: Path) -> None:
@@ -195,14 +197,14 @@ def test_a_file_of_the_user_in_an_old_checkpoint_outlives_it(tmp_path: Path) -> 
 
 def test_a_replay_service_lists_only_its_own_parts(spec: EnvSpec, tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal", 5, 1, keep=False)
-    core, epochs = ReplayCore(CONFIG, spec, journal), ReplayEpochs(tmp_path, 5, journal)
+    core, checkpoints = ReplayCore(CONFIG, spec, journal), ReplayCheckpoints(tmp_path, 5, journal)
     mine = tmp_path / "checkpoints" / "best" / "replay"
     mine.mkdir(parents=True)
     (tmp_path / "journal" / "notes.log").write_text("mine")
     for number in (10, 20, 30):
         core.insert(make_segment(spec, number))
-        save(core, epochs, number, number - 10)
-    assert epochs.intact() == [20, 30]
+        save(core, checkpoints, number, number - 10)
+    assert checkpoints.intact() == [20, 30]
     assert mine.exists()
     assert (tmp_path / "journal" / "notes.log").read_text() == "mine"
 
@@ -229,7 +231,7 @@ def test_shorter_records_cost_a_checkpoint_or_are_accepted_by_name(run: Path) ->
     os.truncate(metrics, sizes["220"] - 1)
     if sizes["200"] < sizes["220"]:
         done = resume(Path(shutil.copytree(run, run.with_name("other"))), "--total-steps", "300")
-        assert "goes on from checkpoint 200; passes over checkpoint 220: metrics.jsonl: has" in done.stdout
+        assert "resuming from checkpoint 200; passes over checkpoint 220: metrics.jsonl: has" in done.stdout
     os.truncate(metrics, 10)
     before = contents(run)
     done = resume(run, "--total-steps", "300")
@@ -328,10 +330,10 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
         (tmp_path / name).write_text("a line\n")
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(Path, "replace", renamed)
-    from coop.records.learner_checkpoints import save_epoch  # noqa: PLC0415 (with what is patched)
+    from coop.records.learner_checkpoints import save_checkpoint  # noqa: PLC0415 (with what is patched)
 
     records = {name: measure(tmp_path / name) for name in checkpoints.RECORDS}
-    save_epoch(tmp_path, 5, 100, {"a": 1}, lambda _: calls.append("replay"), records=records)
+    save_checkpoint(tmp_path, 5, 100, {"a": 1}, lambda _: calls.append("replay"), records=records)
     order = [calls.index(each) for each in ("name checkpoints/100/learner.pt", "replay", "sync episodes.csv")]
     done = calls.index("name checkpoints/100/DONE")
     assert order == sorted(order)
@@ -341,7 +343,7 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
     assert calls[done + 1] == "sync checkpoints/100"
     (tmp_path / "metrics.jsonl").write_text("")
     with pytest.raises(OSError, match=r"metrics\.jsonl: lines wait for space"):
-        save_epoch(tmp_path, 5, 200, {}, lambda _: None, records=records)
+        save_checkpoint(tmp_path, 5, 200, {}, lambda _: None, records=records)
 
 
 def test_a_run_over_processes_goes_on_from_the_checkpoint_that_both_hold(tmp_path: Path) -> None:
@@ -354,7 +356,7 @@ def test_a_run_over_processes_goes_on_from_the_checkpoint_that_both_hold(tmp_pat
     done = run_command("coop-local", *flags, "--resume", "--total-steps", "300")
     assert done.returncode == 0, done.stderr
     why = f"passes over checkpoint {newest}: replay/actions.npy: wrong checksum\n"
-    assert done.stdout.startswith(f"goes on from checkpoint {older}; {why}")
+    assert done.stdout.startswith(f"resuming from checkpoint {older}; {why}")
     summary = json.loads((path / "summary.json").read_text())
     assert (summary["exit"], summary["transitions_lost"]) == ("complete", 0)
     assert summary["fallbacks"] == [f"checkpoint {newest}: the replay service has no whole part of it"]
@@ -411,12 +413,12 @@ def test_a_damaged_record_costs_only_itself_and_is_counted(
     flip(tmp_path / "00000001.log", at[2] + place)
     before = contents(tmp_path)
     twin = ReplayCore(AHEAD, spec)
-    number, told = recover(twin, tmp_path, 1, 5)
+    number, notices = recover(twin, tmp_path, 1, 5)
     assert number == 2
     assert (twin.table.inserted, twin.lost) == (24 - lost, lost)
     if lost:
-        assert pytest.importorskip("re").search(words, told[1]), told
-        assert "the journal lacks 4 transitions that had been acknowledged" in told[2]
+        assert pytest.importorskip("re").search(words, notices[1]), notices
+        assert "the journal lacks 4 transitions that had been acknowledged" in notices[2]
     assert contents(tmp_path) == before, "reading changes nothing"
     twin.recorder = Journal(tmp_path, 5, number, keep=False, accepted=twin.table.inserted)
     assert not isinstance(_insert(twin, spec, 6), RetryLater)
@@ -437,11 +439,11 @@ def test_a_record_is_no_longer_than_a_message(length: int, spec: EnvSpec, tmp_pa
         file.truncate(1 << 41)
     tracemalloc.start()
     twin = ReplayCore(AHEAD, spec)
-    _, told = recover(twin, tmp_path, 1, 5)
+    _, notices = recover(twin, tmp_path, 1, 5)
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert (twin.table.inserted, twin.lost) == (20, 4)
-    assert f"record 3 at byte {at[2]:,}, a segment, is damaged" in told[1]
+    assert f"record 3 at byte {at[2]:,}, a segment, is damaged" in notices[1]
     assert most < 1 << 25
 
 
@@ -451,9 +453,9 @@ def test_a_page_of_zeros_costs_what_it_covers(spec: EnvSpec, tmp_path: Path) -> 
     data[at[1] + 10 : at[3] + 10] = bytes(at[3] - at[1])
     (tmp_path / "00000001.log").write_bytes(data)
     twin = ReplayCore(AHEAD, spec)
-    _, told = recover(twin, tmp_path, 1, 5)
+    _, notices = recover(twin, tmp_path, 1, 5)
     assert (twin.table.inserted, twin.lost) == (12, 12)
-    assert "records 2 to 4 before byte" in told[1]
+    assert "records 2 to 4 before byte" in notices[1]
 
 
 def test_draws_of_what_is_lost_are_passed_over(spec: EnvSpec, tmp_path: Path) -> None:
@@ -479,9 +481,9 @@ def test_a_missing_file_and_the_end_of_a_file_are_counted(spec: EnvSpec, tmp_pat
     (tmp_path / "00000003.log").unlink()
     os.truncate(tmp_path / "00000005.log", (tmp_path / "00000005.log").stat().st_size - HEADER_BYTES - 10)
     twin = ReplayCore(AHEAD, spec)
-    _, told = recover(twin, tmp_path, 1, 5)
+    _, notices = recover(twin, tmp_path, 1, 5)
     assert (twin.table.inserted, twin.lost) == (16, 8)
-    assert "file 3 is missing" in told[1]
+    assert "file 3 is missing" in notices[1]
 
 
 def test_a_kill_is_no_damage(spec: EnvSpec, tmp_path: Path) -> None:
@@ -492,9 +494,9 @@ def test_a_kill_is_no_damage(spec: EnvSpec, tmp_path: Path) -> None:
     for left in (without_header, without_header[:-1], without_header[: at[5] + 1], content[: at[5]]):
         (tmp_path / "00000001.log").write_bytes(left)
         twin = ReplayCore(AHEAD, spec)
-        _, told = recover(twin, tmp_path, 1, 5)
-        assert (twin.table.inserted, twin.lost, len(told)) == (20, 0, 1)
-        assert told[0].endswith("which ends as a kill leaves it")
+        _, notices = recover(twin, tmp_path, 1, 5)
+        assert (twin.table.inserted, twin.lost, len(notices)) == (20, 0, 1)
+        assert notices[0].endswith("which ends as a kill leaves it")
 
 
 def test_a_kill_within_a_record_leaves_none(spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -537,10 +539,10 @@ def test_lines_that_cannot_be_read_are_named(
     path.write_bytes(damage(path.read_bytes()))
     try:
         read_csv(path) if name.endswith("csv") else read_jsonl(path)
-        told = capsys.readouterr().err
+        message = capsys.readouterr().err
     except RunError as error:
-        told = str(error)
-    assert words in told
+        message = str(error)
+    assert words in message
     with pytest.raises(RunError, match=name.replace(".", r"\.")):
         load_study(run.parent)
     with pytest.raises(RunError, match=name.replace(".", r"\.")):

@@ -59,7 +59,7 @@ def test_a_run_goes_on_after_its_worker_and_stops_at_ctrl_c(cluster: subprocess.
     print(0, file=cluster.stdin, flush=True)
     wait_for(command, lambda: "\nworkers: 0, threads: 0; gone: tcp://127.0.0.1:" in command.output()[0])
     print(1, file=cluster.stdin, flush=True)
-    wait_for(command, lambda: "goes on from checkpoint" in (run / "run.log").read_text())
+    wait_for(command, lambda: "resuming from checkpoint" in (run / "run.log").read_text())
     command.interrupt()
     done = command.end(200)
     assert (done.returncode, done.stderr) == (
@@ -108,8 +108,8 @@ def test_what_dask_needs_is_checked_first(
     flags = ("--dask", "tcp://head:8786")
     assert refused(tmp_path, monkeypatch, capsys, *flags, "--slurm") == "--dask and --slurm: give one of them\n"
     monkeypatch.setitem(sys.modules, "distributed", None)
-    told = refused(tmp_path, monkeypatch, capsys, *flags)
-    assert told == "--dask: needs the extra 'dask': pip install 'coop-rl[dask]'\n"
+    printed = refused(tmp_path, monkeypatch, capsys, *flags)
+    assert printed == "--dask: needs the extra 'dask': pip install 'coop-rl[dask]'\n"
 
 
 def refused(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *flags: str) -> str:
@@ -118,10 +118,10 @@ def refused(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     monkeypatch.setattr("sys.argv", ["coop-sweep", str(folder / "g.toml"), "--dir", str(folder / "d"), *flags])
     with pytest.raises(SystemExit):
         main()
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.count("\n") == 1
-    return told.err.removeprefix("coop-sweep: error: ")
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    return printed.err.removeprefix("coop-sweep: error: ")
 
 
 def test_other_versions_are_named() -> None:

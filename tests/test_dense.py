@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from coop.common.networks.dense import Dense
+from coop.common.networks.convolution import Dense
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.types import Array, EnvSpec
 from coop.learner.edl.feedback import FEEDBACKS, FeedbackRule, feedback_matrices

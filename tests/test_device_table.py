@@ -27,7 +27,7 @@ def _filled(rows: int, n_step: int, capacity: int = 60) -> tuple[DeviceTable, di
     rng, streams = np.random.default_rng(0), 3
     shape = (rows, streams)
     ends = rng.random(shape) < 0.15
-    told = {
+    outcomes = {
         "rewards": rng.random(shape).astype(np.float32),
         "terminated": (ends & (rng.random(shape) < 0.5)).astype(np.float32),
         "ended": ends.astype(np.float32),
@@ -35,17 +35,17 @@ def _filled(rows: int, n_step: int, capacity: int = 60) -> tuple[DeviceTable, di
     table = DeviceTable(SPEC, capacity, streams, n_step, GAMMA, CPU)
     for t in range(rows):
         obs = (10 * t + torch.arange(streams))[:, None, None, None].expand(streams, 4, 2, 3) % 256
-        terminated = torch.from_numpy(told["terminated"][t])
-        truncated = torch.from_numpy(told["ended"][t]) - terminated
-        table.show(obs.byte(), torch.from_numpy(told["rewards"][t]), terminated, truncated)
+        terminated = torch.from_numpy(outcomes["terminated"][t])
+        truncated = torch.from_numpy(outcomes["ended"][t]) - terminated
+        table.show(obs.byte(), torch.from_numpy(outcomes["rewards"][t]), terminated, truncated)
         table.act(torch.full((streams,), t % 3))
-    return table, told
+    return table, outcomes
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
 @pytest.mark.parametrize("rows", [8, 20, 25])
 def test_transitions_are_the_emulators(rows: int, n_step: int) -> None:
-    table, told = _filled(rows, n_step)
+    table, outcomes = _filled(rows, n_step)
     torch.manual_seed(0)
     given = table.sample(4000, 0.1, 0.2)
     pictures = given.frames.index_select(0, given.index).view(2, 4000, 4, 6)
@@ -54,15 +54,15 @@ def test_transitions_are_the_emulators(rows: int, n_step: int) -> None:
     steps, streams = (obs // 10).tolist(), (obs % 10).tolist()
     for i, (t, k) in enumerate(zip(steps, streams, strict=True)):
         assert given.columns.actions[i] == t % 3
-        assert given.columns.weights[i] == 1 - told["ended"][t, k]
+        assert given.columns.weights[i] == 1 - outcomes["ended"][t, k]
         total, span, discount = 0.0, 0, 1.0
         for step in range(t + 1, t + n_step + 1):
-            total += discount * told["rewards"][step, k]
+            total += discount * outcomes["rewards"][step, k]
             discount, span = discount * GAMMA, span + 1
-            if told["ended"][step, k]:
+            if outcomes["ended"][step, k]:
                 break
         assert given.columns.rewards[i] == pytest.approx(total, rel=1e-5)
-        assert given.columns.discounts[i] == pytest.approx(discount * (1 - told["terminated"][t + span, k]))
+        assert given.columns.discounts[i] == pytest.approx(discount * (1 - outcomes["terminated"][t + span, k]))
         assert after[i] == 10 * (t + span) + k
     # Every transition that is whole in the last 20 rows is drawn, and none else.
     held = min(rows, 20)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from coop.common.networks.dense import Dense
+from coop.common.networks.convolution import Dense
 from coop.common.networks.network import build_network
 from coop.common.types import EnvSpec
 from coop.learner.edl.feedback import FeedbackRule, edl_gradients, feedback_matrices

@@ -7,7 +7,7 @@ import pytest
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.endpoints import check_endpoints, unknown_hosts
 from coop.common.messaging.joining import join
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node
 from coop.common.process.lifecycle import Stop

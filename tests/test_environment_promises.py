@@ -24,7 +24,7 @@ from coop.common.envs.make import env_spec, make_filmed_env, make_vector_env
 from coop.common.envs.protocol import VectorEnv
 from coop.common.errors import BadMessage, CoopError, RunError, UsageError
 from coop.common.messaging.messages.insert import check_values
-from coop.common.process import notices
+from coop.common.process import output
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.resuming import check_resumed, settings_digest
 from coop.common.settings.tables import identity, load_tables, resolve
@@ -213,7 +213,7 @@ def test_the_interface_of_old_environments_is_named() -> None:
 def test_what_is_probably_meant_otherwise_is_warned_of_once(
     settings: EnvSettings, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(notices, "_told", set())
+    monkeypatch.setattr(output, "_warned", set())
     env_spec(settings)
     env_spec(settings)
     (line,) = capsys.readouterr().err.splitlines()
@@ -230,7 +230,7 @@ def test_what_is_probably_meant_otherwise_is_warned_of_once(
 def test_uint8_that_holds_truth_values_is_noticed_from_the_observations(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(notices, "_told", set())
+    monkeypatch.setattr(output, "_warned", set())
     env = make_vector_env(odd("", dtype="uint8"), 1, 0)
     inner(env).right[1] = 1
     env.reset()
@@ -283,7 +283,7 @@ def test_evaluation_and_films_go_through_the_same_check() -> None:
 def test_an_episode_without_end_is_cut_and_the_setting_named(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(notices, "_told", set())
+    monkeypatch.setattr(output, "_warned", set())
     result = coop.evaluate(lambda obs: [0, 0], 2, {"id": ODD, "kwargs": {"wrong": "endless"}}, at_once=2)
     assert result.returns == [LONGEST_EPISODE] * 2
     assert capsys.readouterr().err.count("env.max_episode_steps") == 1
@@ -322,7 +322,7 @@ def test_the_arguments_of_an_evaluation_are_checked(arguments: dict[str, Any], w
 def trained(tmp_path_factory: pytest.TempPathFactory) -> coop.SavedRun:
     """A short run on pictures."""
     path = tmp_path_factory.mktemp("runs") / "catch"
-    settings: Any = {**SHORT, "network": {"kind": "mlp", "hidden": [8]}, "actor": {"envs": 1}}
+    settings: Any = {**SHORT, "network": {"kind": "mlp", "hidden": [8]}, "actor": {"num_envs": 1}}
     coop.train("catch", run_dir=path, env={"stack": 1}, **settings).wait()
     return coop.load(path)
 

@@ -7,7 +7,7 @@ import pytest
 
 from coop.common.errors import UsageError
 from coop.common.messaging import wire
-from coop.common.messaging.messages.join import Joined
+from coop.common.messaging.messages.control import JoinReply
 from coop.common.process.cli import parse
 from coop.common.settings.config import RunConfig
 from coop.common.settings.environment import EnvSettings
@@ -30,9 +30,9 @@ def test_keyword_arguments_on_the_command_line_in_files_and_in_messages(monkeypa
     assert (config.env.kwargs, config.env.resize) == (TABLE, (8, 9))
     assert hash(config) == hash(resolve(tomllib.loads(to_toml(config))))
     assert resolve(tomllib.loads(to_toml(config))) == config
-    joined = Joined(config, EnvSpec("x", (2, 2, 3), "bool", 2, 2), "0", 0, [], 1, 0)
-    received = Joined.decode(wire.decode(bytes(joined.encode("r"))))
-    assert (received.config, received.spec) == (config, joined.spec)
+    reply = JoinReply(config, EnvSpec("x", (2, 2, 3), "bool", 2, 2), "0", 0, [], 1, 0)
+    received = JoinReply.decode(wire.decode(bytes(reply.encode("r"))))
+    assert (received.config, received.spec) == (config, reply.spec)
 
 
 def test_a_given_table_replaces_the_one_of_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:

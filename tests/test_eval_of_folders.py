@@ -77,7 +77,9 @@ def test_the_interval_of_a_mean() -> None:
     assert (low, high) == (pytest.approx(0.4, abs=0.02), pytest.approx(0.6, abs=0.02)), "0.5 -+ 1.96 sd / sqrt(100)"
 
 
-def told_by(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *flags: object) -> tuple[object, str]:
+def printed_by(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *flags: object
+) -> tuple[object, str]:
     """Exit status and output of coop-eval."""
     monkeypatch.setattr("sys.argv", ["coop-eval", *map(str, flags)])
     status: object = 0
@@ -85,9 +87,9 @@ def told_by(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
         evaluation_cli.main()
     except SystemExit as end:
         status = end.code
-    told = capsys.readouterr()
-    assert not (told.out and told.err)
-    return status, told.out + told.err
+    printed = capsys.readouterr()
+    assert not (printed.out and printed.err)
+    return status, printed.out + printed.err
 
 
 def test_a_table_of_several_runs(
@@ -96,9 +98,9 @@ def test_a_table_of_several_runs(
     for name, acting in (("a", 0), ("longer", 1)):
         run_with(tmp_path / name, acting, 0)
     runs = (tmp_path / "a", tmp_path / "longer")
-    status, text = told_by(monkeypatch, capsys, *runs, "--episodes", 4, "--video", tmp_path / "x.gif")
+    status, text = printed_by(monkeypatch, capsys, *runs, "--episodes", 4, "--video", tmp_path / "x.gif")
     assert (status, text) == (2, f"coop-eval: error: --video {tmp_path}/x.gif: of one run; there are 2\n")
-    status, text = told_by(monkeypatch, capsys, *runs, "--episodes", 4, "--envs", 3)
+    status, text = printed_by(monkeypatch, capsys, *runs, "--episodes", 4, "--envs", 3)
     head, *lines = text.splitlines()
     assert (status, len(lines)) == (0, 2 * 3 * 2)
     words = head.replace("95% interval", "interval").split()
@@ -138,7 +140,7 @@ def test_what_it_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
         ((run, "--video", tmp_path / "x.avi"), "must end in .mp4 or .gif"),
         ((run, "--video", tmp_path / "y" / "x.gif"), f"there is no folder {tmp_path}/y"),
     ):
-        status, text = told_by(monkeypatch, capsys, *flags)
+        status, text = printed_by(monkeypatch, capsys, *flags)
         assert status == 2, flags
         assert words in text
         assert text.count("\n") == 1
@@ -206,7 +208,7 @@ def test_a_gif_of_a_run_s_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = base_config(["--preset", "catch"])
-    run = Lockstep(replace(config, actor=replace(config.actor, envs=1), network=NetworkSettings()))
+    run = Lockstep(replace(config, actor=replace(config.actor, num_envs=1), network=NetworkSettings()))
     run.agent.acting = 1
     with RunDirectory(tmp_path / "run", run.config) as directory:
         run.save(directory)
@@ -214,7 +216,7 @@ def test_a_gif_of_a_run_s_network(
     video = tmp_path / "x.gif"
     shown = film_checkpoint(tmp_path / "run", video, 0, (1, 2, "mean"))
     assert shown.startswith(f"{video}: network 2,"), "the one that acts"
-    status, text = told_by(
+    status, text = printed_by(
         monkeypatch, capsys, tmp_path / "run", "--episodes", 1, "--networks", 1, "--epsilon", 0, "--video", video
     )
     assert status == 0

@@ -21,9 +21,8 @@ from coop.common.envs.make import make_vector_env
 from coop.common.errors import UsageError
 from coop.common.messaging.keys import evaluations_key, stop_key
 from coop.common.messaging.messages.answers import Ack
+from coop.common.messaging.messages.control import EndOfRun, JoinReply
 from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow
-from coop.common.messaging.messages.join import Joined
-from coop.common.messaging.messages.stop import EndOfRun
 from coop.common.messaging.transport import Node, Refused
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
@@ -164,7 +163,7 @@ def test_lockstep_runs_are_the_same_with_evaluations_and_through_stops(tmp_path:
 def test_films_of_a_lockstep_run(tmp_path: Path) -> None:
     config = base_config(["--preset", "catch", "--method", "dqn", "--total-steps", "300"])
     small = NetworkSettings(hidden=(8,))
-    config = replace(config, actor=replace(config.actor, envs=1), network=small, video_every=150)
+    config = replace(config, actor=replace(config.actor, num_envs=1), network=small, video_every=150)
     assert lockstep(config, tmp_path / "run", Stop()) == "complete"
     images = EventAccumulator(str(tmp_path / "run" / "tb")).Reload().Images("eval/video")
     assert [(image.step, image.width, image.height) for image in images] == [(150, 252, 252), (300, 252, 252)]
@@ -181,7 +180,7 @@ def test_what_can_t_be_filmed_is_refused_before_the_run_starts(name: str, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
-def test_a_resumed_run_keeps_the_lines_up_to_its_epoch(tmp_path: Path) -> None:
+def test_a_resumed_run_keeps_the_lines_up_to_its_checkpoint(tmp_path: Path) -> None:
     config = base_config([])
     with RunDirectory(tmp_path, config) as directory:
         sealed = directory.records()
@@ -251,7 +250,7 @@ def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -
         running("coop-local", "--listen", endpoint, *flags) as local,
     ):
         out, err = local.communicate(timeout=500)
-        told, wrong = second.communicate(timeout=80)
+        printed, wrong = second.communicate(timeout=80)
     assert (local.returncode, err, second.returncode, wrong) == (0, "", 0, "")
     last = re.search(r"complete: ([\d,]+) steps, ([\d,]+) updates", out)
     assert last is not None
@@ -264,7 +263,7 @@ def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -
         assert updates == sorted(set(updates)), "no networks twice"
         assert updates[-1] == end[1]
         assert steps[-1] <= end[0]  # the last update may come before the last step
-    assert f"3 episodes after {steps[-1]:,} steps" in told
+    assert f"3 episodes after {steps[-1]:,} steps" in printed
     videos = list((folder / "videos").iterdir())
     assert videos
     assert all(video.read_bytes().startswith(GIF) for video in videos)
@@ -276,8 +275,8 @@ def service(nodes: tuple[Node, Node], stop: Stop, plan: EvaluationPlan) -> tuple
     """A learner's agent, and an evaluator that has joined its run."""
     config = RunConfig(method="coop", network=NetworkSettings(hidden=(8,)))
     agent = Agent(config, SPEC)
-    joined = Joined(config, SPEC, agent.networks[0].layout_digest(), 0, [], 5, 0)
-    return agent, EvaluatorService(nodes[1], stop, joined, (), plan, 7, Console())
+    reply = JoinReply(config, SPEC, agent.networks[0].layout_digest(), 0, [], 5, 0)
+    return agent, EvaluatorService(nodes[1], stop, reply, (), plan, 7, Console())
 
 
 def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> None:

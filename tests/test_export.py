@@ -23,8 +23,7 @@ from coop.common.networks.network import FlatNetwork, build_network, sample_obse
 from coop.common.settings.tables import resolve
 from coop.common.types import EnvSpec
 from coop.evaluation import export_cli
-from coop.evaluation.export import export
-from coop.evaluation.export_onnx import NotExportedError, onnx_model
+from coop.evaluation.export import NotExportedError, export, onnx_model
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_directory import RunDirectory
 from website.pages import blocks
@@ -79,7 +78,7 @@ def test_the_card_and_the_parameters(tmp_path: Path) -> None:
     run = saved(tmp_path / "run", {"kwargs": {"sutton_barto_reward": False}})
     done = export(tmp_path / "run", tmp_path / "a" / "b")
     names = ["network-1.safetensors", "network-1.onnx", "network-2.safetensors", "network-2.onnx", "card.json"]
-    assert (done.names, done.epoch, done.acting, done.without_onnx) == (names, 20, 2, "")
+    assert (done.names, done.checkpoint, done.acting, done.without_onnx) == (names, 20, 2, "")
     assert sorted(path.name for path in (tmp_path / "a" / "b").iterdir()) == sorted(names)
     for number, network in enumerate(run.agent.networks, 1):
         tensors = load_file(tmp_path / "a" / "b" / f"network-{number}.safetensors")
@@ -202,8 +201,8 @@ def test_without_onnx_an_earlier_export_is_replaced(
     (out / "network-1.safetensors").write_bytes(b"old")
     monkeypatch.setitem(sys.modules, "onnx", None)
     second = first.replace("network-1.onnx, ", "").replace("network-2.onnx, ", "")
-    told = called(monkeypatch, capsys, tmp_path / "run", "--out", out)
-    assert told == (0, f"{second}no ONNX files: onnx is not installed\n", "")
+    printed = called(monkeypatch, capsys, tmp_path / "run", "--out", out)
+    assert printed == (0, f"{second}no ONNX files: onnx is not installed\n", "")
     assert sorted(path.name for path in out.iterdir()) == [
         "card.json",
         "network-1.safetensors",

@@ -8,9 +8,9 @@ from samples import await_service, make_segment, until
 
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Ack, Retry
-from coop.common.messaging.messages.epoch import Snapshot
+from coop.common.messaging.messages.control import Snapshot
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, Refused, new_incarnation
@@ -20,7 +20,7 @@ from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import RunConfig
 from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.service import ReplayService
 
 
@@ -66,7 +66,7 @@ def test_a_table_that_may_be_half_changed_is_not_used_any_more(
 ) -> None:
     server, client = nodes
     core, stop = ReplayCore(RunConfig(run="test"), spec), Stop()
-    service = ReplayService(server, core, ReplayEpochs(tmp_path, 5))
+    service = ReplayService(server, core, ReplayCheckpoints(tmp_path, 5))
     service.start()
     await_service(client, replay_key(client, "snapshot"))  # the last one that it declares
     running = threading.Thread(target=service.run, args=(stop, Console()))
@@ -103,9 +103,9 @@ def test_a_thread_that_ends_of_an_error_ends_the_process(
     def fail() -> None:
         raise ZeroDivisionError("gone")
 
-    thread = threading.Thread(target=fail, name="epoch 7")
+    thread = threading.Thread(target=fail, name="checkpoint 7")
     thread.start()
     thread.join()
     assert stop.failed
-    assert stop.reason == "error of this program in the thread 'epoch 7': ZeroDivisionError: gone"
+    assert stop.reason == "error of this program in the thread 'checkpoint 7': ZeroDivisionError: gone"
     assert "Traceback" in capfd.readouterr().err

@@ -136,15 +136,15 @@ def test_labels_of_ticks_do_not_touch(sizes: tuple[int, ...], columns: int) -> N
 
 def test_a_table_for_readers() -> None:
     rows = [["a <b>", 1.5, 0.25, None, None, 7], ["c", 200.0, None, 1.0, float("nan"), 8], ["d,e", 3, 1.0, 1.0, 2.0, 9]]
-    beside = {"mean": ["sd"], "IQM": ["low"]}
-    table = ResultTable("t", "T", ["name", "mean", "sd", "IQM", "low", "more"], rows, "note", beside, aside=["more"])
+    spreads = {"mean": ["sd"], "IQM": ["low"]}
+    table = ResultTable("t", "T", ["name", "mean", "sd", "IQM", "low", "more"], rows, "note", spreads, aside=["more"])
     assert table.csv() == 'name,mean,sd,IQM,low,more\na <b>,1.5,0.25,,,7\nc,200,,1,,8\n"d,e",3,1,1,2,9\n'
     assert table.markdown().splitlines() == [
         *("## T", "", "| name | mean (sd) | IQM (low) |", "| --- | --- | --- |"),
         *("| a <b> | 1.5 (0.25) | - |", "| c | 200 | 1 |", "| d,e | 3 (1) | 1 (2) |", "", "note"),
     ]
     assert "<td>a &lt;b&gt;</td>" in table.html()
-    interval = ResultTable("t", "T", ["x", "low", "high"], [[1.0, 0.5, 2.0]], beside={"x": ["low", "high"]})
+    interval = ResultTable("t", "T", ["x", "low", "high"], [[1.0, 0.5, 2.0]], spreads={"x": ["low", "high"]})
     assert interval.markdown().splitlines()[2:] == ["| x [95 %] |", "| --- |", "| 1 [0.5, 2] |"]
 
 

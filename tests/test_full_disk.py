@@ -1,4 +1,4 @@
-"""A full disk: what grows waits for space, epochs are given up one by one, and nothing ends in a traceback."""
+"""A full disk: what grows waits for space, checkpoints are given up one by one, and nothing ends in a traceback."""
 
 import contextlib
 import os
@@ -80,17 +80,17 @@ def test_episodes_metrics_and_scalars_wait_for_space(small_disk: Path, capsys: p
     assert len(board.Scalars("losses/td_error")) == rows
 
 
-def test_a_lockstep_run_goes_on_without_its_epochs(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_lockstep_run_goes_on_without_its_checkpoints(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, path = _lockstep(), small_disk / "run"
     with RunDirectory(path, run.config) as directory:
         _fill(small_disk)
-        with pytest.raises(RunError, match=r"how the run ended: failed: epoch 550 in .*: No space left on device"):
+        with pytest.raises(RunError, match=r"how the run ended: failed: checkpoint 550 in .*: No space left on device"):
             play_lockstep(run, directory, Stop())
     run.env.close()
     assert run.step == run.config.total_steps
     assert checkpoint_numbers(path) == []
-    assert "epoch 200 in" in (told := capsys.readouterr().out)
-    assert told.count("No space left on device; the run goes on without it\n") == 2
+    assert "checkpoint 200 in" in (printed := capsys.readouterr().out)
+    assert printed.count("No space left on device; the run goes on without it\n") == 2
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,7 @@ from typing import Any, get_type_hints
 
 import pytest
 
-from coop.common.process.cli import PACKAGE
-from coop.common.process.help import EXIT_STATUSES
+from coop.common.process.cli import EXIT_STATUSES, PACKAGE
 from coop.common.settings.methods import METHODS
 from coop.records.run_options import COMMON, RunOptions, parse_run
 from website.reference import COMMANDS as OPTIONS
@@ -115,7 +114,7 @@ def settings(kind: type[Any], prefix: str = "--") -> Iterator[str]:
         if dataclasses.is_dataclass(inner := hints[field.name]):
             assert isinstance(inner, type)
             yield from settings(inner, f"{name}.")
-        elif name not in ("--own", "--methods"):
+        elif name not in ("--method-settings", "--methods"):
             yield name
 
 

@@ -9,16 +9,16 @@ from commands import run_command
 from torch import Tensor
 
 from coop.lockstep.reexecute import reexecute
-from coop.records.learner_checkpoints import newest_epoch
+from coop.records.learner_checkpoints import newest_checkpoint
 
 FLAGS = ("--learner.learning-rate", "1e-30")  # keeps the networks as they are
 SHORT = ("--total-steps", "300", "--replay.learning-starts", "100")
 
 
 def networks(path: Path) -> list[Tensor]:
-    epoch = newest_epoch(path)
-    assert epoch is not None
-    found: list[Tensor] = epoch.state["agent"]["networks"]
+    checkpoint = newest_checkpoint(path)
+    assert checkpoint is not None
+    found: list[Tensor] = checkpoint.state["agent"]["networks"]
     return found
 
 
@@ -41,7 +41,7 @@ def test_in_lockstep_and_resumed_without_the_other_run(source: Path, tmp_path: P
     assert begins_with(path, source)
     shutil.rmtree(copied)
     done = run_command("coop-lockstep", "--resume", "--total-steps", "400", "--run-dir", path, check=True)
-    assert "goes on from checkpoint 200" in done.stdout
+    assert "resuming from checkpoint 200" in done.stdout
     assert begins_with(path, source)
 
 
@@ -55,7 +55,7 @@ def test_in_processes_executed_again_and_started_anew(source: Path, tmp_path: Pa
     for lost in path.glob("checkpoints/*/replay"):
         shutil.rmtree(lost)
     again = ("--actors", "1", "--resume", "--restart", "--run-dir", path)
-    assert "begins anew" in run_command("coop-local", *again, check=True).stdout
+    assert "starting over" in run_command("coop-local", *again, check=True).stdout
     assert begins_with(path, source)
 
 

@@ -13,10 +13,8 @@ from coop.common.messaging import joining, wire
 from coop.common.messaging.joining import difference, join, leave_run
 from coop.common.messaging.keys import join_key, replay_key
 from coop.common.messaging.members import Origin
-from coop.common.messaging.messages.join import Join, Joined, Leave
-from coop.common.messaging.messages.limits import Limit, Limits, LimitsQuestion
+from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Leave, Limit, Limits, LimitsQuestion
 from coop.common.messaging.messages.sample import DrawRequest
-from coop.common.messaging.messages.stop import EndOfRun
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, Refused
@@ -26,16 +24,16 @@ from coop.common.types import EnvSpec
 from coop.deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
 from coop.learner.join_service import JoinService
 from coop.learner.roster import Roster
-from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.shared_checkpoints import SharedCheckpoints
 from coop.replay.core import ReplayCore
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.service import ReplayService
 
 REQUEST = Join("actor", 3, [])
 
 
 def _receive(node: Node, spec: EnvSpec) -> None:
-    JoinService(node, RunConfig(run="test"), spec, "layout", 9, SharedEpochs([], "run"), Roster(), print)
+    JoinService(node, RunConfig(run="test"), spec, "layout", 9, SharedCheckpoints([], "run"), Roster(), print)
 
 
 def test_another_protocol_is_refused_with_both_versions(
@@ -65,13 +63,13 @@ def test_another_run_is_named(nodes: tuple[Node, Node], endpoint: str) -> None:
         join(stranger, Stop(), REQUEST, ("there",), 1)
 
 
-MINE = Joined(RunConfig(), EnvSpec("CartPole-v0", (4,), "float32", 1, 2), "abc", 0, [], 5, 0)
+MINE = JoinReply(RunConfig(), EnvSpec("CartPole-v0", (4,), "float32", 1, 2), "abc", 0, [], 5, 0)
 
 
 @pytest.mark.parametrize(
     ("theirs", "words"),
     [
-        (replace(MINE, index=4, epoch=300, replay_endpoints=["x"]), None),
+        (replace(MINE, index=4, checkpoint=300, replay_endpoints=["x"]), None),
         (replace(MINE, config=RunConfig(checkpoint_every=7)), None),
         (replace(MINE, run_id=6), "run id here 5, the learner's 6"),
         (replace(MINE, layout="abd"), "network layout here abc, the learner's abd"),
@@ -79,7 +77,7 @@ MINE = Joined(RunConfig(), EnvSpec("CartPole-v0", (4,), "float32", 1, 2), "abc",
         (replace(MINE, config=RunConfig(seed=1)), "config.seed here 0, the learner's 1"),
     ],
 )
-def test_another_learner(theirs: Joined, words: str | None) -> None:
+def test_another_learner(theirs: JoinReply, words: str | None) -> None:
     assert difference(MINE, theirs) == words
 
 
@@ -110,7 +108,7 @@ def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, m
     learner, actor = nodes
     events: list[str] = []
     join_service = JoinService(
-        learner, RunConfig(run="test"), spec, "layout", 9, SharedEpochs([], "run"), Roster(), events.append
+        learner, RunConfig(run="test"), spec, "layout", 9, SharedCheckpoints([], "run"), Roster(), events.append
     )
     service = Join("replay", 5, ["tcp/rep:1"], origin=Origin("rep", 7))
     other = replace(service, incarnation=6, origin=Origin("rep", 8))
@@ -124,7 +122,7 @@ def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, m
     with pytest.raises(Refused, match="not an actor's"):
         actor.ask(join_key(actor, "actor"), payload)
     assert not join_service.departure.is_due
-    assert actor.ask(join_key(actor, "replay"), payload).kind == "retry", "an epoch comes first"
+    assert actor.ask(join_key(actor, "replay"), payload).kind == "retry", "a checkpoint comes first"
     assert join_service.departure.is_due
     join_service.departure.grant()
     assert not join_service.departure.is_due
@@ -147,7 +145,7 @@ def test_the_limiter_changes_while_the_run_goes_on(nodes: tuple[Node, Node], spe
     server, client = nodes
     config = RunConfig(run="test", total_steps=1000)
     core = ReplayCore(config, spec)
-    ReplayService(server, core, ReplayEpochs(tmp_path, 5)).start()
+    ReplayService(server, core, ReplayCheckpoints(tmp_path, 5)).start()
     await_service(client, replay_key(client, "snapshot"))  # the last one that it declares
     key = replay_key(client, "limits")
     for sequence in range(125):

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from samples import make_segment
-from test_epochs import CONFIG, save
+from test_checkpoints import CONFIG, save
 
 from coop.common.errors import RunError
 from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore, RetryLater
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import Journal, journal_files
 from coop.replay.persistence.recovery import recover
 
@@ -52,9 +52,9 @@ def test_a_kill_loses_nothing(spec: EnvSpec, tmp_path: Path) -> None:
     with (tmp_path / "00000001.log").open("ab") as file:
         file.write(b"half a record, longer than its header")
     twin = ReplayCore(CONFIG, spec)
-    number, told = recover(twin, tmp_path, 1, 5)
+    number, notices = recover(twin, tmp_path, 1, 5)
     taken = f"36 transitions and {core.drawn} batches from the journal, which ends as a kill leaves it"
-    assert (number, told) == (2, [taken])
+    assert (number, notices) == (2, [taken])
     _assert_alike(core, twin)
     twin.recorder = Journal(tmp_path, 5, number, keep=False)
     _use(twin, spec, range(9, 12))
@@ -66,18 +66,20 @@ def test_a_kill_loses_nothing(spec: EnvSpec, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_files_that_epochs_cover(keep: bool, spec: EnvSpec, tmp_path: Path) -> None:
+def test_files_that_checkpoints_cover(keep: bool, spec: EnvSpec, tmp_path: Path) -> None:
     folder = tmp_path / "journal"
     journal = Journal(folder, 5, 1, keep=keep)
-    core, epochs = ReplayCore(CONFIG, spec, journal), ReplayEpochs(tmp_path, 5, journal)
+    core, checkpoints = ReplayCore(CONFIG, spec, journal), ReplayCheckpoints(tmp_path, 5, journal)
     for turn in range(4):
         _use(core, spec, range(3 * turn, 3 * turn + 3))
-        save(core, epochs, turn, turn - 1)
+        save(core, checkpoints, turn, turn - 1)
     _use(core, spec, range(12, 14))
-    assert journal_files(folder) == ([1, 2, 3, 4, 5] if keep else [4, 5]), "those since the older epoch that is kept"
+    assert journal_files(folder) == ([1, 2, 3, 4, 5] if keep else [4, 5]), (
+        "those since the older checkpoint that is kept"
+    )
     (tmp_path / "checkpoints" / "3" / "replay" / "state.msgpack").write_bytes(b"torn")
     twin = ReplayCore(CONFIG, spec)
-    first, _ = ReplayEpochs(tmp_path, 5).restore(twin, 3)
+    first, _ = ReplayCheckpoints(tmp_path, 5).restore(twin, 3)
     assert first == 4
     assert recover(twin, folder, first, 5)[0] == 6
     _assert_alike(core, twin)
@@ -85,7 +87,7 @@ def test_files_that_epochs_cover(keep: bool, spec: EnvSpec, tmp_path: Path) -> N
 
 def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
     journal = Journal(small_disk / "journal", 5, 1, keep=True)
-    core, epochs = ReplayCore(CONFIG, spec, journal), ReplayEpochs(small_disk, 5, journal)
+    core, checkpoints = ReplayCore(CONFIG, spec, journal), ReplayCheckpoints(small_disk, 5, journal)
     filler = small_disk / "filler"
     filler.write_bytes(bytes(220_000))
     sequence = 0
@@ -101,14 +103,14 @@ def test_a_full_disk(spec: EnvSpec, small_disk: Path) -> None:
     assert core.samples_wait_for.endswith("; the journal can't be written: No space left on device")
     assert core.drawn > before, "training goes on as far as the limiter lets it"
     with pytest.raises(RunError, match="No space left on device"):
-        save(core, epochs, 1)
+        save(core, checkpoints, 1)
     assert isinstance(_insert(core, spec, sequence), RetryLater)
     filler.unlink()
     assert _insert(core, spec, sequence) == 4 * sequence + 4
     twin = ReplayCore(CONFIG, spec)
     recover(twin, small_disk / "journal", 1, 5)
     _assert_alike(core, twin)
-    save(core, epochs, 2)
+    save(core, checkpoints, 2)
 
 
 def test_priorities_are_carried_out_again(spec: EnvSpec, tmp_path: Path) -> None:

@@ -178,8 +178,8 @@ def test_the_range_of_a_dueling_head_lies_beside_the_mean(dtype: torch.dtype) ->
     torch.manual_seed(0)
     passes = make_backprop(Duel(5, 3).to(dtype), _inputs((5,), 3, 8)[0].to(dtype))
     mean = torch.full((3, 3), 1 / 3, dtype=dtype)
-    beside = torch.eye(3, dtype=dtype) - mean
-    expected = {"trunk.": None, "advantage.0.": (beside, 2), "advantage.2.": (beside, 2), "value.0.": (mean, 1),
+    others = torch.eye(3, dtype=dtype) - mean
+    expected = {"trunk.": None, "advantage.0.": (others, 2), "advantage.2.": (others, 2), "value.0.": (mean, 1),
                 "value.2.": (mean, 1)}  # fmt: skip
     assert passes.names == list(expected)
     for index, wanted in enumerate(expected.values()):

@@ -19,7 +19,7 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import load_tables, resolve
 from coop.learner.agent import Agent
 from coop.lockstep.lockstep import Lockstep
-from coop.records.learner_checkpoints import newest_epoch
+from coop.records.learner_checkpoints import newest_checkpoint
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 
@@ -90,15 +90,15 @@ def test_coop_finds_optimal_values_over_the_real_topology(config: RunConfig, tmp
     # Both actors explore as the whole run asks for, not as their own half of the steps would (0.12 more). No actor
     # knows more steps than were inserted; one that waits for a core knows an older count, hence the median.
     with (tmp_path / "run" / "episodes.csv").open(encoding="utf-8") as file:
-        told = [(int(row["env_step"]), float(row["epsilon"])) for row in csv.DictReader(file)]
-    assert all(epsilon > schedules.epsilon(config.actor, step) for step, epsilon in told)
-    late = [epsilon - schedules.epsilon(config.actor, step) for step, epsilon in told if 600 < step < 1600]
+        recorded = [(int(row["env_step"]), float(row["epsilon"])) for row in csv.DictReader(file)]
+    assert all(epsilon > schedules.epsilon(config.actor, step) for step, epsilon in recorded)
+    late = [epsilon - schedules.epsilon(config.actor, step) for step, epsilon in recorded if 600 < step < 1600]
     assert len(late) > 20
     assert statistics.median(late) < 0.04
-    epoch = newest_epoch(tmp_path / "run")
-    assert epoch is not None
+    checkpoint = newest_checkpoint(tmp_path / "run")
+    assert checkpoint is not None
     run = Lockstep(replace(config, method="coop"))  # for a network of the right shape
-    run.agent.load_state(epoch.state["agent"])
+    run.agent.load_state(checkpoint.state["agent"])
     run.env.close()
     for q in values(run.agent):
         np.testing.assert_allclose(q, optimal_values(config.learner.gamma), atol=BOUND)

@@ -34,7 +34,7 @@ def page() -> Iterator[LivePage]:
     served.close()
 
 
-def told(page: LivePage) -> dict[str, Any]:
+def page_json(page: LivePage) -> dict[str, Any]:
     with urllib.request.urlopen(f"{page.url}page.json", timeout=20) as answer:
         return json.loads(answer.read())  # type: ignore[no-any-return]
 
@@ -52,7 +52,7 @@ def test_a_browser_follows_the_run(page: LivePage, tmp_path: Path) -> None:
     """The status changes whenever the browser has asked: one that asks only once would show none of the changes."""
     members = [*STATUS.members, STRANGER]
     status = replace(STATUS, members=members, env_steps=100)
-    answered, ended = page.told, threading.Event()
+    answered, ended = page.state, threading.Event()
 
     def next_status() -> dict[str, Any]:
         nonlocal status
@@ -63,7 +63,7 @@ def test_a_browser_follows_the_run(page: LivePage, tmp_path: Path) -> None:
         return now
 
     page.show(status, EVENTS[:3], 0.0, "")
-    page.told = next_status  # type: ignore[method-assign]
+    page.state = next_status  # type: ignore[method-assign]
     document = in_browser(page, tmp_path, 4500)
     assert ended.is_set()
     assert status.env_steps >= 250, "it asked more than twice"
@@ -83,10 +83,10 @@ def test_a_browser_follows_the_run(page: LivePage, tmp_path: Path) -> None:
 
 
 def test_what_the_page_is_told(page: LivePage) -> None:
-    assert told(page) == {"run": "demo", "notice": "waiting for the learner", "ended": False, "events": []}
+    assert page_json(page) == {"run": "demo", "notice": "waiting for the learner", "ended": False, "events": []}
     page.show(STATUS, EVENTS, 0.0, "")
     page.show(STATUS, EVENTS, 1.0, "")
-    now = told(page)
+    now = page_json(page)
     assert dict(now["facts"]) == facts(STATUS)
     assert (now["settings"], now["times"]) == ("CartPole-v1, coop, seed 0", "1:02:05 so far, about 0:01:01 left")
     assert (now["notice"], now["connected"]) == ("", "1 replay service, 2 actors")
@@ -105,7 +105,7 @@ def test_what_the_page_is_told(page: LivePage) -> None:
     page.show(replace(STATUS, ratio=None, measured=None), EVENTS, 0.0, "")
     page.show(replace(STATUS, ratio=Ratio(1.0, None, -500.0, -64.0, 80.0), measured=None), EVENTS, 0.0, "")
     known = [{name: value for name, value in zip(COLUMNS, point, strict=True) if value is not None}
-             for point in told(page)["points"][1:]]  # fmt: skip
+             for point in page_json(page)["points"][1:]]  # fmt: skip
     fewer = {"env_steps": 31_240, "env_steps_per_s": 1204.0, "updates_per_s": 1198.2}
     band = {"ratio_target": 1.0, "ratio_least": -64.0, "ratio_most": 80.0}
     assert known == [fewer, fewer | band], "before the first update, steps ahead are out of the band"
@@ -114,15 +114,15 @@ def test_what_the_page_is_told(page: LivePage) -> None:
 def test_the_end_of_the_run_reaches_a_browser_that_follows_it() -> None:
     page = LivePage("demo", "0")
     page.show(STATUS, EVENTS, 0.0, "")
-    assert not told(page)["ended"]
+    assert not page_json(page)["ended"]
     page.show(STATUS, EVENTS, 0.0, "complete")
     closing = threading.Thread(target=page.close)
     closing.start()
     assert closing.is_alive()
-    assert told(page)["notice"] == "the run has ended: complete"
+    assert page_json(page)["notice"] == "the run has ended: complete"
     closing.join(20)
     with pytest.raises(urllib.error.URLError):
-        told(page)
+        page_json(page)
     alone = LivePage("demo", "0")
     alone.show(STATUS, EVENTS, 0.0, "complete")
     began = time.monotonic()
@@ -138,7 +138,7 @@ def test_curves_keep_evenly_spaced_points() -> None:
     assert steps == list(range(0, 1000, 4))
     assert len(steps) <= MOST
     curves.add(replace(STATUS, env_steps=500))
-    assert [point[0] for point in curves.points] == [500], "the run was resumed from an epoch"
+    assert [point[0] for point in curves.points] == [500], "the run was resumed from a checkpoint"
 
 
 def test_only_the_page_is_served_and_it_loads_nothing(page: LivePage) -> None:

@@ -185,9 +185,9 @@ def test_sweeps_in_containers_that_look_alike_run_each_cell_once(tmp_path: Path)
             )
             for _ in range(PODS)
         ]
-        told = [pod.communicate(timeout=250)[0] for pod in pods]
-    assert [pod.returncode for pod in pods] == [0] * PODS, told
-    ran = sorted(line.partition(": return")[0] for text in told for line in text.splitlines() if ": return" in line)
+        printed = [pod.communicate(timeout=250)[0] for pod in pods]
+    assert [pod.returncode for pod in pods] == [0] * PODS, printed
+    ran = sorted(line.partition(": return")[0] for text in printed for line in text.splitlines() if ": return" in line)
     assert len(ran) == len(set(ran)) == 8, ran
     logs = [log.read_text() for log in (tmp_path / "d").glob("*/run.log")]
     assert sum(log.count("complete: 60 steps") for log in logs) == 8  # one process may play several cells

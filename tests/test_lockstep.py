@@ -14,7 +14,7 @@ from table_reference import whole_state
 
 from coop.common.settings.methods import METHODS
 from coop.lockstep.lockstep import Lockstep
-from coop.records.learner_checkpoints import newest_epoch
+from coop.records.learner_checkpoints import newest_checkpoint
 from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
 
@@ -80,7 +80,7 @@ def test_resume_starts_goes_on_or_refuses(tmp_path: Path) -> None:
     status, out, _ = resume(*short)
     assert (status, out.splitlines()[0]) == (0, f"starts in {tmp_path / 'a'}: there is no run there yet")
     status, out, _ = resume(*short)
-    assert (status, out.splitlines()[0]) == (0, "goes on from checkpoint 260")
+    assert (status, out.splitlines()[0]) == (0, "resuming from checkpoint 260")
     status, _, err = resume(*short, "--seed", "9")
     assert (status, err.count("\n")) == (1, 1)
     assert "another run's, whose seed is 0; here it is 9" in err
@@ -163,9 +163,9 @@ def test_steps_that_wait_come_back_with_a_resumed_run(ratio: float, tmp_path: Pa
         for _ in range(150):
             _play(first, directory)
         first.save(directory)
-        epoch = newest_epoch(tmp_path)
-        assert epoch is not None
-        second.restore(epoch)
+        checkpoint = newest_checkpoint(tmp_path)
+        assert checkpoint is not None
+        second.restore(checkpoint)
         for run in (first, second):
             for _ in range(30):
                 for _ in run.play():

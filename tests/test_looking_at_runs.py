@@ -131,12 +131,12 @@ def test_watching_a_run_to_its_end(tmp_path: Path) -> None:
         assert hasty.stderr.endswith("the learner of run 'coop' has been silent for 0.1 s\n")
         with started([*watch, "--patience", "90"], stdout=subprocess.PIPE) as second:
             assert second.stdout is not None
-            told = second.stdout.readline()
+            printed = second.stdout.readline()
             second.send_signal(signal.SIGINT)
-            told += second.stdout.read()
+            printed += second.stdout.read()
             assert second.wait(110) == 0
-        assert "joined" in told
-        assert "the run has ended" not in told
+        assert "joined" in printed
+        assert "the run has ended" not in printed
 
         os.kill(before.members[-1].pid, signal.SIGKILL)
         lost = wait_for(status, lambda now: states(now).get("actor 0") == "lost")

@@ -23,7 +23,9 @@ def config(own: MedqnSettings, **learner: Any) -> RunConfig:
     settings = LearnerSettings(**{"optimizer": "sgd", "learning_rate": 0.1, "gamma": 0.5, **learner})
     replay = ReplaySettings(learning_starts=1)
     network = NetworkSettings(hidden=())
-    return RunConfig(method="medqn", own=own, learner=settings, replay=replay, network=network, total_steps=101)
+    return RunConfig(
+        method="medqn", method_settings=own, learner=settings, replay=replay, network=network, total_steps=101
+    )
 
 
 def batch_of_two() -> Batch:
@@ -104,7 +106,7 @@ def test_uniform_states_lie_between_the_bounds_of_all_that_was_seen() -> None:
 def test_autograd_agrees(states: str, monkeypatch: pytest.MonkeyPatch) -> None:
     own = MedqnSettings(states, 0.3, 0.3)  # type: ignore[arg-type]
     agent = Agent(replace(config(own), network=NetworkSettings(hidden=(8, 8))), SPEC)
-    plain = Agent(replace(agent.config, method="dqn", own=None), SPEC)
+    plain = Agent(replace(agent.config, method="dqn", method_settings=None), SPEC)
     (first, batch) = batches(2)
     for one in (agent, plain):
         one.networks[0].load(plain.networks[0].snapshot() * 1.1)
@@ -154,6 +156,6 @@ def test_without_an_input_there_are_no_bounds() -> None:
 
 @pytest.mark.parametrize("preset", preset_names())
 def test_presets_of_pictures_consolidate_on_real_states(preset: str) -> None:
-    own = base_config(["--preset", preset, "--method", "medqn"]).own
+    own = base_config(["--preset", preset, "--method", "medqn"]).method_settings
     assert isinstance(own, MedqnSettings)
     assert own.states == ("uniform" if preset.startswith("cartpole") else "real")

@@ -30,11 +30,9 @@ from coop.common.errors import BadMessage, RunError
 from coop.common.messaging import wire
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.answers import Ack, Error, Retry
-from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Leave, Limit, Limits, Snapshot, Written
 from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
 from coop.common.messaging.messages.insert import SegmentReader, encode_segment
-from coop.common.messaging.messages.join import Join, Joined, Leave
-from coop.common.messaging.messages.limits import Limit, Limits
 from coop.common.messaging.messages.sample import (
     BatchReader,
     Drawn,
@@ -44,8 +42,7 @@ from coop.common.messaging.messages.sample import (
     encode_batch,
     encode_named,
 )
-from coop.common.messaging.messages.stats import ReplayStats
-from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.status import ReplayStats
 from coop.common.messaging.messages.weights import Current, Role, Weights
 from coop.common.messaging.wire import Message
 from coop.common.settings.config import RunConfig
@@ -57,8 +54,8 @@ SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 END = [3, 1.5, 4, 0.1, 0.2, 0.3, 5]
 RECORD = [4, 7, 0, END]
 STATS = ReplayStats(1, 2, 3, 4, 5, 6, 7, 8, 9, "a", "b")
-JOIN = Join("replay", 5, ["tcp/127.0.0.1:1"], epochs=[500, 1000])
-JOINED = Joined(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300, replay=Origin("h", 7))
+JOIN = Join("replay", 5, ["tcp/127.0.0.1:1"], checkpoints=[500, 1000])
+JOIN_REPLY = JoinReply(RunConfig(target_return=1.0), SPEC, "abc", 2, ["tcp/h:1"], 77, 300, replay=Origin("h", 7))
 LIMITS = Limits(0.5, 8.0, 10, 5, 50, "a", "")
 EVALUATED = Evaluated(5, 3, EvaluationRow(600, 400, 2, 10, 21.5, 3.25, 0.0, 1.5))
 RESULT = msgspec.structs.asdict(EVALUATED.result)
@@ -96,7 +93,7 @@ def _encoded_batches() -> bytearray:
 
 READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "join": (JOIN.encode("r"), Join.decode),
-    "joined": (JOINED.encode("r"), Joined.decode),
+    "join-reply": (JOIN_REPLY.encode("r"), JoinReply.decode),
     "leave": (Leave(5).encode("r"), Leave.decode),
     "insert": (encode_segment("r", make_segment(SPEC)), SegmentReader(SPEC)),
     "ack": (Ack(9).encode("r"), Ack.decode),
@@ -132,7 +129,7 @@ def _sent(message: Message, arrays: dict[str, Any]) -> Message:
     ("kind", "value"),
     [
         ("join", JOIN),
-        ("joined", JOINED),
+        ("join-reply", JOIN_REPLY),
         ("leave", Leave(5)),
         ("ack", Ack(9)),
         ("retry", Retry("later")),
@@ -199,20 +196,20 @@ FIELDS = [
     ("join", "endpoints", ["x"] * 17),
     ("join", "endpoints", ["x" * 257]),
     ("join", "origin", ["h", -1]),
-    ("joined", "learner", None),
-    ("joined", "replay", ["h" * 257, 1]),
+    ("join-reply", "learner", None),
+    ("join-reply", "replay", ["h" * 257, 1]),
     ("leave", "incarnation", -1),
-    ("join", "epochs", [-1]),
-    ("join", "epochs", [0] * 17),
+    ("join", "checkpoints", [-1]),
+    ("join", "checkpoints", [0] * 17),
     ("join", "serving", 1),
-    ("joined", "anew", 0),
-    ("joined", "config", {"learning": 1}),
-    ("joined", "config", {**TABLES, "replay": {"capacity": -1}}),
-    ("joined", "config", []),
-    ("joined", "layout", "x" * 65),
-    ("joined", "index", -1),
-    ("joined", "replay_endpoints", "tcp/h:1"),
-    ("joined", "spec", {}),
+    ("join-reply", "anew", 0),
+    ("join-reply", "config", {"learning": 1}),
+    ("join-reply", "config", {**TABLES, "replay": {"capacity": -1}}),
+    ("join-reply", "config", []),
+    ("join-reply", "layout", "x" * 65),
+    ("join-reply", "index", -1),
+    ("join-reply", "replay_endpoints", "tcp/h:1"),
+    ("join-reply", "spec", {}),
     ("insert", "incarnation", -1),
     ("insert", "incarnation", True),
     ("insert", "stream", 65_536),
@@ -314,9 +311,9 @@ def test_a_bad_field_is_refused_by_name(kind: str, field: str, value: object) ->
     ],
 )
 def test_a_bad_specification_is_refused_by_name(field: str, value: object) -> None:
-    message = _valid("joined")
+    message = _valid("join-reply")
     with pytest.raises(BadMessage) as caught:
-        Joined.decode(replace(message, fields={**message.fields, "spec": _spec(**{field: value})}))
+        JoinReply.decode(replace(message, fields={**message.fields, "spec": _spec(**{field: value})}))
     assert caught.value.field == f"fields.spec.{field}"
 
 

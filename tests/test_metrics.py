@@ -87,8 +87,8 @@ def test_the_columns_and_tags_of_a_row(run: Run) -> None:
     assert run.row.keys() == COLUMNS
     for metric in METRICS:
         if metric.tensorboard:
-            told = pytest.approx(run.row[metric.column])
-            assert run.board[metric.tensorboard] == (run.row["env_step"], told), metric.name
+            shown = pytest.approx(run.row[metric.column])
+            assert run.board[metric.tensorboard] == (run.row["env_step"], shown), metric.name
     own = {tag for tag in run.board if tag.startswith(("train/", "losses/")) or "per_second" in tag}
     assert own - {metric.tensorboard for metric in METRICS} == {"losses/q_values"}
 
@@ -121,16 +121,16 @@ def test_metrics_on_the_page(run: Run) -> None:
     with closing(LivePage("demo", "0")) as page:
         page.show(run.status, [], 0.0, "")
         with urllib.request.urlopen(f"{page.url}page.json", timeout=20) as answer:
-            told = json.load(answer)
-    (point,) = told["points"]
-    drawn = {(chart["title"], *line[:2]) for chart in told["charts"] for line in chart["lines"]}
+            shown = json.load(answer)
+    (point,) = shown["points"]
+    drawn = {(chart["title"], *line[:2]) for chart in shown["charts"] for line in chart["lines"]}
     known = values(run.status)
     for metric in METRICS:
         if metric.chart:
             assert (metric.chart, metric.name, metric.curve) in drawn
-            assert point[told["columns"].index(metric.name)] == known[metric.name]
+            assert point[shown["columns"].index(metric.name)] == known[metric.name]
         if metric.line:
-            assert metric.words.format(known[metric.name]) in dict(told["facts"])[metric.line]
+            assert metric.words.format(known[metric.name]) in dict(shown["facts"])[metric.line]
 
 
 def test_metrics_for_prometheus(run: Run) -> None:
@@ -144,10 +144,10 @@ def test_metrics_for_prometheus(run: Run) -> None:
         urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=20) as answer,
     ):
         families = list(text_string_to_metric_families(answer.read().decode()))
-    told = {sample.name: sample.value for family in families for sample in family.samples}
+    shown = {sample.name: sample.value for family in families for sample in family.samples}
     texts = {family.name: family.documentation for family in families}
     for metric in LIVE:
-        assert told[metric.prometheus] == values(run.status)[metric.name]
+        assert shown[metric.prometheus] == values(run.status)[metric.name]
         assert texts[f"coop_{metric.name}"] == metric.meaning
 
 

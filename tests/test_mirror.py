@@ -37,7 +37,7 @@ from coop.common.settings.resuming import check_resumed
 from coop.common.types import Batch, EnvSpec, Segment
 from coop.replay.core import ReplayCore, Reply
 from coop.replay.mirrored import MirroredFrames
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.service import ReplayService
 
 NUMBERS = EnvSpec("numbers", (2,), "float32", 1, 2)  # frame n holds n, and is the observation of transition n
@@ -124,7 +124,7 @@ def _insert(core: ReplayCore, sequence: int) -> None:
 
 
 def _restored(core: ReplayCore) -> ReplayCore:
-    """A core as a restarted service has it from an epoch: the same draws to repeat, and frames in other slots."""
+    """A core as a restarted service has it from a checkpoint: the same draws to repeat, and frames in other slots."""
     state, episodes, (meta, arrays, frames), replies = core.snapshot(0)
     with frames:
         again = ReplayCore(CONFIG, NUMBERS)
@@ -377,7 +377,7 @@ def test_a_mirror_that_cannot_grow_stays_as_it_is(monkeypatch: pytest.MonkeyPatc
 
 
 def _serve(node: Node, core: ReplayCore, folder: Path, asker: Node) -> None:
-    ReplayService(node, core, ReplayEpochs(folder, 5)).start()
+    ReplayService(node, core, ReplayCheckpoints(folder, 5)).start()
     await_service(asker, replay_key(asker, "snapshot"))
 
 

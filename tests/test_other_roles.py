@@ -21,7 +21,7 @@ import coop
 from coop.common.bounds import LONGEST_EPISODE
 from coop.common.envs.make import make_filmed_env, make_vector_env
 from coop.common.errors import CoopError, RunError, UsageError
-from coop.common.process import notices
+from coop.common.process import output
 from coop.common.settings.environment import EnvSettings
 from coop.evaluation.episodes import Evaluator
 from coop.evaluation.film import Film, short_gif
@@ -133,8 +133,8 @@ def test_a_sweep_and_its_report_leave_what_they_did_not_write(folder: Path) -> N
     (folder / "s" / "notes").mkdir()
     (folder / "s" / "notes" / "config.txt").write_text("mine")
     assert swept().returncode == 0
-    told = run_command("coop-report", "s", cwd=folder)
-    assert told.returncode == 0, told.stderr
+    printed = run_command("coop-report", "s", cwd=folder)
+    assert printed.returncode == 0, printed.stderr
     assert (folder / "s" / "copy of mine" / "summary.json").exists()
     assert (folder / "s" / "notes" / "config.txt").read_text() == "mine"
 
@@ -319,7 +319,7 @@ def test_what_a_job_allows_holds_for_sweeps_and_in_python(folder: Path, monkeypa
 def test_films_and_evaluations_of_a_training_are_bounded(
     trained: SavedRun, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(notices, "_told", set())
+    monkeypatch.setattr(output, "_warned", set())
     endless = EnvSettings(id=ODD, kwargs={"wrong": "endless"})
     film = Film(lambda obs: 0, endless, 0)
     assert sum(1 for _ in film) == film.steps == LONGEST_EPISODE
@@ -376,11 +376,11 @@ def test_paths_that_can_not_be_are_refused_in_python(path: str, tmp_path: Path, 
 
 
 def test_returns_cross_the_wire_exactly(made: Path) -> None:
-    told = column(made / "run" / "episodes.csv", "return")
+    returns = column(made / "run" / "episodes.csv", "return")
     lengths = column(made / "run" / "episodes.csv", "length")
-    assert [float(text) for text in told] == [sum([123456.789] * int(length)) for length in lengths]
+    assert [float(text) for text in returns] == [sum([123456.789] * int(length)) for length in lengths]
     summary = json.loads((made / "run" / "summary.json").read_text())
-    assert summary["return_mean_100"] == pytest.approx(sum(map(float, told[-100:])) / len(told[-100:]), rel=1e-12)
+    assert summary["return_mean_100"] == pytest.approx(sum(map(float, returns[-100:])) / len(returns[-100:]), rel=1e-12)
 
 
 def test_policies_refuse_what_overflows_and_evaluations_what_is_no_action(trained: SavedRun) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from coop.common.process.lifecycle import Stop
-from coop.records.learner_checkpoints import newest_epoch
+from coop.records.learner_checkpoints import newest_checkpoint
 
 pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
 
@@ -89,7 +89,7 @@ def test_a_reader_that_goes_ends_a_run_with_a_closing_checkpoint(tmp_path: Path)
     assert done.stdout.splitlines()[-1] == "141"
     assert done.stderr == ""
     assert how_it_ended(tmp_path / "run") == "interrupted"
-    assert newest_epoch(tmp_path / "run") is not None
+    assert newest_checkpoint(tmp_path / "run") is not None
 
 
 def test_a_terminal_that_goes_ends_a_topology_with_a_closing_checkpoint(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_terminal_that_goes_ends_a_topology_with_a_closing_checkpoint(tmp_path
         os.close(side)
         assert process.wait(120) == 128 + signal.SIGHUP
     assert how_it_ended(tmp_path / "run") == "interrupted"
-    assert newest_epoch(tmp_path / "run") is not None
+    assert newest_checkpoint(tmp_path / "run") is not None
     for log in (tmp_path / "run" / "logs").glob("*.log"):
         assert "Traceback" not in log.read_text()
 
@@ -117,8 +117,8 @@ def test_closed_descriptors_of_a_lockstep_run(tmp_path: Path) -> None:
     done = shell(f"coop-lockstep {SHORT} --run-dir run <&- >&-", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert how_it_ended(tmp_path / "run") == "complete"
-    told = shell("coop-eval run --episodes 1 --networks 1 >&- 2>&-", tmp_path)
-    assert told.returncode == 0
+    printed = shell("coop-eval run --episodes 1 --networks 1 >&- 2>&-", tmp_path)
+    assert printed.returncode == 0
 
 
 def test_a_topology_whose_environment_closes_its_output(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from coop.common.envs import registry
 from coop.common.envs.make import env_spec, make_vector_env
 from coop.common.envs.pictures import grayscale, make_resizer
 from coop.common.errors import UsageError
-from coop.common.networks.inputs import preprocess
+from coop.common.networks.forward import preprocess
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.tables import load_tables, resolve

@@ -19,7 +19,7 @@ from coop.common.errors import RunError
 from coop.common.process.processes import free_endpoint
 from coop.common.settings.environment import EnvSettings
 from coop.lockstep.lockstep import Lockstep
-from coop.records.learner_checkpoints import newest_epoch
+from coop.records.learner_checkpoints import newest_checkpoint
 from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
 
@@ -133,13 +133,13 @@ def test_lockstep_goes_on_only_where_the_environment_repeats(tmp_path: Path, wha
             list(first.play())
         first.save(directory)
     again = Lockstep(replace(config, env=replace(config.env, kwargs={**kwargs, "what": what})))
-    epoch = newest_epoch(tmp_path)
-    assert epoch is not None
+    checkpoint = newest_checkpoint(tmp_path)
+    assert checkpoint is not None
     if what == "nothing":
-        again.restore(epoch)
+        again.restore(checkpoint)
         return
     with pytest.raises(RunError, match="test/Changed-v0 showed something else when the run's 100 actions were played"):
-        again.restore(epoch)
+        again.restore(checkpoint)
 
 
 def test_an_actor_imports_only_what_its_own_user_allows(folder: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Whose a run directory is, who works in it, and which epoch a run goes on from."""
+"""Whose a run directory is, who works in it, and which checkpoint a run goes on from."""
 
 import os
 import shutil
@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 from commands import run_command
 from samples import make_segment
-from test_epochs import CONFIG, save, save_learner
+from test_checkpoints import CONFIG, save, save_learner
 
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.joining import join
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.files import FileDigest, truncate
@@ -26,7 +26,7 @@ from coop.common.process.lifecycle import Stop
 from coop.common.types import EnvSpec
 from coop.learner.join_service import JoinService
 from coop.learner.roster import Roster
-from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.shared_checkpoints import SharedCheckpoints
 from coop.records.checkpoints import Manifest
 from coop.records.locks import INHERITED, RunLock
 from coop.records.resumption import Survey, Whole, go_back, survey
@@ -34,7 +34,7 @@ from coop.records.run_directory import RunDirectory, claim_run_directory
 from coop.records.run_ids import RUN_ID, claim, read_run_id
 from coop.records.run_options import RunOptions
 from coop.replay.core import ReplayCore
-from coop.replay.persistence.epochs import ReplayEpochs, part_path
+from coop.replay.persistence.checkpoints import ReplayCheckpoints, part_path
 from coop.replay.persistence.folder import ReplayFolder
 from coop.replay.persistence.journal import Journal, journal_files
 
@@ -47,13 +47,13 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def a_replay_folder(folder: Path, spec: EnvSpec, run_id: int = 5, epochs: tuple[int, ...] = (500, 1000)) -> None:
-    """What a replay service of the run leaves: parts of epochs and a journal."""
+def a_replay_folder(folder: Path, spec: EnvSpec, run_id: int = 5, checkpoints: tuple[int, ...] = (500, 1000)) -> None:
+    """What a replay service of the run leaves: parts of checkpoints and a journal."""
     core = ReplayCore(CONFIG, spec, Journal(folder / "journal", run_id, 1, keep=True))
-    written = ReplayEpochs(folder, run_id)
-    for number in epochs:
+    written = ReplayCheckpoints(folder, run_id)
+    for number in checkpoints:
         core.insert(make_segment(spec, number))
-        save(core, written, number, *epochs)
+        save(core, written, number, *checkpoints)
 
 
 @pytest.mark.parametrize("named", [True, False])
@@ -72,7 +72,7 @@ def test_another_run_s_folder_is_refused_and_stays_as_it_is(named: bool, spec: E
 
 
 def test_a_journal_alone_tells_whose_it_is(spec: EnvSpec, tmp_path: Path) -> None:
-    a_replay_folder(tmp_path, spec, run_id=5, epochs=())
+    a_replay_folder(tmp_path, spec, run_id=5, checkpoints=())
     with pytest.raises(RunError, match="journal: belongs to another run"):
         ReplayFolder(tmp_path, 6).check(resume=True)
 
@@ -143,9 +143,9 @@ def test_a_supervisor_s_locks_are_its_children_s_too(tmp_path: Path) -> None:
             (other.descriptors, "", refused),
             ((), "", refused),
         ):
-            told = {**os.environ, INHERITED: ",".join(map(str, held))}
+            environ = {**os.environ, INHERITED: ",".join(map(str, held))}
             child = subprocess.run(
-                command, pass_fds=held, env=told, input="", capture_output=True, text=True, check=False
+                command, pass_fds=held, env=environ, input="", capture_output=True, text=True, check=False
             )
             assert child.stdout == out, child.stderr
             assert problem in child.stderr
@@ -197,8 +197,8 @@ def test_resume_without_a_run_starts_and_another_run_is_refused(tmp_path: Path) 
         replace(options, resume=False).directory()
 
 
-def offer(*epochs: int, serving: bool = False, incarnation: int = 3) -> Join:
-    return Join("replay", incarnation, ["tcp/h:1"], epochs=list(epochs), serving=serving)
+def offer(*checkpoints: int, serving: bool = False, incarnation: int = 3) -> Join:
+    return Join("replay", incarnation, ["tcp/h:1"], checkpoints=list(checkpoints), serving=serving)
 
 
 @pytest.mark.parametrize(
@@ -211,34 +211,34 @@ def offer(*epochs: int, serving: bool = False, incarnation: int = 3) -> Join:
         ((), offer(500), 0),
     ],
 )
-def test_the_newest_epoch_that_both_hold(mine: tuple[int, ...], theirs: Join, number: int) -> None:
-    epochs = SharedEpochs(mine, "run")
-    assert epochs.offered(theirs) == (number, False)
-    assert epochs.wait(Stop()) == number
-    epochs.finished(2000)
-    assert epochs.offered(offer(500, 2000)) == (2000, False), "one that comes back in the middle of the run"
+def test_the_newest_checkpoint_that_both_hold(mine: tuple[int, ...], theirs: Join, number: int) -> None:
+    shared = SharedCheckpoints(mine, "run")
+    assert shared.offered(theirs) == (number, False)
+    assert shared.wait(Stop()) == number
+    shared.finished(2000)
+    assert shared.offered(offer(500, 2000)) == (2000, False), "one that comes back in the middle of the run"
 
 
-def test_no_epoch_in_common() -> None:
-    epochs = SharedEpochs((500, 1000), "runs/a")
+def test_no_checkpoint_in_common() -> None:
+    shared = SharedCheckpoints((500, 1000), "runs/a")
     words = (
-        rf"runs/a holds epochs 500, 1000, the replay service on \S+ \(pid {os.getpid()}\) holds none; "
-        "nothing was changed. With --restart the training begins anew"
+        rf"runs/a holds checkpoints 500, 1000, the replay service on \S+ \(pid {os.getpid()}\) holds none; "
+        "nothing was changed. With --restart the training starts over"
     )
     with pytest.raises(UsageError, match=words):
-        epochs.offered(offer())
+        shared.offered(offer())
     with pytest.raises(UsageError, match=words):
-        epochs.wait(Stop())
-    restarted = SharedEpochs((500, 1000), "runs/a", restart=True)
+        shared.wait(Stop())
+    restarted = SharedCheckpoints((500, 1000), "runs/a", restart=True)
     assert restarted.offered(offer(1500)) == (0, True)
     assert restarted.wait(Stop()) == 0
     assert restarted.offered(offer(incarnation=4)) == (0, False), "one that comes later begins with what it holds"
     stop = Stop()
     stop.set("interrupted")
-    assert SharedEpochs((500,), "runs/a").wait(stop) is None
+    assert SharedCheckpoints((500,), "runs/a").wait(stop) is None
 
 
-def test_the_learner_goes_back_to_the_epoch_that_is_chosen(tmp_path: Path) -> None:
+def test_the_learner_goes_back_to_the_checkpoint_that_is_chosen(tmp_path: Path) -> None:
     for number in (500, 1000):
         save_learner(tmp_path, number, {"updates": number})
     (tmp_path / "checkpoints" / "1000" / "learner.pt").write_bytes(b"torn")
@@ -262,7 +262,7 @@ def serve_replay(endpoint: str, folder: Path, *flags: str) -> subprocess.Complet
         out = []
         for line in process.stdout:
             out.append(line)
-            if "epoch" in line:
+            if "checkpoint" in line:
                 process.send_signal(signal.SIGINT)
         assert process.stderr is not None
         err = process.stderr.read()
@@ -272,19 +272,19 @@ def serve_replay(endpoint: str, folder: Path, *flags: str) -> subprocess.Complet
 
 
 @pytest.fixture
-def learner(endpoint: str, spec: EnvSpec) -> Callable[..., SharedEpochs]:
-    """Makes the join service of a learner that holds the given epochs."""
+def learner(endpoint: str, spec: EnvSpec) -> Callable[..., SharedCheckpoints]:
+    """Makes the join service of a learner that holds the given checkpoints."""
 
-    def receive(node: Node, *held: int, restart: bool = False) -> SharedEpochs:
-        epochs = SharedEpochs(held, "runs/a", restart=restart)
-        JoinService(node, CONFIG, spec, "layout", 5, epochs, Roster(), lambda _: None)
-        return epochs
+    def receive(node: Node, *held: int, restart: bool = False) -> SharedCheckpoints:
+        shared = SharedCheckpoints(held, "runs/a", restart=restart)
+        JoinService(node, CONFIG, spec, "layout", 5, shared, Roster(), lambda _: None)
+        return shared
 
     return receive
 
 
 def test_a_replay_service_refuses_restores_and_begins_anew(
-    endpoint: str, spec: EnvSpec, tmp_path: Path, learner: Callable[..., SharedEpochs]
+    endpoint: str, spec: EnvSpec, tmp_path: Path, learner: Callable[..., SharedCheckpoints]
 ) -> None:
     theirs, ours = tmp_path / "theirs", tmp_path / "ours"
     a_replay_folder(theirs, spec, run_id=6)
@@ -297,7 +297,7 @@ def test_a_replay_service_refuses_restores_and_begins_anew(
         assert "belongs to another run than the learner's" in refused.stderr
         assert contents(theirs) == before
         done = serve_replay(endpoint, ours, "--resume")
-        assert "restored epoch 1000" in done.stdout, done.stderr
+        assert "restored checkpoint 1000" in done.stdout, done.stderr
         assert (ours / RUN_ID).read_text() == "5\n"
     shutil.rmtree(part_path(ours, 1000).parent)
     for restart in (False, True):
@@ -305,26 +305,30 @@ def test_a_replay_service_refuses_restores_and_begins_anew(
             learner(node, 1000, restart=restart)
             done = serve_replay(endpoint, ours, "--resume")
             if restart:
-                assert "no epoch to restore" in done.stdout, done.stderr
+                assert "no checkpoint to restore" in done.stdout, done.stderr
                 assert not list((ours / "checkpoints").iterdir())
                 assert not journal_files(ours / "journal")
             else:
                 assert done.returncode == 1
-                assert "no epoch to go on from: runs/a holds epochs 1000, the replay service on " in done.stderr
-                assert "holds epochs 500; nothing was changed. With --restart" in done.stderr
+                assert (
+                    "no checkpoint to resume from: runs/a holds checkpoints 1000, the replay service on " in done.stderr
+                )
+                assert "holds checkpoints 500; nothing was changed. With --restart" in done.stderr
                 assert part_path(ours, 500).exists()
 
 
-def test_who_only_asks_takes_nobody_s_place(nodes: tuple[Node, Node], learner: Callable[..., SharedEpochs]) -> None:
+def test_who_only_asks_takes_nobody_s_place(
+    nodes: tuple[Node, Node], learner: Callable[..., SharedCheckpoints]
+) -> None:
     node, other = nodes
-    epochs = learner(node, 500)
+    shared = learner(node, 500)
     assert join(other, Stop(), Join("replay", 1, []), (), 5) is not None
     stop = Stop()
     stop.set("enough")
-    assert epochs.wait(stop) is None, "nothing is decided by a question"
-    joined = join(other, Stop(), Join("replay", 1, ["tcp/h:1"], epochs=[500]), (), 5)
-    assert joined is not None
-    assert (joined.epoch, joined.replay_endpoints) == (500, ["tcp/h:1"])
+    assert shared.wait(stop) is None, "nothing is decided by a question"
+    reply = join(other, Stop(), Join("replay", 1, ["tcp/h:1"], checkpoints=[500]), (), 5)
+    assert reply is not None
+    assert (reply.checkpoint, reply.replay_endpoints) == (500, ["tcp/h:1"])
     again = join(other, Stop(), Join("replay", 2, []), (), 5)
     assert again is not None
     assert again.replay_endpoints == ["tcp/h:1"]

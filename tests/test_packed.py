@@ -89,8 +89,8 @@ def test_a_study_outlives_the_rules_for_its_cells(folder: Path) -> None:
 
 
 def test_every_number_comes_back(folder: Path, tmp_path: Path) -> None:
-    told = pack(folder, tmp_path / "study.parquet")
-    assert told.startswith(f"{tmp_path}/study.parquet: 5 runs in ")
+    line = pack(folder, tmp_path / "study.parquet")
+    assert line.startswith(f"{tmp_path}/study.parquet: 5 runs in ")
     packed = PackedStudy(tmp_path / "study.parquet")
     assert packed.sweep == (folder / "sweep.toml").read_text()
     for run in folder.glob("*/"):

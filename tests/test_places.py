@@ -38,8 +38,8 @@ def test_an_environment_that_changes_directory(command: str, name: str, tmp_path
     done = run_command(command, *flags, "--run-dir", "runs/a", cwd=tmp_path, timeout=200)
     assert done.returncode == 0, done.stderr
     assert "runs/a" in done.stdout.splitlines()[-1]
-    told = run_command("coop-eval", "runs/a", "--episodes", "1", "--networks", "1", cwd=tmp_path)
-    assert told.stdout.splitlines()[-1].startswith("runs/a "), told.stderr
+    printed = run_command("coop-eval", "runs/a", "--episodes", "1", "--networks", "1", cwd=tmp_path)
+    assert printed.stdout.splitlines()[-1].startswith("runs/a "), printed.stderr
     assert (tmp_path / "runs" / "a" / "summary.json").exists()
     assert not list((tmp_path / "assets").iterdir())
 

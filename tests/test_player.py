@@ -88,14 +88,14 @@ def test_epsilon_follows_the_steps_of_the_whole_run() -> None:
     _, env, policy = make_player(num_envs=1)
     player = Player(env, policy, partial(schedules.epsilon, settings))
     player.begin()
-    told = {}
+    recorded = {}
     for env_step in range(0, 1000, 4):  # three others play as well
         player.send(env_step, 0)
         for end in player.recv().ended.values():
-            told[env_step] = end.epsilon
+            recorded[env_step] = end.epsilon
     env.close()
-    assert len(told) > 5
-    for env_step, epsilon in told.items():
+    assert len(recorded) > 5
+    for env_step, epsilon in recorded.items():
         assert epsilon == pytest.approx(1 - env_step / 1000)
 
 

@@ -122,9 +122,9 @@ def test_the_last_line_says_what_failed(
     with pytest.raises(SystemExit) as end:
         run_main("coop-x", fail)
     assert end.value.code == status
-    told = capsys.readouterr().err.splitlines()
-    assert told[-1].startswith(lines[-1])
-    assert ("Traceback" in told[0]) == isinstance(error, RuntimeError)
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[-1].startswith(lines[-1])
+    assert ("Traceback" in printed[0]) == isinstance(error, RuntimeError)
 
 
 def test_the_same_words_twice_at_once_are_certain() -> None:

@@ -121,9 +121,9 @@ def test_a_failed_recording_is_told_and_leaves_the_agent_as_it_was(capsys: pytes
     for batch in make_batches(2):
         np.testing.assert_array_equal(recorded.update(batch).td_errors, eager.update(batch).td_errors)
     assert_equal(recorded, eager)
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "RuntimeError: operation not permitted when stream is capturing" in told
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert "RuntimeError: operation not permitted when stream is capturing" in printed
 
 
 @pytest.mark.parametrize(

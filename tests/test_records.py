@@ -82,8 +82,8 @@ def test_tensorboard_is_cut_back_with_the_records(tmp_path: Path) -> None:
         while run.step < 600:
             for effects in run.play():
                 directory.record(effects.episodes, effects.metrics)
-            if run.trainer.epoch_due():
-                run.trainer.epoch_begun()
+            if run.trainer.checkpoint_due():
+                run.trainer.checkpoint_begun()
                 run.save(directory)
     run.env.close()
     (mine,) = (path / "tb").iterdir()

@@ -77,8 +77,8 @@ def test_the_primary_outcome() -> None:
     assert points["g-coop - dqn"].tolist() == pytest.approx([10, -10, 20])
     assert points["two networks - one"].tolist() == pytest.approx([25, -15, 40])
     assert table["low"].tolist() == pytest.approx(points.tolist())  # the same for all seeds
-    beside = outcome(pd.concat([study_runs(small, large), without_buffer(1.0)]))
-    pd.testing.assert_frame_equal(beside.set_index(["difference", "size"]), table)
+    compared = outcome(pd.concat([study_runs(small, large), without_buffer(1.0)]))
+    pd.testing.assert_frame_equal(compared.set_index(["difference", "size"]), table)
     without = outcome(study_runs(small, large, edql=False)).set_index(["difference", "size"])["points"]
     assert without["two networks - one"].tolist() == pytest.approx([10, -10, 20])
 

@@ -49,7 +49,8 @@ def make_newest(table):
 
 
 SOFT = Method("soft-max", "a mean of both", rule="my_rules:Soft", settings=SoftSettings,
-              conditions=(Condition(("soft_max.other",), lambda c: c.own.weight > 0, "soft_max.weight = 0"),))
+              conditions=(
+                  Condition(("soft_max.other",), lambda c: c.method_settings.weight > 0, "soft_max.weight = 0"),))
 EVICTION = EvictionPolicy("most-drawn", MostDrawn)
 SAMPLER = SamplingPolicy("newest", make_newest)
 """
@@ -59,7 +60,7 @@ from coop.learner.methods.rule import UpdateRule
 
 class Soft(UpdateRule):
     def bootstrap(self, next_values, preferred):
-        weight = self.config.own.weight
+        weight = self.config.method_settings.weight
         return weight * next_values.max(1) + (1 - weight) * next_values.mean(1)
 """
 ENTRY_POINTS = """

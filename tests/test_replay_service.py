@@ -17,10 +17,10 @@ from coop.common.messaging.keys import replay_key
 from coop.common.messaging.links import locators
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack, Retry
-from coop.common.messaging.messages.epoch import Snapshot, Written
+from coop.common.messaging.messages.control import Snapshot, Written
 from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.messages.sample import DrawRequest
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation
@@ -28,7 +28,7 @@ from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore, RetryLater
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.service import ReplayService
 
 CONFIG = RunConfig(
@@ -41,7 +41,7 @@ CONFIG = RunConfig(
 
 def _serve(node: Node, core: ReplayCore, folder: Path, asker: Node | None = None) -> ReplayService:
     """A service that has started, and that `asker` has heard of."""
-    service = ReplayService(node, core, ReplayEpochs(folder, 5))
+    service = ReplayService(node, core, ReplayCheckpoints(folder, 5))
     service.start()
     if asker is not None:
         await_service(asker, replay_key(asker, "snapshot"))  # the last one that it declares
@@ -125,7 +125,7 @@ def test_snapshot_on_disk(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Pat
     folder = tmp_path / "checkpoints" / "12" / "replay"
     assert np.load(folder / "rewards.npy").tolist() == [0, 1, 2, 3]
     assert np.load(folder / "frames.npy").shape == (5, 4)
-    with pytest.raises(Refused, match="epoch 13 was not begun"):
+    with pytest.raises(Refused, match="checkpoint 13 was not begun"):
         client.ask(key, Written(13).encode("test"))
 
 
@@ -201,8 +201,8 @@ def test_segments_wait_behind_their_window_without_being_sent_again(
 ) -> None:
     server, client = nodes
     service = _serve(server, ReplayCore(CONFIG, spec), tmp_path, client)
-    told: list[str] = []
-    inserts = InsertClient(client, Stop(), window=16, on_wait=lambda: told.append(inserts.waiting))
+    reasons: list[str] = []
+    inserts = InsertClient(client, Stop(), window=16, on_wait=lambda: reasons.append(inserts.waiting))
     for number in range(16):  # the limiter lets 5 in, then one for every 4 draws
         assert inserts.submit(make_segment(spec, number, acked=inserts.acked))
     waiter = threading.Thread(target=inserts.drain)
@@ -215,7 +215,7 @@ def test_segments_wait_behind_their_window_without_being_sent_again(
     assert time.monotonic() - began > ASK_TIMEOUT, "the last one waited longer than an ordinary question may"
     assert inserts.acked == 16 * 4
     assert service.stats().duplicates == 0
-    assert len(told) > 50, "and whoever looks is told meanwhile"
+    assert len(reasons) > 50, "and whoever looks is told meanwhile"
 
 
 def test_actors_share_what_may_be_in_flight(
@@ -248,13 +248,13 @@ def test_actors_share_what_may_be_in_flight(
 def test_a_stop_ends_the_waiting(endpoint: str, spec: EnvSpec) -> None:
     stop = Stop()
     with Node(open_session((endpoint,)), "test", "actor", new_incarnation()) as client:
-        told: list[str] = []
-        inserts = InsertClient(client, stop, window=4, on_wait=lambda: told.append(inserts.waiting))
+        reasons: list[str] = []
+        inserts = InsertClient(client, stop, window=4, on_wait=lambda: reasons.append(inserts.waiting))
         threading.Timer(0.3, stop.set, ("enough",)).start()
         assert inserts.submit(make_segment(spec, 0))
         assert not inserts.submit(make_segment(spec, 1)), "until it is acknowledged, the first one goes alone"
         assert inserts.waiting == "the replay service does not answer"
-        assert told.count(inserts.waiting) > 1, "the reason is told again and again"
+        assert reasons.count(inserts.waiting) > 1, "the reason is told again and again"
         with pytest.raises(NoAnswer):
             client.ask(replay_key(client, "stats"), StatsQuestion().encode("test"))
 

@@ -33,8 +33,7 @@ from coop.studies.report.intervals import (
     tail,
 )
 from coop.studies.report.measures import breaking_point
-from coop.studies.report.paper import table_1
-from coop.studies.report.results import breaking_table
+from coop.studies.report.results import breaking_table, table_1
 from coop.studies.report.study import load_study
 from coop.studies.report.writer import write_report
 from coop.studies.sweep.grid import load_grid
@@ -88,22 +87,22 @@ def returns(run: Path) -> list[float]:
 
 @pytest.mark.parametrize("name", ["dqn-capacity=60-seed=1", "coop-capacity=300-seed=0"])
 def test_a_run_recomputed_from_its_episodes(name: str, study: Path, report: Path) -> None:
-    (told,) = (row for row in rows(report / "table_runs.csv") if row["run"] == name)
+    (row,) = (row for row in rows(report / "table_runs.csv") if row["run"] == name)
     last = returns(study / name)[-100:]
     assert len(last) == 100 < len(returns(study / name))
-    assert float(told["mean"]) == pytest.approx(sum(last) / len(last), rel=1e-9)
-    assert float(told["sd"]) == pytest.approx(statistics.pstdev(last), rel=1e-9)
-    assert int(told["episodes"]) == len(returns(study / name))
+    assert float(row["mean"]) == pytest.approx(sum(last) / len(last), rel=1e-9)
+    assert float(row["sd"]) == pytest.approx(statistics.pstdev(last), rel=1e-9)
+    assert int(row["episodes"]) == len(returns(study / name))
     lines = [json.loads(line) for line in (study / name / "metrics.jsonl").read_text().splitlines()]
     late = [line["sample_age_mean"] for line in lines if line["env_step"] >= lines[-1]["env_step"] / 2]
-    assert float(told["sample_age_mean"]) == pytest.approx(statistics.fmean(late))
-    assert float(told["evicted_unsampled"]) == pytest.approx(lines[-1]["evicted_unsampled"])
+    assert float(row["sample_age_mean"]) == pytest.approx(statistics.fmean(late))
+    assert float(row["evicted_unsampled"]) == pytest.approx(lines[-1]["evicted_unsampled"])
     late = [line for line in lines if line["env_step"] >= lines[-1]["env_step"] / 2]
     for column in ("archive_td_error", "archive_drift", "policy_churn", "dormant_share", "effective_rank"):
-        assert float(told[column]) == pytest.approx(statistics.fmean(line[column] for line in late if column in line))
-    assert float(told["terminal_share"]) == pytest.approx(statistics.fmean(line["terminal_share"] for line in late))
+        assert float(row[column]) == pytest.approx(statistics.fmean(line[column] for line in late if column in line))
+    assert float(row["terminal_share"]) == pytest.approx(statistics.fmean(line["terminal_share"] for line in late))
     shares = [line["q_abs_mean"] / line["q_bound"] for line in late]
-    assert float(told["q_share"]) == pytest.approx(statistics.fmean(shares))
+    assert float(row["q_share"]) == pytest.approx(statistics.fmean(shares))
 
 
 def test_settings_and_breaking_points_recomputed(study: Path, report: Path) -> None:

@@ -289,8 +289,8 @@ def test_what_feedback_does_to_a_step() -> None:
     page = (RESULTS / "../docs/algorithm.md").read_text()
     columns = ("gradient", "cosine", "step", "step_cosine")
     for (case, when), part in rows.groupby(["case", "when"], sort=False):
-        told = " | ".join(", ".join(f"{value:.2f}" for value in part[what]) for what in columns)
-        assert f"| {case} | {when} | {told} |" in page
+        cells = " | ".join(", ".join(f"{value:.2f}" for value in part[what]) for what in columns)
+        assert f"| {case} | {when} | {cells} |" in page
     later = rows[rows["when"] == "later"].set_index("case")
     plain = [f"{value:.2f}" for value in later.loc["transform, constant s", "gradient"]]
     turned = [f"{value:.2f}" for value in later.loc["weight-gradient, constant s", "step_cosine"]]

@@ -7,7 +7,7 @@ import pytest
 import coop.learner.roster
 from coop.common.errors import BadMessage, RunError
 from coop.common.messaging.members import Origin
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join
 from coop.common.messaging.presence import LEASE
 from coop.common.process.files import write_atomic
 from coop.learner.roster import AlreadyServed, Roster

@@ -45,11 +45,11 @@ def test_one_link_carries_everything() -> None:
                 assert (len(session.info.routers_zid()), len(session.info.peers_zid())) == (1, 0)
                 role = node.latest(node.key("role"))
 
-                def told() -> object:
+                def asked() -> object:
                     learner.announce(learner.key("role"), Ack(3).encode("test"))
                     return role.poll()
 
-                wait_for(told)
+                wait_for(asked)
                 wait_for(lambda: learner.presence.members("actor"))
                 wait_for(lambda: replay.presence.members("actor"))  # by which it shares out what may be in flight
                 assert links(router) == "connected: 2 services, 1 actor"

@@ -37,7 +37,7 @@ def test_epsilon(decay: str, env_step: int, expected: float) -> None:
     ],
 )
 def test_exploration_rate(stepwise: bool, update: int, expected: float) -> None:
-    settings = EdlSettings(rate=0.1, decay=0.5, decay_every=10, decay_stepwise=stepwise)
+    settings = EdlSettings(rate=0.1, decay=0.5, decay_every=10, decay_staircase=stepwise)
     assert schedules.feedback_scale(settings, update) == pytest.approx(expected)
 
 

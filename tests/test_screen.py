@@ -194,16 +194,16 @@ def test_the_json_object_is_as_documented() -> None:
     section = page.partition("## The JSON object")[2].partition("\n## ")[0]
     rows = [line.split(" | ", 1) for line in section.splitlines() if line.startswith("| `")]
     fields = [name for names, _ in rows for name in re.findall(r"`(\w+)`", names)]
-    told = report("demo", STATUS)
-    assert sorted(told) == sorted(fields)
+    reported = report("demo", STATUS)
+    assert sorted(reported) == sorted(fields)
     meanings = {
         name: set(re.findall(r"`(\w+)`", text)) for names, text in rows for name in re.findall(r"`(\w+)`", names)
     }
-    assert meanings["ratio"] == told["ratio"].keys()
-    assert meanings["waits"] == told["waits"][0].keys()
-    assert meanings["members"] == told["members"][0].keys()
-    assert told["measured"].keys() == set(re.findall(r"`measured\.(\w+)`", page))
-    assert told["events"] == EVENTS
+    assert meanings["ratio"] == reported["ratio"].keys()
+    assert meanings["waits"] == reported["waits"][0].keys()
+    assert meanings["members"] == reported["members"][0].keys()
+    assert reported["measured"].keys() == set(re.findall(r"`measured\.(\w+)`", page))
+    assert reported["events"] == EVENTS
 
 
 class Pictures(LiveDisplay):

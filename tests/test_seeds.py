@@ -22,9 +22,9 @@ from coop.lockstep.memory import TableMemory
 from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start
 from coop.records.summaries import read_summary
-from coop.studies.stacked.eligible import why_not
 from coop.studies.stacked.seeds import Seeds
 from coop.studies.stacked.together import play_together
+from coop.studies.sweep.stacking import why_not
 
 pytest.importorskip("numba")
 
@@ -100,16 +100,16 @@ def test_each_run_is_to_the_bit_what_it_is_by_itself(case: str) -> None:
     configs = [replace(config, seed=seed) for seed in (3, 4, 5, 6, 7)]
     runs = [Lockstep(each) for each in configs]
     seeds = Seeds(runs)
-    told: dict[Lockstep, tuple[list[EpisodeRow], list[dict[str, Any]]]] = {run: ([], []) for run in runs}
+    recorded: dict[Lockstep, tuple[list[EpisodeRow], list[dict[str, Any]]]] = {run: ([], []) for run in runs}
     while seeds.step < steps:
         for each in seeds.play(steps - seeds.step):
-            told[each.run][0].extend(each.episodes)
-            told[each.run][1].extend(each.metrics)
+            recorded[each.run][0].extend(each.episodes)
+            recorded[each.run][1].extend(each.metrics)
     for k in (0, 4):
         own = Lockstep(configs[k])
         episodes, metrics = alone(own, seeds.step)
-        assert told[runs[k]][0] == episodes
-        assert untimed(told[runs[k]][1]) == untimed(metrics)
+        assert recorded[runs[k]][0] == episodes
+        assert untimed(recorded[runs[k]][1]) == untimed(metrics)
         assert len(episodes) > 5
         assert metrics
         seeds.save_into(k)
@@ -168,7 +168,7 @@ OF_STATE = (
 
 
 def assert_same_files(one: Path, other: Path, *, resumed: bool = False) -> None:
-    """resumed: an interval of metrics begins anew where a run goes on, whatever plays it."""
+    """resumed: an interval of metrics starts over where a run goes on, whatever plays it."""
     for name in ("config.toml", "episodes.csv"):
         assert (one / name).read_bytes() == (other / name).read_bytes(), name
     texts = [(path / "metrics.jsonl").read_text().splitlines() for path in (one, other)]

@@ -159,6 +159,6 @@ def test_episode_ends_travel_in_the_segment_of_their_last_step() -> None:
         over = [stream in ends for stream in range(2)]
         segments += assembler.add(np.zeros(2, np.int32), steps_of([0, 0], over), step, ends)
     segments += assembler.flush()
-    told = [(s.stream, s.sequence, [e.step_in_segment for e in s.episodes]) for s in segments]
-    assert told == [(0, 0, [2]), (1, 0, [1, 2]), (0, 1, [0]), (1, 1, [])]
+    sent = [(s.stream, s.sequence, [e.step_in_segment for e in s.episodes]) for s in segments]
+    assert sent == [(0, 0, [2]), (1, 0, [1, 2]), (0, 1, [0]), (1, 1, [])]
     assert segments[0].episodes[0].episode_return == 12.0

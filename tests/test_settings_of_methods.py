@@ -141,14 +141,16 @@ def test_the_reason_is_said_and_files_may_hold_everything(
 def test_a_methods_own_settings_are_kept_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flags = ["--medqn.states", "real", "--medqn.lambda-end=2", "--medqn.epochs", "3"]
     config = parsed(["--method", "medqn", *flags], monkeypatch)
-    assert config.own == MedqnSettings("real", 0.01, 2.0, 3)
+    assert config.method_settings == MedqnSettings("real", 0.01, 2.0, 3)
     assert to_tables(config)["medqn"] == {"states": "real", "lambda_start": 0.01, "lambda_end": 2.0, "epochs": 3}
     file = tmp_path / "config.toml"
     file.write_text(to_toml(config))
     assert parsed([f"--config={file}"], monkeypatch) == config
-    assert parsed([f"--config={file}", "--medqn.epochs", "4"], monkeypatch).own == MedqnSettings("real", 0.01, 2.0, 4)
+    assert parsed([f"--config={file}", "--medqn.epochs", "4"], monkeypatch).method_settings == MedqnSettings(
+        "real", 0.01, 2.0, 4
+    )
     other = parsed([f"--config={file}", "--method", "dqn"], monkeypatch)
-    assert other.own is None
+    assert other.method_settings is None
     assert validated(to_tables(config)) == config, "what joining roles receive"
     assert "medqn" not in to_tables(other)
     file.write_text(to_toml(other))
@@ -158,7 +160,7 @@ def test_a_methods_own_settings_are_kept_for_it(tmp_path: Path, monkeypatch: pyt
 def test_a_presets_table_of_one_method_overrides_its_own_settings() -> None:
     tables = {"medqn": {"epochs": 2, "states": "real"}, "methods": {"medqn": {"medqn": {"epochs": 3}, "seed": 7}}}
     config = resolve(tables, "medqn")
-    assert (config.own, config.seed) == (MedqnSettings("real", epochs=3), 7)
+    assert (config.method_settings, config.seed) == (MedqnSettings("real", epochs=3), 7)
     again = resolve(to_tables(resolve(to_tables(resolve(tables, "dqn")), "coop")), "medqn")
     assert again == config
 

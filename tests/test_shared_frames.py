@@ -27,7 +27,7 @@ from coop.common.process.shared_memory import SharedMemory, SharedMemoryReader
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.types import Batch, EnvSpec
 from coop.replay.core import ReplayCore, Reply
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import Journal
 from coop.replay.persistence.recovery import recover
 from coop.replay.service import ReplayService
@@ -51,7 +51,7 @@ def _insert(core: ReplayCore, *sequences: int) -> None:
 
 
 def _serve(node: Node, core: ReplayCore, folder: Path, asker: Node) -> None:
-    ReplayService(node, core, ReplayEpochs(folder, 5)).start()
+    ReplayService(node, core, ReplayCheckpoints(folder, 5)).start()
     await_service(asker, replay_key(asker, "snapshot"))
 
 

@@ -77,7 +77,7 @@ def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
     assert json.loads((path / "summary.json").read_text())["exit"] == "interrupted"
     done = run_command("coop-lockstep", *flags)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("goes on from checkpoint ")
+    assert done.stdout.startswith("resuming from checkpoint ")
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -96,15 +96,15 @@ def test_the_first_reason_tells_the_status() -> None:
     stop = Stop()
     stop.set("complete")
     stop.set("interrupted", exit_status=143)
-    stop.leave()
+    stop.raise_for_status()
     interrupted = Stop()
     interrupted.set("interrupted", exit_status=143)
     with pytest.raises(SystemExit, match="143"):
-        interrupted.leave()
+        interrupted.raise_for_status()
     lost = Stop()
     lost.set("the learner has gone", failed=True)
     with pytest.raises(PeerLost, match="the learner has gone"):
-        lost.leave()
+        lost.raise_for_status()
 
 
 def test_only_a_second_sigint_interrupts_at_once() -> None:

@@ -23,8 +23,8 @@ from test_screen import STATUS
 
 import coop
 from coop.common.errors import UsageError
+from coop.common.imports import check_extra
 from coop.common.messaging.messages.status import LearnerStatus
-from coop.common.process.extras import check_extra
 from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import free_endpoint
 from coop.common.registry import Registry
@@ -61,18 +61,18 @@ def test_a_status_for_prometheus() -> None:
     with exported("0", lambda: status) as port:
         assert scrape() == {}, "before the first status"
         status = replace(STATUS, missing=["actor 2 on node2 (pid 44)"])
-        told = scrape()
+        logged = scrape()
         with pytest.raises(UsageError, match=f"--prometheus {port}: Address already in use"), exported(str(port), dict):
             pass
         status = replace(STATUS, ratio=None, measured=None, waits=[], env_steps=31_290)
         fewer = scrape()
-    assert told["coop_env_steps_total"] == 31_240
-    assert told["coop_return_mean_100"] == 187.43
-    assert (told["coop_members actor"], told["coop_members_lost"]) == (2, 1)
-    assert (told["coop_ratio_measured"], told["coop_ratio_most"]) == (0.998, 80)
-    assert (told["coop_q_abs_mean"], told["coop_q_bound"]) == (42.13, 100)
-    assert told["coop_wait_share the learner actors"] == 0.63
-    assert told["coop_evicted_unsampled"] == 0, "which is not unknown"
+    assert logged["coop_env_steps_total"] == 31_240
+    assert logged["coop_return_mean_100"] == 187.43
+    assert (logged["coop_members actor"], logged["coop_members_lost"]) == (2, 1)
+    assert (logged["coop_ratio_measured"], logged["coop_ratio_most"]) == (0.998, 80)
+    assert (logged["coop_q_abs_mean"], logged["coop_q_bound"]) == (42.13, 100)
+    assert logged["coop_wait_share the learner actors"] == 0.63
+    assert logged["coop_evicted_unsampled"] == 0, "which is not unknown"
     assert fewer["coop_env_steps_total"] == 31_290
     assert not [name for name in fewer if name.startswith(("coop_ratio", "coop_q", "coop_wait"))]
 
@@ -120,13 +120,13 @@ def test_weights_and_biases_gets_tensorboards_scalars(tmp_path: Path, monkeypatc
     run.env.close()
     expected = scalars(tmp_path)
     (file,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
-    told, settings = {}, {}
+    logged, settings = {}, {}
     for data in records(file):
         record = Record.FromString(data)
         row = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
-        told |= {(tag, row["env_step"]): value for tag, value in row.items() if "/" in tag}
+        logged |= {(tag, row["env_step"]): value for tag, value in row.items() if "/" in tag}
         settings |= {item.key: json.loads(item.value_json) for item in record.config.update}
-    assert told == pytest.approx(expected)
+    assert logged == pytest.approx(expected)
     assert settings["replay.capacity"] == run.config.replay.capacity
 
 
@@ -151,14 +151,14 @@ def test_mlflow_gets_tensorboards_scalars(tmp_path: Path) -> None:
     assert (experiment.name, its_run.info.run_name, its_run.info.status) == ("coop", "run", "FINISHED")
     assert its_run.data.tags["coop.run_id"] == f"{run_id:x}"
     assert its_run.data.params["replay.capacity"] == str(config.replay.capacity)
-    told = {
+    logged = {
         (tag, each.step): each.value
         for tag in its_run.data.metrics
         for each in store.get_metric_history(its_run.info.run_id, tag)
     }
     expected = scalars(path)
     assert max(step for _, step in expected) > 1000, "the resumed run goes on with tb/, which has to be cut back"
-    assert told == pytest.approx(expected), "what was behind the checkpoint was logged twice, with the same values"
+    assert logged == pytest.approx(expected), "what was behind the checkpoint was logged twice, with the same values"
 
 
 def mlflow_store(folder: Path) -> Any:

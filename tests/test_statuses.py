@@ -4,12 +4,12 @@ import pytest
 from msgspec.structs import replace
 
 from coop.common.messaging.members import Origin
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join
 from coop.common.messaging.messages.status import ActorStatus, Held, Member, Ratio, ReplayStatus, Wait
-from coop.common.process.rates import Rate
-from coop.learner.members import FORGOTTEN, MemberTracker
-from coop.learner.return_history import ReturnHistory
+from coop.common.numbers import Rate
+from coop.learner.roster import FORGOTTEN, MemberTracker
 from coop.learner.status import waits
+from coop.learner.telemetry import ReturnHistory
 from coop.replay.gate import HOLD, Gate
 
 
@@ -78,9 +78,9 @@ def test_the_history_of_returns_covers_the_run() -> None:
 
 def test_members_are_listed_with_their_states() -> None:
     members = MemberTracker(lambda line: None)
-    members.joined(Join("replay", 1, ["tcp/rep:1"], origin=Origin("rep", 7)), "replay service")
-    members.joined(Join("actor", 2, [], origin=Origin("act", 8)), "actor 0")
-    members.joined(Join("actor", 3, [], origin=Origin("act", 9)), "actor 1")
+    members.add(Join("replay", 1, ["tcp/rep:1"], origin=Origin("rep", 7)), "replay service")
+    members.add(Join("actor", 2, [], origin=Origin("act", 8)), "actor 0")
+    members.add(Join("actor", 3, [], origin=Origin("act", 9)), "actor 1")
     members.report(2, ActorStatus(10, 8, 55.0))
     members.report(3, ActorStatus(10, 8, 1.0, "because"))
     members.report(99, ActorStatus(10, 8))
@@ -97,5 +97,5 @@ def test_members_are_listed_with_their_states() -> None:
     assert members.listed(1.0 + FORGOTTEN, 9) == [service]
     members.token(2, True, 2.0)
     assert members.listed(2.0, 9) == [service, first]
-    members.joined(Join("actor", 99, [], origin=Origin("act", 10)), "actor 2")
+    members.add(Join("actor", 99, [], origin=Origin("act", 10)), "actor 2")
     assert members.listed(2.0, 9)[2] == Member("actor 2", "actor", "act", 10, "playing"), "nothing from before its join"

@@ -103,8 +103,8 @@ def test_moments_by_hand() -> None:
 def test_rewards_by_hand() -> None:
     """gamma = 0.5. u is 1; 3, as the episode ends there; then 0.5 * 3 + 2 = 3.5. Variances: 1, 2, 1.75."""
     scale = RewardScale(0.5)
-    told = [scale(1.0, ended=False), scale(3.0, ended=True), scale(2.0, ended=False)]
-    assert told == pytest.approx([1, 3 / math.sqrt(2), 2 / math.sqrt(1.75)])
+    scales = [scale(1.0, ended=False), scale(3.0, ended=True), scale(2.0, ended=False)]
+    assert scales == pytest.approx([1, 3 / math.sqrt(2), 2 / math.sqrt(1.75)])
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,9 @@ def linear_agent() -> StreamAgent:
     """Q(x, 0) = x + 0.5 and Q(x, 1) = -x of the standardized x; gamma = lambda = 0.5. The first observation is 1."""
     own = StreamQSettings(trace_decay=0.5)
     learner, network = LearnerSettings(gamma=0.5), NetworkSettings(hidden=())
-    agent = StreamAgent(RunConfig(method="stream-q", own=own, learner=learner, network=network, total_steps=1000), ONE)
+    agent = StreamAgent(
+        RunConfig(method="stream-q", method_settings=own, learner=learner, network=network, total_steps=1000), ONE
+    )
     agent.networks[0].load(np.array([0, 1, 1, -1, 0.5, 0], np.float32))  # mean, sd, w0, w1, b0, b1
     agent.begin(np.array([1.0], np.float32))
     return agent
@@ -254,7 +256,9 @@ def test_the_reward_that_ends_an_episode_begins_no_sum() -> None:
 
 
 def test_stacked_pictures_are_shown_oldest_first() -> None:
-    config = RunConfig(method="stream-q", own=StreamQSettings(), network=NetworkSettings(hidden=(8,)), total_steps=1000)
+    config = RunConfig(
+        method="stream-q", method_settings=StreamQSettings(), network=NetworkSettings(hidden=(8,)), total_steps=1000
+    )
     agent, rng = StreamAgent(config, STACKED), np.random.default_rng(0)
     frames = rng.integers(0, 256, (3, *STACKED.frame_shape), np.uint8)
     for first in (frames[1:], frames[:2]):  # one alone would be standardized to 0

@@ -40,7 +40,7 @@ def test_a_run_writes_what_every_run_writes(run_dir: Path) -> None:
     run = coop.load(run_dir)
     assert run.summary is not None
     assert (run.summary["updates"], run.summary["transitions_accepted"]) == (600, 600)
-    assert run.config.own == StreamQSettings()
+    assert run.config.method_settings == StreamQSettings()
     rows = run.metrics
     assert list(rows["update"]) == [200, 400, 600]
     assert set(rows["replay_size"]) == {0}

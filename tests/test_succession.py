@@ -27,9 +27,9 @@ from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import free_endpoint
 from coop.common.settings.config import RunConfig
 from coop.common.types import EnvSpec
-from coop.records.learner_checkpoints import newest_epoch
+from coop.records.learner_checkpoints import newest_checkpoint
 from coop.replay.core import ReplayCore
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.service import ReplayService
 
 pytestmark = pytest.mark.timeout(300)  # processes that start one after the other, also on a busy machine
@@ -40,7 +40,7 @@ def test_a_service_that_is_not_confirmed_neither_acknowledges_nor_draws(
 ) -> None:
     server, client = nodes
     core = ReplayCore(RunConfig(run="test"), spec)
-    service = ReplayService(server, core, ReplayEpochs(tmp_path, 5), confirmed=0.0)
+    service = ReplayService(server, core, ReplayCheckpoints(tmp_path, 5), confirmed=0.0)
     service.start()
     await_service(client, replay_key(client, "snapshot"))  # the last one that it declares
     segment = encode_segment("test", make_segment(spec))
@@ -63,7 +63,7 @@ def test_a_route_follows_a_replay_service_to_another_address(spec: EnvSpec, tmp_
 
     def serve(endpoint: str) -> Node:
         node = Node(open_session((endpoint,)), "test", "replay", new_incarnation())
-        ReplayService(node, core, ReplayEpochs(tmp_path, 5)).start()
+        ReplayService(node, core, ReplayCheckpoints(tmp_path, 5)).start()
         return node
 
     def open_route(endpoints: Sequence[str]) -> zenoh.Session:
@@ -140,7 +140,7 @@ def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path
 
 
 @pytest.mark.parametrize("first", ["everybody", "replay"])
-def test_whoever_is_told_to_stop_first_the_closing_epoch_is_saved(first: str, tmp_path: Path) -> None:
+def test_whoever_is_told_to_stop_first_the_closing_checkpoint_is_saved(first: str, tmp_path: Path) -> None:
     endpoint, path = free_endpoint(), tmp_path / "run"
     joining = ("--run", "hand", "--connect", endpoint, "--join-timeout", "120")
     learning = ("--run", "hand", "--listen", endpoint, "--total-steps", "10000000", "--run-dir", str(path))
@@ -157,8 +157,8 @@ def test_whoever_is_told_to_stop_first_the_closing_epoch_is_saved(first: str, tm
         else:
             replay.send_signal(signal.SIGTERM)
             replay.wait(40)
-            saved = newest_epoch(path)
-            assert saved is not None, "the epoch comes first"
+            saved = newest_checkpoint(path)
+            assert saved is not None, "the checkpoint comes first"
             with running("coop-replay", *serving, "--resume") as another:
                 before = lines(path / "metrics.jsonl")
                 wait_for("metrics with another one", lambda: lines(path / "metrics.jsonl") > before + 1)
@@ -168,7 +168,7 @@ def test_whoever_is_told_to_stop_first_the_closing_epoch_is_saved(first: str, tm
         for process in (learner, replay, actor):
             process.wait(60)
     summary = json.loads((path / "summary.json").read_text())
-    saved = newest_epoch(path)
+    saved = newest_checkpoint(path)
     assert saved is not None
     assert saved.number == summary["updates"] > 0
     assert (saved.path / "replay" / "frames.npy").exists()

@@ -111,7 +111,7 @@ def test_cells_share_the_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         ("fixed.edl.rate = 0.1\nvary.edl.rate = [0.1]", "edl.rate: both in [fixed] and in [vary]"),
         ("fixed.replay = 5", "replay = 5: must be a table"),
         ('fixed.env.id = "CartPoles-v0"', "CartPoles-v0"),
-        ('preset = "catch"', "actor.envs = 4: lockstep cells play one emulator"),
+        ('preset = "catch"', "actor.num_envs = 4: lockstep cells play one emulator"),
         (
             'mode = "distributed"\nfixed.learner.swap_unit = "steps"',
             "learner.swap_unit = 'steps': in lockstep runs only",
@@ -124,21 +124,21 @@ def test_a_bad_grid_is_refused(text: str, words: str, tmp_path: Path) -> None:
     path.write_text(text)
     with pytest.raises(UsageError) as caught:
         load_grid(str(path))
-    told = str(caught.value)
-    assert told.startswith(f"grid {path}: ")
-    assert words in told
-    assert "\n" not in told
+    printed = str(caught.value)
+    assert printed.startswith(f"grid {path}: ")
+    assert words in printed
+    assert "\n" not in printed
 
 
 def test_a_method_with_settings_of_its_own_varies_in_them(tmp_path: Path) -> None:
     path = tmp_path / "g.toml"
     path.write_text('methods = ["dqn", "medqn"]\nfixed.medqn.states = "real"\nfixed.medqn.epochs = 2\n')
     dqn, medqn = (cell.config for cell in load_grid(str(path)).cells)
-    assert (dqn.own, medqn.own) == (None, MedqnSettings("real", epochs=2))
+    assert (dqn.method_settings, medqn.method_settings) == (None, MedqnSettings("real", epochs=2))
     path.write_text('methods = ["medqn"]\nvary.medqn.lambda_end = [1.0, 4.0]\n')
     cells = load_grid(str(path)).cells
     assert [cell.name for cell in cells] == ["medqn-lambda_end=1.0-seed=0", "medqn-lambda_end=4.0-seed=0"]
-    assert [cell.config.own.lambda_end for cell in cells] == [1.0, 4.0]
+    assert [cell.config.method_settings.lambda_end for cell in cells] == [1.0, 4.0]
     path.write_text('methods = ["dqn", "medqn"]\nvary.medqn.epochs = [1, 2]\n')
     with pytest.raises(UsageError, match="dqn-epochs=1-seed=0 and dqn-epochs=2-seed=0 are the same run"):
         load_grid(str(path))
@@ -186,10 +186,10 @@ def test_bad_flags_are_refused_before_anything_runs(
         monkeypatch.setattr("sys.argv", ["coop-sweep", *flags])
         with pytest.raises(SystemExit) as caught:
             main()
-        told = capsys.readouterr()
-        assert (caught.value.code, told.out) == (2, "")
-        assert words in told.err
-        assert told.err.count("\n") == 1
+        printed = capsys.readouterr()
+        assert (caught.value.code, printed.out) == (2, "")
+        assert words in printed.err
+        assert printed.err.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "g.toml", "held"]
     assert [path.name for path in held.parent.iterdir()] == ["dqn-seed=0"]
 
@@ -208,9 +208,9 @@ def test_interrupted_killed_and_started_again(tmp_path: Path) -> None:
             process.send_signal(how)
             return process.communicate(timeout=250)[1]
 
-    told = until(first / "episodes.csv", signal.SIGINT)
-    assert told.startswith("coop-sweep: error: interrupted with 0 of 2 cells finished")
-    assert told.count("\n") == 1
+    printed = until(first / "episodes.csv", signal.SIGINT)
+    assert printed.startswith("coop-sweep: error: interrupted with 0 of 2 cells finished")
+    assert printed.count("\n") == 1
     assert json.loads((first / "summary.json").read_text())["exit"] == "interrupted"
     until(second / "metrics.jsonl", signal.SIGKILL)
     before = summaries(folder)["dqn-seed=0"]

@@ -66,8 +66,8 @@ def test_tensorboard_has_the_usual_names(tmp_path: Path) -> None:
     board = EventAccumulator(str(tmp_path / "tb"), size_guidance={"scalars": 0, "histograms": 0, "tensors": 0}).Reload()
     episodes = [line.split(",") for line in (tmp_path / "episodes.csv").read_text().splitlines()[1:]]
     for tag, column in (("charts/episodic_return", 5), ("charts/episodic_length", 6)):
-        told = [(event.step, event.value) for event in board.Scalars(tag)]
-        assert told == [(int(episode[1]), float(episode[column])) for episode in episodes]
+        recorded = [(event.step, event.value) for event in board.Scalars(tag)]
+        assert recorded == [(int(episode[1]), float(episode[column])) for episode in episodes]
     for tag, name in (
         ("charts/SPS", "env_steps_per_s"),
         ("charts/epsilon", "epsilon"),

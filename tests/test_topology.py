@@ -113,13 +113,13 @@ def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, 
         assert isinstance(updates, int)
         assert steps <= env_steps < steps + 64
         assert abs(updates - (steps - config["replay"]["learning_starts"])) <= 0.02 * steps
-    epochs = sorted((path / "checkpoints").iterdir(), key=lambda folder: int(folder.name))
-    assert 1 <= len(epochs) <= 2
-    assert all((epoch / "DONE").exists() for epoch in epochs)
-    state = load_learner(epochs[-1])
+    checkpoints = sorted((path / "checkpoints").iterdir(), key=lambda folder: int(folder.name))
+    assert 1 <= len(checkpoints) <= 2
+    assert all((checkpoint / "DONE").exists() for checkpoint in checkpoints)
+    state = load_learner(checkpoints[-1])
     assert state["agent"]["updates"] == summary["updates"]
     assert all(torch.isfinite(flat).all() for flat in state["agent"]["networks"])
-    assert (epochs[-1] / "replay" / "frames.npy").exists()
+    assert (checkpoints[-1] / "replay" / "frames.npy").exists()
     assert (path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     return summary
 
@@ -184,9 +184,9 @@ def test_three_shells_a_late_actor_and_a_kill(tmp_path: Path) -> None:
         wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
         with running("coop-actor", *joining) as second:
             wait_for("more metrics", lambda: lines(path / "metrics.jsonl") >= 4)
-            told = run("coop-limits", *joining, "--tolerance", "16")
-            assert (told.returncode, told.stderr) == (0, "")
-            assert told.stdout.startswith("ratio 1, tolerance 16 steps\n")
+            printed = run("coop-limits", *joining, "--tolerance", "16")
+            assert (printed.returncode, printed.stderr) == (0, "")
+            assert printed.stdout.startswith("ratio 1, tolerance 16 steps\n")
             first.send_signal(signal.SIGKILL)
             out, err = learner.communicate(timeout=80)
             assert (learner.returncode, err) == (0, "")

@@ -119,7 +119,7 @@ def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("config", "told", "updates", "outcome"),
+    ("config", "drawn", "updates", "outcome"),
     [
         ({}, drawn(10_000, planned=1), 1, "complete"),
         ({}, drawn(10_000, planned=3), 3, "complete"),
@@ -136,14 +136,14 @@ def test_episodes_are_numbered_and_keep_what_the_actor_told() -> None:
         ({"target_return": 6.0}, drawn(200, *[9.0] * 99), 1, ""),
     ],
 )
-def test_when_a_run_is_over(config: dict[str, float], told: Drawn, updates: int, outcome: str) -> None:
+def test_when_a_run_is_over(config: dict[str, float], drawn: Drawn, updates: int, outcome: str) -> None:
     trainer, source = Trainer(Agent(replace(CONFIG, **config), SPEC), 0.0), batches()  # type: ignore[arg-type]
     for _ in range(updates - 1):
-        trainer.train(next(source), msgspec.structs.replace(told, episodes=()), 0.0)
+        trainer.train(next(source), msgspec.structs.replace(drawn, episodes=()), 0.0)
     assert trainer.outcome() == ""
-    trainer.train(next(source), told, 0.0)
+    trainer.train(next(source), drawn, 0.0)
     assert trainer.outcome() == outcome
-    assert trainer.all_updates_done() == (updates == told.planned)
+    assert trainer.all_updates_done() == (updates == drawn.planned)
 
 
 def test_a_new_run_has_neither_diverged_nor_done_all_its_updates() -> None:
@@ -152,18 +152,18 @@ def test_a_new_run_has_neither_diverged_nor_done_all_its_updates() -> None:
     assert not trainer.all_updates_done()  # it is not known yet how many there will be
 
 
-def test_an_epoch_is_due_until_it_is_begun() -> None:
+def test_a_checkpoint_is_due_until_it_is_begun() -> None:
     trainer, source = Trainer(Agent(replace(CONFIG, checkpoint_every=5), SPEC), 0.0), batches()
     due = []
     for update in range(1, 20):
         trainer.train(next(source), drawn(), 0.0)
-        due.append(trainer.epoch_due())
+        due.append(trainer.checkpoint_due())
         if update in (7, 12):  # the one before was still being written at 5 and 6
-            trainer.epoch_begun()
+            trainer.checkpoint_begun()
     assert [update for update, is_due in enumerate(due, start=1) if is_due] == [5, 6, 7, 12, 17, 18, 19]
     never = Trainer(Agent(replace(CONFIG, checkpoint_every=0), SPEC), 0.0)
     train(never, 20)
-    assert not never.epoch_due()
+    assert not never.checkpoint_due()
 
 
 @pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
@@ -176,7 +176,7 @@ def test_a_run_whose_values_are_no_longer_finite_has_diverged(method: str) -> No
     assert trainer.outcome() == "diverged: TD errors are not finite at update 1"
     assert not effects.broadcast
     assert effects.priorities is None
-    assert not trainer.epoch_due()
+    assert not trainer.checkpoint_due()
     assert not trainer.saveable()
 
 
@@ -186,7 +186,7 @@ def test_parameters_that_are_not_finite_are_neither_broadcast_nor_saved() -> Non
         trainer.train(next(source), drawn(), 0.0)
     assert trainer.saveable()
     trainer.agent.networks[1].flat[3] = np.inf  # of which the TD errors of this batch know nothing
-    assert not trainer.epoch_due()
+    assert not trainer.checkpoint_due()
     assert trainer.outcome() == "diverged: parameters are not finite at update 6"
     assert not trainer.train(next(source), drawn(), 0.0).broadcast
 
@@ -261,7 +261,7 @@ def test_a_restored_trainer_goes_on() -> None:
     second.load_state(first.state(130.0), 1_000.0)
     assert second.seconds(1_010.0) == 40.0  # 30 before, 10 since
     assert second.drawn == msgspec.structs.replace(drawn(300), episodes=())
-    assert not second.epoch_due()
+    assert not second.checkpoint_due()
     batch = next(source)
     for trainer in (first, second):
         trainer.train(batch, drawn(310, 6.0), 0.0)

@@ -16,13 +16,10 @@ from samples import until
 
 from coop.common.messaging.keys import evaluations_key, join_key, replay_key
 from coop.common.messaging.members import ROUTE
-from coop.common.messaging.messages.epoch import Snapshot
+from coop.common.messaging.messages.control import EndOfRun, Join, Leave, Limit, Snapshot
 from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow
-from coop.common.messaging.messages.join import Join, Leave
-from coop.common.messaging.messages.limits import Limit
 from coop.common.messaging.messages.sample import DrawRequest
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
-from coop.common.messaging.messages.stop import EndOfRun
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
@@ -126,7 +123,7 @@ def test_strangers_stay_outside(run: tuple[str, str], keys: Path, tmp_path: Path
             assert_outside(at, config)
         wait_for_more(inside)
         with joined(run, keys / "actor.json5") as actor:
-            assert actor.ask(join_key(actor, "actor"), Join("actor", 1, []).encode(RUN)).kind == "joined"
+            assert actor.ask(join_key(actor, "actor"), Join("actor", 1, []).encode(RUN)).kind == "join-reply"
 
 
 def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, str], keys: Path) -> None:
@@ -167,7 +164,7 @@ def test_an_evaluator_s_certificate_reads_weights_and_reports(run: tuple[str, st
     report = Evaluated(1, 0, EvaluationRow(0, 0, 1, 1, 1.0, 0.0, 0.0, 1.0)).encode(RUN)
     with joined(run, keys / "evaluator.json5", "evaluator") as evaluator, joined(run, keys / "actor.json5") as actor:
         joining = Join("evaluator", 5, []).encode(RUN)
-        assert evaluator.ask(join_key(evaluator, "evaluator"), joining).kind == "joined"
+        assert evaluator.ask(join_key(evaluator, "evaluator"), joining).kind == "join-reply"
         assert evaluator.ask(evaluator.key("weights", "1"), Current().encode(RUN)).kind == "weights"
         assert evaluator.ask(evaluations_key(evaluator), report).kind == "ack"
         for node, key, payload in (
@@ -220,7 +217,7 @@ def seconds_to_join(run: tuple[str, str], config: Path | None) -> float:
     with joined(run, config) as actor:
         while time.monotonic() - began < 60:
             with suppress(NoAnswer):
-                assert actor.ask(join_key(actor, "actor"), Join("actor", 1, []).encode(RUN)).kind == "joined"
+                assert actor.ask(join_key(actor, "actor"), Join("actor", 1, []).encode(RUN)).kind == "join-reply"
                 until(lambda: actor.presence.members("replay"))
                 break
         return time.monotonic() - began

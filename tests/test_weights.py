@@ -9,12 +9,11 @@ import zenoh
 from msgspec.structs import replace as changed
 from samples import await_service
 
-from coop.actors.joined import make_policy
 from coop.actors.policy import EpsilonGreedy
-from coop.actors.weights import GRACE, WeightsFollower
+from coop.actors.weights import GRACE, WeightsFollower, make_policy
 from coop.common.errors import JoinError
 from coop.common.messaging.keys import role_key, weights_key
-from coop.common.messaging.messages.join import Joined
+from coop.common.messaging.messages.control import JoinReply
 from coop.common.messaging.messages.weights import Role, Weights
 from coop.common.messaging.transport import Node
 from coop.common.networks.network import FlatNetwork, build_network
@@ -153,11 +152,11 @@ def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
 
 def test_a_layout_that_differs_is_refused(spec: EnvSpec) -> None:
     layout = Agent(CONFIG, spec).networks[0].layout_digest()
-    joined = Joined(CONFIG, spec, layout, 0, [], 5, 0)
-    first, second = make_policy(joined, (), np.random.default_rng(0)).networks
+    reply = JoinReply(CONFIG, spec, layout, 0, [], 5, 0)
+    first, second = make_policy(reply, (), np.random.default_rng(0)).networks
     assert first.layout_digest() == second.layout_digest() == layout
     with pytest.raises(JoinError, match=f"network layout here {layout}, the learner's 0123"):
-        make_policy(changed(joined, layout="0123"), (), np.random.default_rng(0))
+        make_policy(changed(reply, layout="0123"), (), np.random.default_rng(0))
     wider = replace(CONFIG, network=NetworkSettings(hidden=(9,)))
     with pytest.raises(JoinError, match="network layout here"):
-        make_policy(changed(joined, config=wider), (), np.random.default_rng(0))
+        make_policy(changed(reply, config=wider), (), np.random.default_rng(0))

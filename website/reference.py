@@ -11,7 +11,7 @@ import pydantic
 from coop.actors.cli import ActorOptions
 from coop.common.bounds import MAX_INTEGER
 from coop.common.metrics import METRICS
-from coop.common.process.flags import Flag, sections
+from coop.common.process.cli import Flag, sections
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS, table_of
 from coop.common.settings.tables import load_tables, preset_names, resolve
@@ -111,7 +111,7 @@ def _schemas() -> dict[str, Mapping[str, Any]]:
     for name, schema in whole["properties"].items():
         if "$ref" in schema:
             found[name] = whole["$defs"][schema["$ref"].rpartition("/")[2]]["properties"]
-        elif name not in ("own", "methods"):
+        elif name not in ("method_settings", "methods"):
             found[""] = {**found[""], name: schema}
     for method in map(METHODS.get, METHODS.names()):
         if method.settings is not None:

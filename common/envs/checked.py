@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coop.common.bounds import MAX_MAGNITUDE
 from coop.common.errors import RunError, UsageError
 from coop.common.imports import describe
-from coop.common.process.notices import warn, warn_once
+from coop.common.process.output import warn, warn_once
 from coop.common.types import Array
 
 _STEP = "gymnasium's step gives (observation, reward, terminated, truncated, info)"

@@ -19,7 +19,7 @@ from coop.common.envs.pictures import coloured
 from coop.common.envs.protocol import Steps
 from coop.common.envs.registry import find_registered
 from coop.common.errors import UsageError
-from coop.common.process.notices import warn_once
+from coop.common.process.output import warn_once
 from coop.common.settings.environment import EnvSettings
 from coop.common.types import Array, EnvSpec
 

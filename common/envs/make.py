@@ -12,7 +12,7 @@ import numpy as np
 
 from coop.common.envs.protocol import FilmedEnv, VectorEnv
 from coop.common.errors import UsageError
-from coop.common.process.notices import warn_once
+from coop.common.process.output import warn_once
 from coop.common.settings.environment import EnvSettings
 from coop.common.types import EnvSpec
 

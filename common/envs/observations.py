@@ -8,7 +8,7 @@ from gymnasium.spaces import Box
 from coop.common.envs.checked import of_flags
 from coop.common.envs.pictures import grayscale, make_resizer
 from coop.common.errors import UsageError
-from coop.common.process.notices import warn_once
+from coop.common.process.output import warn_once
 from coop.common.settings.environment import EnvSettings
 from coop.common.types import Array
 

@@ -13,10 +13,10 @@ from typing import Protocol
 import msgspec
 
 from coop.common.errors import BadMessage
+from coop.common.messaging.backoff import BAD_ANSWER, NO_ANSWER, Backoff
 from coop.common.messaging.keys import KeySpace, replay_key
 from coop.common.messaging.messages.answers import Ack, Retry
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.repeating import BAD_ANSWER, NO_ANSWER, Backoff
 from coop.common.messaging.transport import NoAnswer, Pending
 from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop

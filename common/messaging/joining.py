@@ -13,7 +13,7 @@ from coop.common.errors import BadMessage, JoinError
 from coop.common.messaging.endpoints import unknown_hosts
 from coop.common.messaging.keys import join_key
 from coop.common.messaging.messages.answers import Retry
-from coop.common.messaging.messages.join import Join, Joined, Leave
+from coop.common.messaging.messages.control import Join, JoinReply, Leave
 from coop.common.messaging.transport import NoAnswer, Node, Refused
 from coop.common.process.console import PeerMonitor, StallDetector
 from coop.common.process.lifecycle import Stop
@@ -35,7 +35,7 @@ def join(
     *,
     need_replay: bool = False,
     event: Callable[[str], None] = lambda text: None,
-) -> Joined | None:
+) -> JoinReply | None:
     """Ask the learner until it answers; return None if a stop was requested first.
 
     need_replay: also wait until the learner knows where the replay service listens.
@@ -74,7 +74,7 @@ def join(
     return None
 
 
-def ask_to_join(node: Node, request: Join) -> Joined | str:
+def ask_to_join(node: Node, request: Join) -> JoinReply | str:
     """Ask the learner once; return its answer, or the reason why this process cannot join now.
 
     Raises:
@@ -83,7 +83,7 @@ def ask_to_join(node: Node, request: Join) -> Joined | str:
     """
     try:
         message = node.ask(join_key(node, request.role), request.encode(node.run), timeout=1.0)
-        return Retry.decode(message).reason if message.kind == "retry" else Joined.decode(message)
+        return Retry.decode(message).reason if message.kind == "retry" else JoinReply.decode(message)
     except (Refused, BadMessage) as error:
         raise JoinError(f"the learner of run {node.run!r} refused: {error}") from error
 
@@ -132,7 +132,7 @@ class Membership:
     Stops the process if the learner belongs to another run, refuses it, or has been gone for `patience` seconds.
 
     Args:
-        request: the request with which this process first joined. joined: the learner's answer to it.
+        request: the request with which this process first joined. reply: the learner's answer to it.
         learned: called with each answer and with the time of the request.
         event: called with a line when a member stops answering, and when it is back.
         replay_there: returns whether a replay service is connected; while none is, this thread asks often for the
@@ -144,16 +144,16 @@ class Membership:
         node: Node,
         stop: Stop,
         request: Join,
-        joined: Joined,
+        reply: JoinReply,
         patience: float,
-        learned: Callable[[Joined, float], None],
+        learned: Callable[[JoinReply, float], None],
         event: Callable[[str], None],
         replay_there: Callable[[], bool] | None = None,
     ) -> None:
         self._node = node
         self._stop = stop
-        self._request = msgspec.structs.replace(request, index=joined.index)
-        self._joined = joined
+        self._request = msgspec.structs.replace(request, index=reply.index)
+        self._reply = reply
         self._patience = patience
         self._learned = learned
         self._event = event
@@ -183,8 +183,8 @@ class Membership:
                 if self._ask(asked):
                     known = there
             for text in (
-                learner.check(bool(there & known), str(self._joined.learner)),
-                replay.check(replay_there, str(self._joined.replay)),
+                learner.check(bool(there & known), str(self._reply.learner)),
+                replay.check(replay_there, str(self._reply.replay)),
             ):
                 if text and not self._stop.is_set():
                     self._event(text)
@@ -193,29 +193,29 @@ class Membership:
         """Ask the learner once; return True if it answered."""
         try:
             answer = ask_to_join(self._node, self._request)
-            problem = answer if isinstance(answer, str) else difference(self._joined, answer)
+            problem = answer if isinstance(answer, str) else difference(self._reply, answer)
         except NoAnswer:
             return False
         except JoinError as error:
             problem = str(error)
         if problem:
             self._stop.set(problem, failed=True)
-        elif isinstance(answer, Joined):
-            self._joined = answer
+        elif isinstance(answer, JoinReply):
+            self._reply = answer
             self._learned(answer, now)
         return True
 
 
-def difference(mine: Joined, theirs: Joined) -> str | None:
+def difference(mine: JoinReply, theirs: JoinReply) -> str | None:
     """The first difference that keeps a member from following another learner, with both values; None if none does."""
     found = first_difference(_identity(mine), _identity(theirs))
     return found and f"{found[0]} here {found[1]}, the learner's {found[2]}"
 
 
-def _identity(joined: Joined) -> dict[str, Any]:
+def _identity(reply: JoinReply) -> dict[str, Any]:
     return {
-        "run id": joined.run_id,
-        "environment": msgspec.structs.asdict(joined.spec),
-        "network layout": joined.layout,
-        "config": identity(joined.config),
+        "run id": reply.run_id,
+        "environment": msgspec.structs.asdict(reply.spec),
+        "network layout": reply.layout,
+        "config": identity(reply.config),
     }

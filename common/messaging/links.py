@@ -80,8 +80,8 @@ def described(session: zenoh.Session, mode: str = "peer") -> dict[str, Any]:
     """What Zenoh's administration says of this session, whose mode is given; empty if it does not answer."""
     for reply in session.get(f"@/{session.zid()}/{mode}", timeout=2.0):
         if reply.ok is not None:
-            told: dict[str, Any] = json.loads(reply.ok.payload.to_string())
-            return told
+            answer: dict[str, Any] = json.loads(reply.ok.payload.to_string())
+            return answer
     return {}
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coop.common.bounds import MAX_AHEAD
 from coop.common.errors import BadMessage
+from coop.common.messaging.backoff import BAD_ANSWER, NO_ANSWER, Backoff
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Retry
 from coop.common.messaging.messages.sample import (
@@ -26,7 +27,6 @@ from coop.common.messaging.messages.sample import (
     NamedBatchReader,
 )
 from coop.common.messaging.mirror import FrameMirror
-from coop.common.messaging.repeating import BAD_ANSWER, NO_ANSWER, Backoff
 from coop.common.messaging.shared_frames import SharedFrames
 from coop.common.messaging.transport import NoAnswer, Node, Pending
 from coop.common.messaging.wire import Message
@@ -121,7 +121,7 @@ class SampleClient:
         """
         self._ask_ahead()
         if not self._outstanding and not self._arrived:
-            self.waiting = "the replay service has not begun its part of the epoch"
+            self.waiting = "the replay service has not begun its part of the checkpoint"
             self._backoff.pause(self._stop)
             return None
         try:

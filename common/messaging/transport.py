@@ -21,8 +21,8 @@ from coop.common.messaging.faults import Faults
 from coop.common.messaging.keys import run_key, stop_key
 from coop.common.messaging.links import close
 from coop.common.messaging.messages.answers import Error
+from coop.common.messaging.messages.control import EndOfRun
 from coop.common.messaging.messages.status import Status
-from coop.common.messaging.messages.stop import EndOfRun
 from coop.common.messaging.presence import Presence
 from coop.common.messaging.wire import Message
 from coop.common.process.console import say, stamped
@@ -168,11 +168,11 @@ class Node:
         """
         with self._counting:
             self.bad_messages += 1
-            told = self._refusals.setdefault(place, set())
-            if error.field in told or len(told) >= MOST_REFUSALS:
+            reported = self._refusals.setdefault(place, set())
+            if error.field in reported or len(reported) >= MOST_REFUSALS:
                 return
-            told.add(error.field)
-            last = "; further ones are only counted" if len(told) == MOST_REFUSALS else ""
+            reported.add(error.field)
+            last = "; further ones are only counted" if len(reported) == MOST_REFUSALS else ""
         text = str(error)[:LONGEST_REFUSAL].encode("unicode_escape").decode()  # it holds what the sender wrote
         say(stamped(f"refused a message at {place}: {text}{last}"))
 

@@ -8,10 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.networks.forward import DenseForward
-from coop.common.networks.inputs import preprocess
-from coop.common.networks.layout import digest, mlp_layout, size_of, views
-from coop.common.process.threads import use_threads
+from coop.common.networks.forward import DenseForward, digest, mlp_layout, preprocess, size_of, views
+from coop.common.process.limits import use_threads
 from coop.common.settings.config import NetworkSettings
 from coop.common.types import EnvSpec
 
@@ -36,7 +34,7 @@ class ActingNetwork(Protocol):
         ...
 
     def layout_digest(self) -> str:
-        """See `coop.common.networks.layout.digest`."""
+        """See `coop.common.networks.forward.digest`."""
         ...
 
 
@@ -88,5 +86,5 @@ class Mlp:
         return self._forward(inputs.reshape(len(inputs), -1))
 
     def layout_digest(self) -> str:
-        """See `coop.common.networks.layout.digest`."""
+        """See `coop.common.networks.forward.digest`."""
         return digest(self._layout)

@@ -1,7 +1,7 @@
-"""Networks of one convolution and Linear layers behind it, as matrix products over arrays of numpy.
+"""Networks of Linear layers, and of one convolution before them, as matrix products over arrays of numpy.
 
-The batch is the last axis of every array, so a picture's windows are copied in long runs, and no array is transposed
-between the convolution and the Linear layers. The products are PyTorch's, whose library (MKL) takes half the time of
+Behind a convolution the batch is the last axis of every array, so a picture's windows are copied in long runs, and no
+array is transposed before the Linear layers. The products are PyTorch's, whose library (MKL) takes half the time of
 numpy's for these sizes; everything else costs less to call in numpy.
 """
 
@@ -14,8 +14,40 @@ import numpy as np
 import torch
 from torch import nn
 
-from coop.common.networks.dense import DTYPES, Dense
+from coop.common.networks.forward import DenseForward
 from coop.common.types import Array
+
+DTYPES = (torch.float32, torch.float64)
+
+
+class Dense(DenseForward):
+    """The forward pass of such a module."""
+
+    def __init__(self, module: nn.Module) -> None:
+        """`module` must fit (see `fits`)."""
+        layers = [(name, step) for name, step in module.named_children() if isinstance(step, nn.Linear | nn.Conv2d)]
+        super().__init__(
+            [f"{name}." for name, _ in layers],
+            [step.weight.detach().flatten(1).numpy() for _, step in layers],
+            [step.bias.detach().numpy()[:, None] for _, step in layers if step.bias is not None],
+        )
+
+    @staticmethod
+    def fits(module: nn.Module) -> bool:
+        """Whether a network is Linear, ReLU, Linear, ..., Linear with biases, in float32 or float64 on the CPU.
+
+        No two layers may share a parameter.
+        """
+        steps = list(module) if type(module) is nn.Sequential else []
+        kinds = [type(step) for step in steps]
+        return (
+            len(steps) % 2 == 1
+            and kinds == ([nn.Linear, nn.ReLU] * len(steps))[: len(steps)]
+            and all(isinstance(step.bias, torch.Tensor) for step in steps[::2])
+            and len(list(module.parameters())) == len(steps) + 1
+            and all(p.device.type == "cpu" and p.dtype in DTYPES for p in module.parameters())
+        )
+
 
 _CACHED = 2**14  # numbers that the windows of one picture may hold to stay in the cache with those of a batch
 _SMALL = 2**18  # multiplications below which numpy's product is the faster one, with its shorter call

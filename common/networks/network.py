@@ -16,11 +16,9 @@ from torch import Tensor, nn
 
 from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import UsageError
-from coop.common.networks.convolution import ConvolutionNetwork
+from coop.common.networks.convolution import ConvolutionNetwork, Dense
 from coop.common.networks.custom import custom_network
-from coop.common.networks.dense import Dense
-from coop.common.networks.inputs import preprocess
-from coop.common.networks.layout import ArrayT, Layout, digest, mlp_layout, views
+from coop.common.networks.forward import ArrayT, Layout, digest, mlp_layout, preprocess, views
 from coop.common.networks.normalised import NormalisedNetwork
 from coop.common.types import EnvSpec
 
@@ -231,7 +229,7 @@ class FlatNetwork:
         return array
 
     def layout_digest(self) -> str:
-        """See `coop.common.networks.layout.digest`."""
+        """See `coop.common.networks.forward.digest`."""
         return digest(self.layout)
 
     def q_values(self, obs: NDArray[Any], spec: EnvSpec) -> NDArray[Any]:

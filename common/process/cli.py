@@ -1,25 +1,225 @@
-"""Parses command lines with tyro, answers --help and its like, and reports errors in one line."""
+"""Command lines: parses flags with tyro, answers --help and its like, and reports errors in one line."""
 
 from __future__ import annotations
 
 import re
+import shutil
 import sys
-from collections.abc import Sequence
-from dataclasses import fields, replace
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
+from tyro import _arguments as tyro_arguments  # private, as the two below; pyproject.toml pins the version
 from tyro import _errors as tyro_errors  # private; pyproject.toml pins the version
+from tyro import _parsers as tyro_parsers
+from tyro import _strings as tyro_strings
+from tyro._backends import _tyro_backend as tyro_backend
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from coop.common.errors import UsageError
+from coop.common.errors import UsageError, closest, not_among, refusal
 from coop.common.places import absolute, user_path
-from coop.common.process.flags import SHELLS, completion, placeholder, sections
-from coop.common.process.help import full_help, short_help
 from coop.common.process.lifecycle import ProcessExit
-from coop.common.suggestions import closest, not_among, refusal
+
+SHELLS = ("bash", "zsh", "fish")
+
+HttpAddress = Annotated[str, tyro.conf.arg(metavar="[HOST:]PORT")]
+"""Where to serve HTTP; see `coop.common.process.ports.http_address`."""
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A flag or a positional argument.
+
+    name: "--learner.swap-every"; of a positional argument its placeholder, "RUN_DIR".
+    value: placeholder of the value, "INT"; empty for a switch, which `negative` ("--learner.no-double") turns off.
+    choices: the allowed values, where they are names. text: what it sets. default: empty if there is none, or of
+    a switch that is off.
+    """
+
+    name: str
+    value: str
+    choices: tuple[str, ...]
+    text: str
+    default: str
+    required: bool
+    negative: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """The flags of one dataclass; name and text are empty for those of the command itself."""
+
+    name: str
+    text: str
+    flags: tuple[Flag, ...]
+
+
+def sections(kind: type[Any], default: object = None) -> list[Section]:
+    """The flags of a dataclass, positional arguments first, then of each one nested in it.
+
+    default: an instance with the values to show.
+    """
+    with tyro_strings.delimiter_context("-"):
+        return list(_sections(_specification(kind, default)))
+
+
+def completion(kind: type[Any], default: object, program: str, shell: str) -> str:
+    """A script that completes a command's flags and their values in one of `SHELLS`."""
+    with tyro_strings.delimiter_context("-"):
+        specification = _specification(kind, default)
+        for each in specification.get_args_including_children():
+            lowered = each.arg.lowered
+            lowered.choices, lowered.metavar = _choices(each.arg) or None, placeholder(each.arg)
+        backend = tyro_backend.TyroBackend()
+        prefix = f"tyro_{program.replace('-', '_')}"
+        return backend.generate_completion(specification, program, shell, prefix)  # type: ignore[arg-type]
+
+
+def _specification(kind: type[Any], default: object) -> tyro_parsers.ParserSpecification:
+    return tyro_parsers.ParserSpecification.from_callable_or_type(
+        kind,
+        markers=set(),
+        description=None,
+        parent_classes=set(),
+        default_instance=tyro.MISSING_NONPROP if default is None else default,
+        intern_prefix="",
+        extern_prefix="",
+        subcommand_prefix="",
+        support_single_arg_types=False,
+        prog_suffix="",
+    )
+
+
+def _sections(parser: tyro_parsers.ParserSpecification, name: str = "", text: str = "") -> Iterator[Section]:
+    flags = [_flag(arg) for arg in parser.args if not arg.is_suppressed()]
+    yield Section(name, text, tuple(sorted(flags, key=lambda flag: flag.name.startswith("-"))))
+    for prefix, nested in parser.child_from_prefix.items():
+        yield from _sections(nested, prefix, nested.description)
+
+
+def _flag(arg: tyro_arguments.ArgumentDefinition) -> Flag:
+    lowered, given = arg.lowered, arg.field.helptext
+    text = (given() if callable(given) else given) or ""
+    name = placeholder(arg) if arg.is_positional() else lowered.name_or_flags[-1]
+    if lowered.action == "boolean_optional_action":
+        default = "on" if arg.field.default else ""
+        return Flag(name, "", (), text, default, False, tyro_arguments.flag_to_inverse(name) or "")
+    return Flag(name, placeholder(arg), _choices(arg), text, _shown(arg), bool(lowered.required))
+
+
+def placeholder(arg: tyro_arguments.ArgumentDefinition) -> str:
+    """What stands for the value in the help: "INT", "INT ..." for several, "{fifo,reservoir}" for one of several."""
+    metavar = (arg.lowered.metavar or "").removeprefix("{None}|")
+    short = re.sub(r"\[(\w+|\{[^ {}]+\}) \[\1 \.\.\.\]\]", r"\1 ...", metavar)
+    return short.strip("{}") if short == metavar and not _choices(arg) else short
+
+
+def _choices(arg: tyro_arguments.ArgumentDefinition) -> tuple[str, ...]:
+    """The names in a placeholder such as "{fifo,reservoir}"."""
+    found = re.fullmatch(r"\{([^ {}]+)\}", (arg.lowered.metavar or "").removeprefix("{None}|"))
+    return tuple(found[1].split(",")) if found else ()
+
+
+def _shown(arg: tyro_arguments.ArgumentDefinition) -> str:
+    """The default as the command line would have it."""
+    default, write = arg.field.default, arg.lowered.str_from_instance
+    if default is None or arg.lowered.required or write is None:
+        return ""
+    words = write(default)
+    return words if isinstance(words, str) else " ".join(words)
+
+
+EXIT_STATUSES = (
+    ("0", "It has done what it was asked to do."),
+    ("1", "It could not start or finish, or lost a process that it needs; the last line on stderr says why."),
+    ("2", "A flag, a file or a setting is wrong; nothing has begun. One line on stderr says what is allowed."),
+    (
+        "129, 130, 141, 143",
+        "SIGHUP (the terminal has gone), SIGINT (Ctrl-C), output that nobody reads any more, or SIGTERM has ended it; "
+        "where there is --resume, that goes on from there.",
+    ),
+)
+_WIDEST = 100  # columns
+_INDENT = 28  # column of the texts
+_LONGEST = 44  # characters of a list of allowed values that stands beside the flag
+
+_ABOUT = (
+    ("-h, --help", "Show the flags that most runs need; all of them where there are few."),
+    ("--help-all", "Show all flags and the exit statuses."),
+    ("--version", "Show the version."),
+    (f"--completion {{{','.join(SHELLS)}}}", "Write a script for this shell, which completes flags and values."),
+)
+
+
+def short_help(program: str, description: str, parts: Sequence[Section], common: Sequence[str] = ()) -> str:
+    """The flags named in `common`, in that order, with the first clause of their texts; all flags if it is empty.
+
+    It fits two screens of 80 x 24.
+    """
+    flags = {flag.name: flag for flag in chain.from_iterable(part.flags for part in parts)}
+    chosen = [flags[name] for name in common if name in flags]
+    shown = [replace(flag, text=re.split("[;.]( |$)", flag.text)[0] + ".") for flag in chosen] or list(flags.values())
+    rest = f"all {len(flags)} flags, " if len(shown) < len(flags) else ""
+    also = _wrapped(f"Also: --help-all ({rest}exit statuses), --version, --completion SHELL.")
+    return "\n".join([*_head(program, description, parts), *_entries(map(_row, shown)), "", *also])
+
+
+def full_help(program: str, description: str, parts: Sequence[Section]) -> str:
+    """Every flag, by section, and the exit statuses."""
+    lines = _head(program, description, parts)
+    for part in filter(lambda part: part.flags, parts):
+        lines += _wrapped(f"{part.name}: {part.text}") if part.name else []
+        lines += [*_entries(_row(flag, full=True) for flag in part.flags), ""]
+    return "\n".join([*lines, "about this command:", *_entries(_ABOUT), "", "exit status:", *_entries(EXIT_STATUSES)])
+
+
+def _head(program: str, description: str, parts: Sequence[Section]) -> list[str]:
+    words = [_usage(flag) for part in parts for flag in part.flags if flag.required or flag.name == flag.value]
+    return [f"usage: {' '.join([program, *words, '[FLAGS]'])}", "", *_wrapped(description), ""]
+
+
+def _usage(flag: Flag) -> str:
+    if flag.name != flag.value:
+        return f"{flag.name} {flag.value}"
+    return flag.name if flag.required else f"[{flag.name} ...]"
+
+
+def _row(flag: Flag, full: bool = False) -> tuple[str, str]:
+    """A flag as the help shows it, and its text with allowed values and the default."""
+    value, text = flag.value, flag.text
+    if len(value) > _LONGEST:
+        value, text = "NAME", f"{text} Allowed: {', '.join(flag.choices)}."
+    name = flag.name if flag.name == flag.value else f"{flag.name} {value}".rstrip()
+    if flag.negative and (full or flag.default == "on"):
+        name = f"{name}, {flag.negative}"
+    hint = " (required)" if flag.required else f" (default: {flag.default})" if flag.default else ""
+    return name, text + hint
+
+
+def _entries(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Names with their texts beside them, or below long ones."""
+    for name, text in rows:
+        head = f"  {name}"
+        lines = textwrap.wrap(text, _width() - _INDENT, break_on_hyphens=False) or [""]
+        if len(head) < _INDENT - 1:
+            yield head.ljust(_INDENT) + lines.pop(0)
+        else:
+            yield head
+        yield from (" " * _INDENT + line for line in lines)
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, _width(), break_on_hyphens=False)
+
+
+def _width() -> int:
+    return max(2 * _INDENT, min(shutil.get_terminal_size().columns, _WIDEST))
+
 
 PACKAGE = "coop-rl"
 ANSWERS = ("--help", "--help-all", "--version", "--completion")

@@ -17,8 +17,7 @@ from types import FrameType
 from coop.common.errors import CoopError, PeerLost, first_line
 from coop.common.process.files import NO_SPACE
 from coop.common.process.limits import memory_limit
-from coop.common.process.notices import warn
-from coop.common.process.output import complain, flush_at_end, on_output_gone
+from coop.common.process.output import complain, flush_at_end, on_output_gone, warn
 
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
 LOOK_EVERY = 0.5  # seconds after which a wait notices a signal that came just before it began
@@ -94,7 +93,7 @@ class Stop:
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # under nohup, output may go away
             on_output_gone(lambda: self.set("interrupted", exit_status=status_after(signal.SIGPIPE)))
 
-    def leave(self) -> None:
+    def raise_for_status(self) -> None:
         """End the process with the status that the stop requires; return if that is 0.
 
         Raises:

@@ -1,4 +1,4 @@
-"""What this process may use: memory and processors of its job, where that is less than the machine has.
+"""What this process may use: memory and processors of its job, where that is less than the machine has, and threads.
 
 Sources are the machine, the process's own limits (ulimit), its control groups (version 1 and 2, with all above it) and
 Slurm's variables. A source that is absent or unreadable limits nothing.
@@ -9,9 +9,12 @@ from __future__ import annotations
 import math
 import os
 import resource
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+from threadpoolctl import threadpool_limits
 
 ROOT = Path("/")
 UNLIMITED = 2**60  # bytes; version 1 writes "no limit" as the largest number of pages
@@ -150,3 +153,10 @@ def _number(path: Path) -> int | None:
 def _positive(text: str | None) -> int | None:
     """A number; None for what is none, such as "max" and "-1"."""
     return int(text) if text is not None and text.isdecimal() else None
+
+
+def use_threads(count: int) -> None:
+    """Limit numpy's BLAS and, if it has been imported, PyTorch to `count` threads; by default both use every core."""
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(count)
+    threadpool_limits(count, user_api="blas")

@@ -1,4 +1,7 @@
-"""Standard input, output and error of a command: open from its start, and no failure once nobody reads them."""
+"""Standard input, output and error of a command: open from its start, and no failure once nobody reads them.
+
+Warnings and notes go to stderr, and do not stop the program.
+"""
 
 from __future__ import annotations
 
@@ -119,3 +122,18 @@ class _Text(io.TextIOWrapper):
     def close(self) -> None:
         """Write what is left; users' code must not take the stream away."""
         self.flush()
+
+
+_warned: set[str] = set()
+
+
+def warn(text: str) -> None:
+    """Print a warning of a likely mistake."""
+    complain(f"warning: {text}")
+
+
+def warn_once(text: str) -> None:
+    """Print a warning, the first time in this process."""
+    if text not in _warned:
+        _warned.add(text)
+        warn(text)

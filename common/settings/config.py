@@ -130,7 +130,7 @@ class EdlSettings:
     """Factor by which s is multiplied every `decay_every` updates."""
     decay_every: Positive = 1000
     """Updates per application of `decay`."""
-    decay_stepwise: bool = False
+    decay_staircase: bool = False
     """Apply the whole factor once every `decay_every` updates, instead of a fraction of it at each update."""
     noise: Literal["constant", "normal"] = "constant"
     """normal: s is the rate times one draw from N(0, 1) per update."""
@@ -167,7 +167,7 @@ class ReplaySettings:
     """Write each accepted segment and each draw to a file before answering, so that the kill of a process loses none;
     the death of the machine may lose those since the newest checkpoint."""
     journal_keep: bool = False
-    """Keep journal files that an epoch has made redundant, so that the run can be re-executed from its beginning."""
+    """Keep journal files that a checkpoint has made redundant: the run can then be re-executed from its beginning."""
 
     @cached_property
     def prioritized(self) -> bool:
@@ -180,7 +180,7 @@ class ActorSettings:
     """Exploration and segments."""
 
     __pydantic_config__ = _STRICT
-    envs: Annotated[int, Field(gt=0, le=MAX_STREAMS)] = 1
+    num_envs: Annotated[int, Field(gt=0, le=MAX_STREAMS)] = 1
     """Emulators in one actor process."""
     epsilon_start: Share = 1.0
     """Probability of a random action at the run's beginning."""
@@ -192,7 +192,7 @@ class ActorSettings:
     """Environment steps: time constant of the exponential decay, or length of the linear decay."""
     segment_steps: Annotated[int, Field(gt=0, le=MAX_SEGMENT_STEPS)] = 16
     """Steps of one emulator that are sent together."""
-    window: Annotated[int, Field(gt=0, le=MAX_GAPS)] = 2
+    max_in_flight: Annotated[int, Field(gt=0, le=MAX_GAPS)] = 2
     """Unacknowledged segments that an actor may have in flight, for each emulator; many actors get fewer."""
 
 
@@ -216,7 +216,7 @@ class RunConfig:
     target_return: Annotated[float, Field(allow_inf_nan=False)] | None = None
     """Stop once the mean return of the last 100 episodes reaches this."""
     checkpoint_every: Count = 10_000
-    """Updates between epochs, the checkpoints of the whole system; 0: only at the end."""
+    """Updates between checkpoints of the whole system; 0: only at the end."""
     eval_every: Count = 0
     """Environment steps between evaluations: the acting network plays full episodes greedily; 0: none."""
     eval_episodes: Annotated[int, Field(gt=0, le=MAX_EVALUATED)] = 10
@@ -229,7 +229,7 @@ class RunConfig:
     edl: EdlSettings = field(default_factory=EdlSettings)
     replay: ReplaySettings = field(default_factory=ReplaySettings)
     actor: ActorSettings = field(default_factory=ActorSettings)
-    own: Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress] = None
+    method_settings: Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress] = None
     """The method's own settings, an instance of `Method.settings`; files and flags have them under `Method.table`."""
     methods: Annotated[dict[str, dict[str, Any]], tyro.conf.Fixed, tyro.conf.Suppress] = field(
         default_factory=dict, compare=False
@@ -275,7 +275,7 @@ def value_of(config: RunConfig, name: str) -> Any:  # noqa: ANN401 (a value of a
         return 0
     section, _, field_name = name.partition(".")
     if section == METHODS.get(config.method).table:
-        return getattr(config.own, field_name, None)
+        return getattr(config.method_settings, field_name, None)
     value = getattr(config, section, None)
     return getattr(value, field_name) if field_name and value is not None else value
 

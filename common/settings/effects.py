@@ -63,7 +63,7 @@ _CONDITIONS = (
 )
 _OF_PROCESSES = (
     "actor.segment_steps",
-    "actor.window",
+    "actor.max_in_flight",
     "learner.mirror",
     "learner.prefetch",
     "learner.publish_every",

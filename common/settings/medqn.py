@@ -30,7 +30,11 @@ MEDQN = Method(
     rule="coop.learner.methods.medqn:Consolidation",
     settings=MedqnSettings,
     conditions=(
-        Condition(("medqn.states",), lambda c: c.own.lambda_start + c.own.lambda_end > 0, "lambda is 0 throughout"),
+        Condition(
+            ("medqn.states",),
+            lambda c: c.method_settings.lambda_start + c.method_settings.lambda_end > 0,
+            "lambda is 0 throughout",
+        ),
     ),
     colour="#332288",
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from coop.common.process.flags import HttpAddress
+from coop.common.process.cli import HttpAddress
 from coop.common.process.untrusted import check_run
 
 

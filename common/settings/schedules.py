@@ -25,7 +25,7 @@ def linear(start: float, final: float, progress: float) -> float:
 
 def feedback_scale(settings: EdlSettings, update: int) -> float:
     """The paper's s before any N(0, 1) draw: rate * decay^(update / decay_every), with integer powers if stepwise."""
-    power = update // settings.decay_every if settings.decay_stepwise else update / settings.decay_every
+    power = update // settings.decay_every if settings.decay_staircase else update / settings.decay_every
     # (decay of s)
     return settings.rate * float(settings.decay**power)
 

@@ -47,8 +47,8 @@ STREAM_Q = Method(
         Condition(_UNUSED, lambda c: False, "{c.method} learns from each step once, with settings of its own"),
         Condition(
             ("stream_q.epsilon_share",),
-            lambda c: c.own.epsilon_start != c.own.epsilon_final,
-            "epsilon begins and ends at {c.own.epsilon_final:g}",
+            lambda c: c.method_settings.epsilon_start != c.method_settings.epsilon_final,
+            "epsilon begins and ends at {c.method_settings.epsilon_final:g}",
         ),
     ),
     colour="#666666",

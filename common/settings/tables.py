@@ -13,18 +13,17 @@ from typing import Any
 import pydantic
 import tomli_w
 
-from coop.common.errors import RunError, UsageError
+from coop.common.errors import RunError, UsageError, not_among
 from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.settings.overrides import merged, of_method
 from coop.common.settings.rules import check_rules
-from coop.common.suggestions import not_among
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
 CONFIG = "config.toml"
 _SEAL = "# crc32 "
-_FIELDS = [field.name for field in fields(RunConfig) if field.name != "own"]
+_FIELDS = [field.name for field in fields(RunConfig) if field.name != "method_settings"]
 
 
 def preset_names() -> list[str]:
@@ -92,18 +91,18 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
         UsageError: as `resolve`.
     """
     tables = to_tables(tables) if isinstance(tables, RunConfig) else dict(tables)
-    if "own" in tables:
-        raise UsageError(_no_such_field("own", tables["own"], _FIELDS))
-    own = _own_settings(tables)
+    if "method_settings" in tables:
+        raise UsageError(_no_such_field("method_settings", tables["method_settings"], _FIELDS))
+    settings = _settings_of_method(tables)
     try:
-        config: RunConfig = replace(_ADAPTER.validate_python(tables), own=own)
+        config: RunConfig = replace(_ADAPTER.validate_python(tables), method_settings=settings)
     except pydantic.ValidationError as error:
         raise UsageError(first_problem(error, RunConfig())) from error
     check_rules(config)
     return config
 
 
-def _own_settings(tables: dict[str, Any]) -> Any:  # noqa: ANN401 (an instance of `Method.settings`)
+def _settings_of_method(tables: dict[str, Any]) -> Any:  # noqa: ANN401 (an instance of `Method.settings`)
     """Take a method's own settings out of its tables; None if it has none."""
     name = tables.get("method", RunConfig.method)
     method = METHODS.get(name) if name in METHODS.names() else None  # an unknown one is refused with the other fields
@@ -157,8 +156,8 @@ def parse_run_config(text: str, place: object, *, needed: bool = False) -> RunCo
 def to_tables(config: RunConfig) -> dict[str, Any]:
     """The resolved config as plain nested tables, for the wire."""
     tables = asdict(config)
-    own = tables.pop("own")
-    return _without_none(tables if own is None else {**tables, METHODS.get(config.method).table: own})
+    settings = tables.pop("method_settings")
+    return _without_none(tables if settings is None else {**tables, METHODS.get(config.method).table: settings})
 
 
 def identity(config: RunConfig) -> dict[str, Any]:
@@ -219,4 +218,4 @@ def _siblings(path: tuple[int | str, ...], example: Any) -> list[str]:  # noqa: 
     """The fields allowed in place of the last name of `path`."""
     for name in path[:-1]:
         example = getattr(example, str(name))
-    return [field.name for field in fields(example) if field.name != "own"]
+    return [field.name for field in fields(example) if field.name != "method_settings"]

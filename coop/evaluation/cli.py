@@ -99,7 +99,7 @@ def _run() -> None:
 
 def _row(one: CheckpointEvaluation) -> str:
     network, (low, high) = f"{one.network}{' acts' if one.acts else ''}", one.interval
-    played = f"{one.epoch:10}  {network:7}  {one.epsilon:7g}  {len(one.returns):8}"
+    played = f"{one.checkpoint:10}  {network:7}  {one.epsilon:7g}  {len(one.returns):8}"
     spread = f"{one.sd:8.2f}  {exact(min(one.returns)):>7}  {exact(max(one.returns)):>7}"
     return f"{played}  {one.mean:9.2f}  {f'{low:.2f} to {high:.2f}':>18}  {spread}"
 

@@ -50,14 +50,14 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class CheckpointEvaluation(Evaluation):
-    """Returns of a run's checkpoint `epoch`.
+    """Returns of a run's checkpoint of number `checkpoint`.
 
     network: 1, 2, or "mean", which plays by the mean of both networks' Q-values. epsilon: probability of a random
     action. acts: the network acted and was trained last.
     """
 
     run: str
-    epoch: int
+    checkpoint: int
     network: NetworkChoice
     epsilon: float
     acts: bool
@@ -137,7 +137,7 @@ def evaluate_checkpoint(
         policy = SavedPolicy(run.config.env, checkpoint.spec, played)
         returns = _returns(policy, run.config.env, episodes, derived, epsilon, at_once)
         acts = network == checkpoint.acting + 1
-        return CheckpointEvaluation(returns, str(run_dir), checkpoint.epoch, network, epsilon, acts)
+        return CheckpointEvaluation(returns, str(run_dir), checkpoint.number, network, epsilon, acts)
 
     return (one(network, epsilon) for network in chosen for epsilon in epsilons)
 

@@ -8,19 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coop.actors.joined import make_policy
-from coop.actors.weights import WeightsFollower
+from coop.actors.weights import WeightsFollower, make_policy
 from coop.common.envs.make import check_filmed
 from coop.common.errors import UsageError
 from coop.common.messaging.joining import Membership, join, leave_run
 from coop.common.messaging.keys import evaluations_key
+from coop.common.messaging.messages.control import Join, JoinReply
 from coop.common.messaging.messages.evaluate import Evaluated, Video
-from coop.common.messaging.messages.join import Join, Joined
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process.console import Console, counted
 from coop.common.process.lifecycle import Stop
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.options import RoleOptions
 from coop.evaluation.episodes import AT_ONCE, Evaluator
 
@@ -96,15 +95,15 @@ def evaluate_run(options: RoleOptions, allow_import: tuple[str, ...], plan: Eval
         node.follow_stop(stop)
         request = Join("evaluator", incarnation, [])
         try:
-            joined = join(node, stop, request, options.connect, options.join_timeout, event=console.event)
-            if joined is not None:
-                service = EvaluatorService(node, stop, joined, allow_import, plan, incarnation, console)
-                console.event(f"joined run {options.run!r} on {joined.learner}")
-                with Membership(node, stop, request, joined, options.patience, lambda answer, now: None, console.event):
+            reply = join(node, stop, request, options.connect, options.join_timeout, event=console.event)
+            if reply is not None:
+                service = EvaluatorService(node, stop, reply, allow_import, plan, incarnation, console)
+                console.event(f"joined run {options.run!r} on {reply.learner}")
+                with Membership(node, stop, request, reply, options.patience, lambda answer, now: None, console.event):
                     service.run()
         finally:
             leave_run(node, request)
-    stop.leave()
+    stop.raise_for_status()
 
 
 class EvaluatorService:
@@ -114,19 +113,19 @@ class EvaluatorService:
         self,
         node: Node,
         stop: Stop,
-        joined: Joined,
+        reply: JoinReply,
         allow_import: tuple[str, ...],
         plan: EvaluationPlan,
         incarnation: int,
         console: Console,
     ) -> None:
         """Raise UsageError if nothing says how often, or the run can't be filmed; JoinError as `make_policy`."""
-        steps, config = plan.steps or joined.config.eval_every, joined.config
+        steps, config = plan.steps or reply.config.eval_every, reply.config
         if plan.seconds is None and not (steps or config.video_every):
             raise UsageError("--every: needed, as the run has no eval_every")
         if config.video_every:
             check_filmed(config.env)
-        self._policy = make_policy(joined, allow_import, np.random.default_rng(0))
+        self._policy = make_policy(reply, allow_import, np.random.default_rng(0))
         self._node, self._stop, self._console, self._incarnation = node, stop, console, incarnation
         self._weights = WeightsFollower(node, self._policy)
         self._evaluations, self._films = Schedule(plan.seconds, steps), Schedule(None, config.video_every)

@@ -1,8 +1,11 @@
-"""Writes the networks of a run's newest checkpoint to files that need nothing of this package."""
+"""Writes the networks of a run's newest checkpoint to files that need nothing of this package, ONNX among them."""
 
 from __future__ import annotations
 
 import hashlib
+import importlib.util
+import io
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,15 +13,84 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import torch
 from safetensors.numpy import save
-from torch import nn
+from torch import Tensor, nn
 
-from coop.common.errors import RunError, UsageError
+from coop.common.errors import CoopError, RunError, UsageError
+from coop.common.imports import describe
+from coop.common.networks.forward import preprocess
+from coop.common.networks.network import FlatNetwork, sample_observations
 from coop.common.numbers import strict_json
 from coop.common.process.files import SyncedFile, make_folder, sync_folder
 from coop.common.settings.config import RunConfig
-from coop.evaluation.export_onnx import NotExportedError, onnx_model, preparation
+from coop.common.types import EnvSpec
 from coop.evaluation.saved import Checkpoint, SavedRun
+
+
+class NotExportedError(CoopError):
+    """There is no ONNX model of the network; the text says why."""
+
+
+def preparation(spec: EnvSpec) -> dict[str, Any]:
+    """How stacked observations [batch, *obs_shape] become inputs: permute to `axes`, reshape, multiply by `scale`."""
+    axes = list(range(len(spec.obs_shape) + 1))
+    if len(spec.frame_shape) == 3:  # channels before height and width
+        axes.insert(-2, axes.pop())
+    return {"axes": axes, "input_shape": spec.input_shape, "scale": 1 / 255 if spec.frame_dtype == "uint8" else 1.0}
+
+
+class QValues(nn.Module):
+    """A network behind the preparation of its inputs."""
+
+    def __init__(self, module: nn.Module, spec: EnvSpec) -> None:
+        super().__init__()
+        self.module = module
+        self._steps = preparation(spec)
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """Q-values, float32 [batch, actions], of stacked observations <frame_dtype>[batch, *obs_shape]."""
+        inputs = obs.float().permute(self._steps["axes"]).reshape(-1, *self._steps["input_shape"])
+        q_values: Tensor = self.module(inputs * self._steps["scale"])
+        return q_values
+
+
+def onnx_model(network: FlatNetwork, spec: EnvSpec) -> bytes:
+    """The model, from "obs" to "q_values", for batches of any size.
+
+    Raises:
+        NotExportedError: onnx is not installed, the network has layers that ONNX lacks, or the model computes other
+            values than the network, because the module decides by values or by the batch's size.
+    """
+    if importlib.util.find_spec("onnx") is None:
+        raise NotExportedError("onnx is not installed")
+    from onnx.reference import ReferenceEvaluator  # noqa: PLC0415 (an extra, which may be missing)
+
+    observations = sample_observations(spec, 5)
+    file = io.BytesIO()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of traces, which are checked below
+            # The older of PyTorch's exporters: a hundredth of the time, and it needs no package but onnx.
+            torch.onnx.export(
+                QValues(network.module, spec),
+                (observations[:2],),
+                file,  # type: ignore[arg-type]  # what its annotation omits
+                dynamo=False,
+                training=torch.onnx.TrainingMode.PRESERVE,
+                input_names=["obs"],
+                output_names=["q_values"],
+                dynamic_axes={"obs": {0: "batch"}, "q_values": {0: "batch"}},
+            )
+            outputs: Any = ReferenceEvaluator(file.getvalue()).run(None, {"obs": observations.numpy()})
+    except Exception as error:  # layers of users may fail in any way
+        raise NotExportedError(describe(error)) from error
+    with torch.inference_mode():
+        expected = network(preprocess(observations, spec)).numpy()
+    if not np.allclose(outputs[0], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max(), equal_nan=True):
+        raise NotExportedError("its ONNX model gives other Q-values for other observations than those that were traced")
+    return file.getvalue()
+
 
 CARD = "card.json"
 # The arguments that make a layer again, besides its bias.
@@ -34,10 +106,10 @@ _ARGUMENTS: dict[type[nn.Module], tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Exported:
-    """What has been written: names of files, in order; epoch and acting network (1 or 2); why there is no ONNX."""
+    """What has been written: names of files, in order; checkpoint and acting network (1 or 2); why there is no ONNX."""
 
     names: list[str]
-    epoch: int
+    checkpoint: int
     acting: int
     without_onnx: str
 
@@ -67,7 +139,7 @@ def export(run_dir: Path, out: Path) -> Exported:
         _write(out, contents)
     except OSError as error:
         raise RunError(f"{error.filename or out}: {error.strerror or error}") from error
-    return Exported(list(contents), checkpoint.epoch, checkpoint.acting + 1, without_onnx)
+    return Exported(list(contents), checkpoint.number, checkpoint.acting + 1, without_onnx)
 
 
 def _card(config: RunConfig, checkpoint: Checkpoint) -> dict[str, Any]:
@@ -82,7 +154,7 @@ def _card(config: RunConfig, checkpoint: Checkpoint) -> dict[str, Any]:
         "method": config.method,
         "seed": config.seed,
         "env_steps": checkpoint.env_steps,
-        "updates": checkpoint.epoch,
+        "updates": checkpoint.number,
         "acting_network": checkpoint.acting + 1,
         "return_mean_100": float(np.mean(returns)) if returns else None,
     }

@@ -41,7 +41,7 @@ def _run() -> None:
 
     permit(options.allow_import)
     done = export(options.run_dir, options.out)
-    where = f"checkpoint {done.epoch} in {shown(options.run_dir)}"
+    where = f"checkpoint {done.checkpoint} in {shown(options.run_dir)}"
     print(f"{where}, network {done.acting} acts: {', '.join(done.names)}", file=out())
     if done.without_onnx:
         print(f"no ONNX files: {done.without_onnx}", file=out())

@@ -25,7 +25,7 @@ from coop.common.settings.resuming import settings_digest
 from coop.common.types import Array, EnvSpec
 from coop.learner.qnetwork import make_network
 from coop.records.checkpoints import EVALUATIONS, RECORDS
-from coop.records.learner_checkpoints import fitting, newest_epoch
+from coop.records.learner_checkpoints import fitting, newest_checkpoint
 from coop.records.reading import check_records, read_frame, read_jsonl, read_run_config
 from coop.records.summaries import read_summary
 
@@ -35,13 +35,13 @@ NetworkChoice = Literal["mean", 1, 2]
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Both networks of an epoch.
+    """Both networks of a checkpoint.
 
-    epoch: its number, in updates. spec: what the networks know of the environment. acting: 0 or 1, index of the network
+    number: in updates. spec: what the networks know of the environment. acting: 0 or 1, index of the network
     that acted and was trained last. env_steps: how many the run had done. returns: of its last episodes, at most 100.
     """
 
-    epoch: int
+    number: int
     spec: EnvSpec
     networks: tuple[FlatNetwork, FlatNetwork]
     acting: int
@@ -154,19 +154,19 @@ class SavedRun:
 
         Raises UsageError if there is none.
         """
-        epoch = newest_epoch(self.path, settings_digest(self.config))
-        if epoch is None:
+        checkpoint = newest_checkpoint(self.path, settings_digest(self.config))
+        if checkpoint is None:
             raise UsageError(f"{self.path}: has no complete checkpoint")
-        state, spec = epoch.state, env_spec(self.config.env)
+        state, spec = checkpoint.state, env_spec(self.config.env)
         first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
-        with fitting(epoch.path):
+        with fitting(checkpoint.path):
             for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
                 network.load(flat)
             steps, returns = state["drawn"]["inserted"], state["telemetry"]["returns"]
-            return Checkpoint(epoch.number, spec, (first, second), state["agent"]["acting"], steps, returns)
+            return Checkpoint(checkpoint.number, spec, (first, second), state["agent"]["acting"], steps, returns)
 
     def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
-        """The greedy policy of the newest epoch.
+        """The greedy policy of the newest checkpoint.
 
         network: 1 or 2 plays by that network's Q-values, "mean" by the mean of both. The second network of a method
         with one network is an older copy of the first, so "mean" is the first one there.

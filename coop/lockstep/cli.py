@@ -7,9 +7,9 @@ from collections.abc import Callable
 from contextlib import closing
 
 from coop.common.errors import RunError
+from coop.common.imports import importing
 from coop.common.places import shown
 from coop.common.process.console import say
-from coop.common.process.importing import importing
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.output import out
 from coop.records.run_options import RunOptions, parse_run
@@ -35,7 +35,7 @@ def _run() -> None:
     replaying = _replaying(stop)
     opened = LockstepRun(config, path, "coop-lockstep", options.start, log=options.log, replaying=replaying)
     with closing(opened) as run:
-        for line in run.told:
+        for line in run.notices:
             say(line)
         summary = run.play(stop, _progress)
     stopped = summary.exit == stop.reason  # otherwise the run was complete before the signal
@@ -44,7 +44,7 @@ def _run() -> None:
     if run.diverged:
         raise RunError(run.diverged)
     if stopped:
-        stop.leave()
+        stop.raise_for_status()
 
 
 def _progress(line: str) -> None:
@@ -60,7 +60,7 @@ def _replaying(stop: Stop) -> Callable[[int, int], None]:
         nonlocal due
         if stop.is_set():
             say("interrupted before the run went on; its files are as they were")
-            stop.leave()
+            stop.raise_for_status()
         if time.monotonic() >= due:
             due = time.monotonic() + REPLAY_PROGRESS_EVERY
             _progress(f"plays the run's actions again: {played:,}/{actions:,}")

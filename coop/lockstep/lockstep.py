@@ -14,13 +14,13 @@ from coop.actors.player import Player, Turn
 from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import RunError, UsageError
-from coop.common.process.randomness import generator_state, set_generator_state
+from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.config import RunConfig
 from coop.common.types import EpisodeRecord
 from coop.learner.trainer import Effects, Trainer
 from coop.lockstep.memory import make_experience
 from coop.records.checkpoints import REPLAY
-from coop.records.learner_checkpoints import fitting, save_epoch
+from coop.records.learner_checkpoints import fitting, save_checkpoint
 from coop.records.resumption import Whole
 from coop.records.run_directory import RunDirectory
 from coop.replay.persistence.storage import Mark
@@ -35,8 +35,8 @@ class Lockstep:
     """
 
     def __init__(self, config: RunConfig) -> None:
-        if config.actor.envs != 1:
-            raise UsageError(f"actor.envs = {config.actor.envs}: lockstep runs play one emulator")
+        if config.actor.num_envs != 1:
+            raise UsageError(f"actor.num_envs = {config.actor.num_envs}: lockstep runs play one emulator")
         env_seed, policy_seed = np.random.SeedSequence([config.seed, 3, 0]).spawn(2)
         self.config = config
         self.step = 0
@@ -83,10 +83,10 @@ class Lockstep:
             self._seen = zlib.crc32(shown.tobytes(), self._seen)
 
     def save(self, directory: RunDirectory) -> None:
-        """Save an epoch that `restore` continues exactly to the bit.
+        """Save a checkpoint that `restore` continues exactly to the bit.
 
         Raises:
-            RunError: the run directory can't be written; nothing is left of this epoch.
+            RunError: the run directory can't be written; nothing is left of this checkpoint.
         """
         state = {
             **self.trainer.state(time.monotonic()),
@@ -103,7 +103,7 @@ class Lockstep:
             self.memory.save(directory.path / folder / REPLAY, mark)
 
         try:
-            save_epoch(
+            save_checkpoint(
                 directory.path,
                 run_id,
                 number,
@@ -114,10 +114,10 @@ class Lockstep:
                 settings=directory.settings,
             )
         except OSError as error:
-            text = f"epoch {self.agent.updates} in {directory.path}: {error.strerror or error}"
+            text = f"checkpoint {self.agent.updates} in {directory.path}: {error.strerror or error}"
             raise RunError(text) from error
 
-    def restore(self, epoch: Whole, replaying: Replaying = lambda played, actions: None) -> None:
+    def restore(self, checkpoint: Whole, replaying: Replaying = lambda played, actions: None) -> None:
         """Restore a whole checkpoint from `save`.
 
         The emulator's state is restored by playing the same actions again, which is exact for every deterministic
@@ -127,17 +127,18 @@ class Lockstep:
             UsageError: the checkpoint does not belong to a lockstep run, or not to one like this.
             RunError: the environment is not deterministic: its observations, rewards or ends differ from the run's.
         """
-        state = epoch.state
+        state = checkpoint.state
         if "player" not in state:
-            raise UsageError(f"{epoch.path}: saved by a distributed run; coop-local --resume continues it")
-        with fitting(epoch.path):
+            raise UsageError(f"{checkpoint.path}: saved by a distributed run; coop-local --resume continues it")
+        with fitting(checkpoint.path):
             self._replay_actions(state["player"]["actions"].tolist(), replaying)
             if state["player"]["seen"] != self._seen:
                 raise RunError(
-                    f"{epoch.path}: {self.config.env.id} showed something else when the run's {len(self._actions):,} "
-                    "actions were played again; a lockstep run goes on only where the seed determines the environment"
+                    f"{checkpoint.path}: {self.config.env.id} showed something else when the run's "
+                    f"{len(self._actions):,} actions were played again; a lockstep run goes on "
+                    "only where the seed determines the environment"
                 )
-            self.memory.load(epoch.path / REPLAY, Mark(epoch.manifest.run, epoch.number, 0))
+            self.memory.load(checkpoint.path / REPLAY, Mark(checkpoint.manifest.run, checkpoint.number, 0))
             self.trainer.load_state(state, time.monotonic())
             set_generator_state(self._policy_rng, state["player"]["policy"])
         self.step = self.trainer.drawn.inserted

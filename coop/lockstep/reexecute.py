@@ -12,7 +12,7 @@ import torch
 from coop.common.envs.make import env_spec
 from coop.common.errors import RunError, UsageError
 from coop.common.imports import hand_over
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest
@@ -24,7 +24,7 @@ from coop.records.resumption import Survey, survey
 from coop.records.run_ids import read_run_id
 from coop.records.summaries import read_summary
 from coop.replay.core import ReplayCore
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import DRAW, Lost, journal_files, read_draw, read_file
 from coop.replay.persistence.recovery import Replaying
 
@@ -53,10 +53,10 @@ class Outcome:
 def reexecute(run_dir: Path) -> Outcome:
     """Replay the journal of `run_dir` from its beginning, with every update of the learner.
 
-    If a learner returned to an epoch and drew a batch again, the last draw of that number counts.
+    If a learner returned to a checkpoint and drew a batch again, the last draw of that number counts.
 
     Raises:
-        UsageError: the folder holds no run with a journal and a finished epoch.
+        UsageError: the folder holds no run with a journal and a finished checkpoint.
         RunError: the journal is incomplete, contains a segment twice or disagrees with the summary's transitions, or
             parameters, optimizers or random state differ in any bit.
     """
@@ -65,7 +65,9 @@ def reexecute(run_dir: Path) -> Outcome:
     config = read_run_config(run_dir)
     folder = run_dir / "journal"
     if not journal_files(folder):
-        raise UsageError(f"{run_dir}: no journal with a finished epoch; was the run started with --replay.journal?")
+        raise UsageError(
+            f"{run_dir}: no journal with a finished checkpoint; was the run started with --replay.journal?"
+        )
     run_id = read_run_id(run_dir)
     found = survey(run_dir, replay=True, settings=settings_digest(config), load=load_learner, every=True)
     final = found.newest
@@ -99,7 +101,7 @@ def reexecute(run_dir: Path) -> Outcome:
         raise RunError(f"{folder}: {core.table.inserted:,} transitions, but the run accepted {accepted:,}")
     digest = hashlib.sha256(b"".join(network.snapshot().tobytes() for network in agent.networks)).hexdigest()
     closing = ReplayCore(config, core.table.spec)
-    ReplayEpochs(run_dir, run_id).restore(closing, final.number)
+    ReplayCheckpoints(run_dir, run_id).restore(closing, final.number)
     repeated, held = closing.table.repeated(), len(closing.table)
     return Outcome(
         began, agent.updates, core.table.inserted, core.missing_segments, repeated, held, digest, tuple(not_checked)
@@ -128,7 +130,7 @@ def _beginning(config: RunConfig, found: Survey, folder: Path, run_id: int) -> t
         load_initial_networks(agent)
         return agent, core, 1
     for whole in sorted(found.whole, key=lambda each: each.number):
-        first, _ = ReplayEpochs(found.run_dir, run_id).restore(core, whole.number)
+        first, _ = ReplayCheckpoints(found.run_dir, run_id).restore(core, whole.number)
         if first in files:
             agent.load_state(whole.state["agent"])
             return agent, core, first

@@ -10,7 +10,7 @@ from coop.common.envs.make import check_filmed
 from coop.common.errors import CoopError, RunError, first_line
 from coop.common.process.console import say
 from coop.common.process.lifecycle import Stop
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest
 from coop.evaluation.episodes import Evaluator
@@ -30,7 +30,7 @@ PROGRESS_EVERY = 5.0  # seconds
 class LockstepRun:
     """A run that holds its directory's locks until `close`.
 
-    run: where it is. told: lines that say what it goes on from, and what was passed over or moved aside.
+    run: where it is. notices: lines that say what it goes on from, and what was passed over or moved aside.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class LockstepRun:
         start: how it begins there. replaying: see `Lockstep.restore`; what it raises leaves the run as it was.
 
         Raises:
-            UsageError: the config does not fit the environment, or the directory's epoch a lockstep run.
+            UsageError: the config does not fit the environment, or the directory's checkpoint a lockstep run.
             RunError: another process uses the directory, or it cannot be read.
         """
         use_threads(config.learner.threads)
@@ -64,7 +64,7 @@ class LockstepRun:
             raise
         try:
             settings = settings_digest(config)
-            self._found, self.told = start.prepare(
+            self._found, self.notices = start.prepare(
                 path, replay=not config.streaming, settings=settings, load=load_learner
             )
             self._lock.sign()
@@ -81,7 +81,7 @@ class LockstepRun:
         """Play until the run is over or stopped; progress: called with a line every few seconds.
 
         Raises:
-            RunError: there is no space for the closing epoch or the summary.
+            RunError: there is no space for the closing checkpoint or the summary.
             UsageError: a sink refuses.
         """
         with self.files() as directory:
@@ -112,7 +112,7 @@ def play_lockstep(
     """Play until the run is over or stopped, and complete its files.
 
     Raises:
-        RunError: there is no space for the closing epoch or the summary.
+        RunError: there is no space for the closing checkpoint or the summary.
     """
     trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
     evaluator = Evaluator(run.config, stop.is_set)
@@ -123,8 +123,8 @@ def play_lockstep(
             for effects in run.play():
                 directory.record(effects.episodes, effects.metrics)
             _evaluate(run, directory, evaluator)
-            if trainer.epoch_due() and not trainer.outcome():
-                trainer.epoch_begun()
+            if trainer.checkpoint_due() and not trainer.outcome():
+                trainer.checkpoint_begun()
                 try:
                     run.save(directory)
                 except RunError as error:

@@ -29,7 +29,7 @@ def facts(status: LearnerStatus) -> dict[str, str]:
     """The figures of a run by their labels, in the order in which they are shown; lines end with a newline."""
     lines, episodes = _lines(status), status.episodes
     returns = f"{status.return_mean_100:.1f}, mean of {averaged_over(episodes)}"
-    told = {
+    shown = {
         "steps": f"{status.env_steps:,} of {status.total_steps:,}",
         "return": returns if episodes else "no episode has ended yet",
         "acting": _acting(status),
@@ -38,7 +38,7 @@ def facts(status: LearnerStatus) -> dict[str, str]:
         "waiting": "\n".join(map(_sentence, status.waits)) or "nobody",
         **lines,
     }
-    return told | ({"warning": printable(status.warning)} if status.warning else {})
+    return shown | ({"warning": printable(status.warning)} if status.warning else {})
 
 
 def settings(status: LearnerStatus) -> str:

@@ -17,7 +17,7 @@ from coop.common.process.console import Console
 from coop.common.process.lifecycle import ProcessExit, run_main
 from coop.common.process.ports import http_address
 
-STUCK = 60.0  # seconds without a turn of the main loop; an epoch or a compilation may take half of that
+STUCK = 60.0  # seconds without a turn of the main loop; a checkpoint or a compilation may take half of that
 QUESTION_TIMEOUT = 5.0  # seconds
 
 

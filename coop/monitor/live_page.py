@@ -47,14 +47,14 @@ class LivePage:
         self._events: list[str] = []
         self._notice, self._ended = "waiting for the learner", False
         self._asked_at = -math.inf
-        self._told_end = threading.Event()
+        self._end_was_asked_for = threading.Event()
         html = files("coop.monitor").joinpath("page.html").read_bytes()
         self._server = WebServer(
             "--web",
             address,
             {
                 "/": lambda: Document("text/html; charset=utf-8", html),
-                "/page.json": lambda: Document("application/json", strict_json(self.told()).encode()),
+                "/page.json": lambda: Document("application/json", strict_json(self.state()).encode()),
             },
         )
         self.url = self._server.url
@@ -70,19 +70,19 @@ class LivePage:
             elif status is not None:
                 self._notice = silence(silent) if silent > SILENT_AFTER else ""
 
-    def told(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """What /page.json holds: words as they are shown, and the numbers of the curves."""
         with self._lock:
             self._asked_at = time.monotonic()
             if self._ended:
-                self._told_end.set()
+                self._end_was_asked_for.set()
             status, points = self._status, list(self._curves.points)
-            told = {"run": printable(self._run), "notice": printable(self._notice), "ended": self._ended}
-            told |= {"events": list(map(printable, self._events))}
+            shown = {"run": printable(self._run), "notice": printable(self._notice), "ended": self._ended}
+            shown |= {"events": list(map(printable, self._events))}
         if status is None:
-            return told
+            return shown
         members = [[printable(each.name), place(each), each.state, detail(each, status)] for each in status.members]
-        return told | {
+        return shown | {
             "settings": settings(status),
             "times": times(status),
             "progress": progress(status),
@@ -99,7 +99,7 @@ class LivePage:
     def close(self) -> None:
         """Stop serving, once a browser that follows the run has heard that it has ended."""
         if self._ended and time.monotonic() - self._asked_at < FOLLOWS:
-            self._told_end.wait(FOLLOWS)
+            self._end_was_asked_for.wait(FOLLOWS)
         self._server.close()
 
 
@@ -115,7 +115,7 @@ class Curves:
         self._seen = 0
 
     def add(self, status: LearnerStatus) -> None:
-        """Note a new status; steps that go back, after a resumption from an epoch, begin the curves anew."""
+        """Note a new status; steps that go back, after a resumption from a checkpoint, begin the curves anew."""
         known = values(status)
         if "ratio_measured" not in known:
             known.pop("ratio_ahead", None)  # the band holds from the first update on

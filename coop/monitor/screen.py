@@ -98,13 +98,13 @@ def _title(run: str, status: LearnerStatus, width: int) -> Text:
 
 def _rows(status: LearnerStatus, width: int, *, ascii_only: bool) -> list[tuple[str, Text]]:
     """The figures, each with its label; progress as a bar, and the returns as a line."""
-    told = facts(status)
-    rows = [("steps", _progress(told.pop("steps"), progress(status), width, BAR_ASCII if ascii_only else BAR))]
-    rows.append(("return", Text(told.pop("return"))))
+    figures = facts(status)
+    rows = [("steps", _progress(figures.pop("steps"), progress(status), width, BAR_ASCII if ascii_only else BAR))]
+    rows.append(("return", Text(figures.pop("return"))))
     if status.return_history:
         rows.append(("", sparkline(status.return_history, width, BLOCKS_ASCII if ascii_only else BLOCKS)))
     styles = {"waiting": "yellow" if status.waits else "", "warning": "bold yellow"}
-    return [*rows, *((label, Text(text, styles.get(label, ""))) for label, text in told.items())]
+    return [*rows, *((label, Text(text, styles.get(label, ""))) for label, text in figures.items())]
 
 
 def _progress(text: str, done: float, width: int, mark: str) -> Text:

@@ -19,9 +19,8 @@ from coop.common.messaging.messages.status import LearnerStatus
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.numbers import strict_json
-from coop.common.process.cli import parse
+from coop.common.process.cli import HttpAddress, parse
 from coop.common.process.console import PeerMonitor, progress_line, stamped
-from coop.common.process.flags import HttpAddress
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.untrusted import check_run
 from coop.monitor.display import LiveDisplay
@@ -69,9 +68,7 @@ class RunStatus:
     def why_nothing(self, waited: float) -> str:
         """Why there has been no status for `waited` seconds, in words."""
         if self.learner_is_there():
-            return (
-                f"the learner of run {self.run!r} has told nothing within {waited:g} s; it may wait for the other roles"
-            )
+            return f"the learner of run {self.run!r} has sent no status in {waited:g} s; it may wait for other roles"
         return no_learner(self._node, (self._endpoint,), waited)
 
     def follow_stop(self, stop: Stop) -> None:
@@ -245,7 +242,7 @@ def _print_once(status: RunStatus, options: WatchOptions, ctrl_c: Stop) -> None:
     """Wait for a status, and print it."""
     while status.learner is None:
         if ctrl_c.wait(TICK):
-            ctrl_c.leave()
+            ctrl_c.raise_for_status()
         status.refresh()
         _check(status, options)
     if options.json:

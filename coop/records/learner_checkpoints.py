@@ -13,13 +13,13 @@ import torch
 
 from coop.common.errors import CoopError, UsageError
 from coop.common.process.files import FileDigest, write_atomic
-from coop.common.process.notices import warn
+from coop.common.process.output import warn
 from coop.common.process.untrusted import check_torch_file
 from coop.records.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
 from coop.records.resumption import Whole, survey
 
 
-def save_epoch(
+def save_checkpoint(
     run_dir: Path,
     run_id: int,
     number: int,
@@ -54,7 +54,7 @@ def save_epoch(
     return path
 
 
-def newest_epoch(run_dir: Path, settings: str = "") -> Whole | None:
+def newest_checkpoint(run_dir: Path, settings: str = "") -> Whole | None:
     """The newest whole checkpoint of a run, with the learner's state, for readers; None if there is none.
 
     A warning names those that were passed over. settings: see `survey`.

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coop.common.errors import RunError, UsageError
-from coop.common.process.notices import warn
+from coop.common.process.output import warn
 from coop.common.process.untrusted import MAX_SETTINGS, read_bytes, read_text
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import CONFIG, parse_run_config

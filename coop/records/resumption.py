@@ -95,7 +95,7 @@ class Survey:
         if self.newest is None:
             there = "the run there has no checkpoint yet" if self.begun else "there is no run there yet"
             return f"starts in {self.run_dir}: {there}"
-        return f"goes on from checkpoint {self.newest.number}{self.fallback and f'; passes over {self.fallback}'}"
+        return f"resuming from checkpoint {self.newest.number}{self.fallback and f'; passes over {self.fallback}'}"
 
     @property
     def fallback(self) -> str:
@@ -120,7 +120,7 @@ class Survey:
             how = "" if left is None else f"--resume-from {left} goes on with what is left of them; "
             raise UsageError(
                 f"run directory {self.run_dir}: no checkpoint can be gone on from: {self.passed_over}. Nothing was "
-                f"changed; {how}--overwrite moves the run aside and begins anew"
+                f"changed; {how}--overwrite moves the run aside and starts over"
             )
         try:
             summary = read_summary(self.run_dir)
@@ -129,7 +129,7 @@ class Survey:
         if summary.get("updates") and not str(summary.get("exit")).startswith("failed"):
             raise UsageError(
                 f"run directory {self.run_dir}: {summary['updates']:,} updates, but no checkpoint to go on from. "
-                "Nothing was changed; --overwrite moves the run aside and begins anew"
+                "Nothing was changed; --overwrite moves the run aside and starts over"
             )
 
 
@@ -185,7 +185,7 @@ class Start:
     """How a run begins in its directory.
 
     resume: go on with the run there, if one has begun. resume_from: go back to this checkpoint of it first.
-    overwrite: move the run there aside, and begin anew.
+    overwrite: move the run there aside, and start over.
     """
 
     resume: bool = False
@@ -214,20 +214,20 @@ class Start:
             UsageError: a run is there that can't be gone on with.
             RunError: the directory can't be written.
         """
-        told = []
+        notices = []
         try:
             if self.overwrite:
-                told.append(overwrite(run_dir))
+                notices.append(overwrite(run_dir))
             if self.resume_from is not None:
-                told.append(keep_from(run_dir, self.resume_from))
+                notices.append(keep_from(run_dir, self.resume_from))
         except OSError as error:
             raise RunError(f"run directory {run_dir}: {reason(error)}") from error
         found = Survey(run_dir)
         if self.goes_on:
             found = survey(run_dir, replay=replay, records=True, settings=settings, load=load, every=every)
             found.check()
-            told.append(found.describe())
-        return found, [line for line in told if line]
+            notices.append(found.describe())
+        return found, [line for line in notices if line]
 
 
 def holds_run(run_dir: Path) -> bool:
@@ -239,7 +239,7 @@ def go_back(found: Survey, number: int | None) -> str:
     """Prepare a run directory for going on from checkpoint `number` (None: beginning); return what was done.
 
     Checkpoints begun only are deleted; younger ones are moved aside, and so are copies of the records, where the run
-    falls back. A run that begins anew leaves its records aside.
+    falls back. A run that starts over leaves its records aside.
 
     Raises:
         OSError: the directory can't be written.
@@ -288,7 +288,7 @@ def keep_from(run_dir: Path, number: int) -> str:
             check_record(run_dir / name, written)
         except Damaged as damaged:
             problems.append(str(damaged))
-    told = go_back(Survey(run_dir), number)
+    moved = go_back(Survey(run_dir), number)
     if problems:
         to = aside_folder(run_dir)
         kept = {}
@@ -302,7 +302,7 @@ def keep_from(run_dir: Path, number: int) -> str:
         fallback = f"checkpoint {number}: {'; '.join(problems)}"
         fallbacks = [*manifest.fallbacks, fallback]
         write_manifest(path, msgspec.structs.replace(manifest, records=kept, fallbacks=fallbacks))
-    return "; ".join(filter(None, [f"goes back to checkpoint {number}", *problems, told]))
+    return "; ".join(filter(None, [f"goes back to checkpoint {number}", *problems, moved]))
 
 
 def overwrite(run_dir: Path) -> str:

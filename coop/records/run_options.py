@@ -15,12 +15,11 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from coop.common.errors import RunError, UsageError
-from coop.common.imports import hand_over, permit
+from coop.common.imports import check_extra, hand_over, permit
 from coop.common.places import absolute
 from coop.common.process import cli
-from coop.common.process.extras import check_extra
-from coop.common.process.flags import HttpAddress
-from coop.common.process.notices import warn
+from coop.common.process.cli import HttpAddress
+from coop.common.process.output import warn
 from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig
 from coop.common.settings.effects import without_effect
@@ -38,7 +37,7 @@ COMMON = (
     *("--preset", "--config", "--method", "--seed", "--total-steps", "--run-dir", "--resume"),
     *("--run", "--actors", "--listen", "--env.id", "--replay.capacity", "--replay.ratio", "--replay.eviction"),
     *("--learner.batch-size", "--learner.swap-every", "--learner.target-update-every", "--learner.learning-rate"),
-    *("--edl.rate", "--actor.envs"),
+    *("--edl.rate", "--actor.num-envs"),
 )
 
 _OF_RUNS = ("run-id", "checkpoints", "episodes.csv")  # beside a config.toml
@@ -61,7 +60,7 @@ class RunOptions(RunConfig):
     """As --resume, but go back to the checkpoint with this number (folder checkpoints/NUMBER), even if records are
     damaged; what is younger is moved to aside/."""
     overwrite: bool = False
-    """Begin anew in a folder that holds a run, which is moved to aside/ in that folder."""
+    """Start over in a folder that holds a run, which is moved to aside/ in that folder."""
     zenoh_config: Path | None = None
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
@@ -89,7 +88,7 @@ class RunOptions(RunConfig):
             RunError: it belongs to another run.
         """
         if self.start.goes_on and self.overwrite:
-            raise UsageError("--overwrite: begins anew; --resume and --resume-from go on: give one of them")
+            raise UsageError("--overwrite: starts over; --resume and --resume-from go on: give one of them")
         if self.start.goes_on:
             return self._resumed()
         game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
@@ -119,7 +118,7 @@ class LearnerRunOptions(RunOptions):
     """The flags of commands that start a learner's process."""
 
     restart: bool = False
-    """With --resume: start training from the beginning if learner and replay service have no epoch in common."""
+    """With --resume: start training from the beginning if learner and replay service have no checkpoint in common."""
     prometheus: HttpAddress = ""
     """Serve the learner's status to Prometheus at PORT, on loopback, or at HOST:PORT."""
 
@@ -138,10 +137,10 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     args = sys.argv[1:]
     base = base_config(args)
     extended = with_methods(kind)
-    given_own = {} if base.own is None else {table_of(base.method): base.own}
-    default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **given_own)
+    of_method = {} if base.method_settings is None else {table_of(base.method): base.method_settings}
+    default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **of_method)
     parsed = cli.parse(extended, program, description, default, args, COMMON)
-    options: OptionsT = replace(parsed, own=getattr(parsed, table_of(parsed.method), None))
+    options: OptionsT = replace(parsed, method_settings=getattr(parsed, table_of(parsed.method), None))
     given = cli.given_flags(args)
     named = {"env.id": options.env.id, "network.kind": options.network.kind}
     permit([*options.allow_import, *(value for name, value in named.items() if name in given)])

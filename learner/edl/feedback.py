@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from coop.common.process.memory import keep_freed_memory
 from coop.learner.edl.arrays import ArrayT, at_least_float32, convert_like
 from coop.learner.edl.backprop import Backprop, Tape
-from coop.learner.edl.beside import Branches
+from coop.learner.edl.branches import Branches
 from coop.learner.edl.layers import make_backprop
 from coop.learner.edl.polar import polar, polar_of_product
 from coop.learner.edl.transforms import Transforms

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from coop.common.errors import first_line
-from coop.common.process.notices import warn
+from coop.common.process.output import warn
 from coop.learner.edl.polar import SCALES
 
 LAYERS = 8  # that one call of `feedback` takes

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import torch
 
-from coop.common.networks.dense import Dense
+from coop.common.networks.convolution import Dense
 from coop.common.types import Array
 from coop.learner.edl.backprop import Backprop, Tape
 

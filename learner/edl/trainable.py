@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coop.common.networks.convolution import ConvolutionNetwork
-from coop.common.networks.dense import Dense
+from coop.common.networks.convolution import ConvolutionNetwork, Dense
 from coop.common.networks.network import FlatNetwork
 from coop.learner.edl.arrays import AnyArray, convert_like
 from coop.learner.edl.backprop import Backprop

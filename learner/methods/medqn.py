@@ -26,8 +26,8 @@ class Consolidation(UpdateRule):
 
     def __init__(self, config: RunConfig, rng: np.random.Generator) -> None:
         super().__init__(config, rng)
-        assert isinstance(config.own, MedqnSettings)
-        self.settings = config.own
+        assert isinstance(config.method_settings, MedqnSettings)
+        self.settings = config.method_settings
         self.passes = self.settings.epochs
         self.low: Bounds = np.empty(0, np.float32)
         self.high: Bounds = np.empty(0, np.float32)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from coop.common.networks.inputs import preprocess
+from coop.common.networks.forward import preprocess
 from coop.common.networks.network import FlatNetwork
 from coop.common.networks.normalised import NormalisedNetwork
 from coop.common.settings import schedules
@@ -54,12 +54,12 @@ class StreamAgent:
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
         """Raise UsageError for a network that the method can't train."""
-        assert isinstance(config.own, StreamQSettings)
+        assert isinstance(config.method_settings, StreamQSettings)
         self.config = config
         self.spec = spec
         self.loss = LOSSES["squared"]
         self.updates = 0
-        self._settings = config.own
+        self._settings = config.method_settings
         self.device = torch.device("cpu")
         self.rule = UpdateRule(config, np.random.default_rng(0))  # which draws no numbers
         self._network = make_network(config, spec, 0, self.device)

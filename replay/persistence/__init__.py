@@ -1,1 +1,1 @@
-"""The replay service's files: snapshots for epochs, the journal, and recovery from both."""
+"""The replay service's files: snapshots for checkpoints, the journal, and recovery from both."""

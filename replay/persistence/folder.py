@@ -8,12 +8,12 @@ from coop.common.errors import RunError, UsageError
 from coop.records.checkpoints import Damaged, read_manifest
 from coop.records.locks import RunLock
 from coop.records.run_ids import check_owner, claim, has_run_id, read_run_id
-from coop.replay.persistence.epochs import part_numbers, part_path
+from coop.replay.persistence.checkpoints import part_numbers, part_path
 from coop.replay.persistence.journal import journal_files, read_owner
 
 
 class ReplayFolder:
-    """The folder of a replay service's parts of epochs and journal; it may also contain the learner's files.
+    """The folder of a replay service's parts of checkpoints and journal; it may also contain the learner's files.
 
     path, run_id: of the folder, and of the run. journal: the journal's folder.
     """
@@ -41,7 +41,7 @@ class ReplayFolder:
         if not parts and not files:
             return f"starts: there is no table of this run in {self.path} yet"
         if not owned and not has_run_id(self.path):
-            raise RunError(f"{self.path}: holds epochs that do not name their run")
+            raise RunError(f"{self.path}: holds checkpoints that do not name their run")
         if not resume:
             raise UsageError(f"--run-dir {self.path}: holds a run already; give another, or --resume")
         return f"goes on in {self.path}"

@@ -44,10 +44,10 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
     taken = f"{core.table.inserted - before:,} transitions and {draws:,} batches from the journal"
     if numbers and not replaying.ended:
         taken += ", which ends as a kill leaves it"
-    told = [f"{text}; the journal is read on behind it" for text in replaying.lost]
+    notices = [f"{text}; the journal is read on behind it" for text in replaying.lost]
     if replaying.lost:
-        told.append(f"the journal lacks {replaying.transitions_lost:,} transitions that had been acknowledged")
-    return max([first, *(number + 1 for number in numbers)]), [taken, *told]
+        notices.append(f"the journal lacks {replaying.transitions_lost:,} transitions that had been acknowledged")
+    return max([first, *(number + 1 for number in numbers)]), [taken, *notices]
 
 
 class Replaying:

@@ -80,7 +80,7 @@ def _write(snapshot: CoreSnapshot, lock: threading.Condition, part: Path) -> dic
     files["frames.npy"] = file.measured
     replies = [bytes(encode_batch("", batch.frames, batch.columns(), drawn)) for batch, drawn in snapshot.replies]
     state = {
-        "books": snapshot.state,  # a name of the file format
+        "state": snapshot.state,
         "episodes": msgspec.to_builtins(snapshot.episodes),
         "table": meta,
         "replies": replies,
@@ -110,7 +110,7 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int, number: int) -> Mar
         episodes = [
             EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in state["episodes"]
         ]
-        core.restore(state["books"], episodes, state["table"], arrays, replies)
+        core.restore(state["state"], episodes, state["table"], arrays, replies)
     except BadMessage as error:
         raise Damaged(f"{STATE}: {error}") from error
     except CoopError:

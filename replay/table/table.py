@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coop.common.errors import UsageError
-from coop.common.process.randomness import generator_state, set_generator_state
+from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
 from coop.common.types import Array, Batch, EnvSpec, Segment
 from coop.replay.table.columns import Columns

@@ -18,7 +18,7 @@ from work import EMULATORS, EPSILON, acting_config
 
 from coop.common.envs.make import env_spec
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
 from coop.common.process.processes import ChildProcess, command, free_endpoint
@@ -26,7 +26,7 @@ from coop.learner.agent import Agent
 from coop.learner.broadcast import Broadcaster
 from coop.learner.join_service import JoinService
 from coop.learner.roster import Roster
-from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.shared_checkpoints import SharedCheckpoints
 
 RUN = "bench"
 LOOK_EVERY = 0.02  # seconds; each request for the replay service's count costs the topology a little processor time
@@ -42,8 +42,8 @@ class Topology:
         session = open_session((head,), (replay,))
         self._node = stack.enter_context(Node(session, RUN, "learner", new_incarnation()))
         agent = Agent(config, spec)
-        digest, epochs = agent.networks[0].layout_digest(), SharedEpochs([], "benchmark")
-        JoinService(self._node, config, spec, digest, 0, epochs, Roster(), print)
+        digest, shared = agent.networks[0].layout_digest(), SharedCheckpoints([], "benchmark")
+        JoinService(self._node, config, spec, digest, 0, shared, Roster(), print)
         Broadcaster(self._node, agent)
         joining = ["--run", RUN, "--connect", head]
         service = command("coop-replay", *joining, "--listen", replay, "--run-dir", str(folder))

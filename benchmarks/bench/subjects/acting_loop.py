@@ -9,7 +9,7 @@ from work import EMULATORS, EPSILON, acting_config
 from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import env_spec, make_vector_env
 from coop.common.networks.network import FlatNetwork, build_network
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 
 use_threads(1)
 config = acting_config("bench", EMULATORS, EPSILON)

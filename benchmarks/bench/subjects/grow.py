@@ -31,7 +31,7 @@ from work import ATARI, BATCH, KINDS, STEPS, update_config
 from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import env_spec, make_vector_env
 from coop.common.networks.network import FlatNetwork, build_network
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.learner.agent import Agent
 from coop.replay.table.table import Table
 from coop.studies.report.packing import study_file

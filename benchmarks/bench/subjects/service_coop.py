@@ -28,7 +28,7 @@ from coop.common.settings.capacity import mirror_slots
 from coop.common.settings.tables import validated
 from coop.learner.join_service import JoinService
 from coop.learner.roster import Roster
-from coop.learner.shared_epochs import SharedEpochs
+from coop.learner.shared_checkpoints import SharedCheckpoints
 
 RUN = "bench"
 PREFETCH = 8
@@ -73,7 +73,7 @@ def main(way: str) -> None:
         incarnation = new_incarnation()
         node = stack.enter_context(Node(open_session((head,), shared_memory=way == "shm"), RUN, "learner", incarnation))
         JoinService(
-            node, CONFIG, ATARI, "", run_id=0, epochs=SharedEpochs([], "benchmark"), roster=Roster(), event=print
+            node, CONFIG, ATARI, "", run_id=0, shared=SharedCheckpoints([], "benchmark"), roster=Roster(), event=print
         )
         gates = [gate] if way == "router" else []
         flags = ["--run", RUN, "--connect", head, *gates, "--listen", replay, "--run-dir", str(folder)]

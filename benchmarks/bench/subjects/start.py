@@ -1,7 +1,7 @@
 """What users wait for: start.py torch|edl|local|report. A turn is one process, from its start.
 
 torch, edl: the imports of PyTorch and of `coop.learner.edl`. local: `coop-local` to its first update, which counts as
-made when the epoch saved after it is complete. report: `coop-report` of the 336 runs of a packed study.
+made when the checkpoint saved after it is complete. report: `coop-report` of the 336 runs of a packed study.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from work import START, step_config
 
 from coop.common.envs.make import make_vector_env
 from coop.common.networks import convolution
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.learner.edl import convolution as backward
 from coop.learner.edl import transforms
 from coop.lockstep.lockstep import Lockstep

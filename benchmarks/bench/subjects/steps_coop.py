@@ -7,7 +7,7 @@ from pathlib import Path
 from turns import attend, rate
 from work import START, step_config
 
-from coop.common.process.threads import use_threads
+from coop.common.process.limits import use_threads
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_directory import RunDirectory
 

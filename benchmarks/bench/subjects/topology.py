@@ -20,8 +20,8 @@ from work import ATARI, update_config
 from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.joining import join
 from coop.common.messaging.keys import replay_key
-from coop.common.messaging.messages.join import Join
-from coop.common.messaging.messages.stats import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.control import Join
+from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
 from coop.common.process.lifecycle import Stop

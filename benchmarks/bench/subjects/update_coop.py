@@ -6,8 +6,8 @@ from made_up import random_batch
 from turns import attend, rate
 from work import KINDS, update_config
 
+from coop.common.process.limits import use_threads
 from coop.common.process.memory import keep_freed_memory
-from coop.common.process.threads import use_threads
 from coop.learner.agent import Agent
 
 kind, method, batch_size, dtype, device = sys.argv[1:]

@@ -10,7 +10,7 @@ from torchrl.objectives import DQNLoss, HardUpdate
 from turns import attend, rate
 from work import KINDS
 
-from coop.common.networks.inputs import preprocess
+from coop.common.networks.forward import preprocess
 from coop.common.networks.network import build_network, sample_observations
 
 kind, batch_size = sys.argv[1], int(sys.argv[2])

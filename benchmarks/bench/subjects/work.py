@@ -66,7 +66,7 @@ def acting_config(run: str, envs: int, epsilon: float) -> RunConfig:
     """Breakout as Mnih et al. played it late in a run, with a limiter that admits everything."""
     tables = load_tables("breakout", None)
     tables["replay"] |= {"capacity": 20_000, "learning_starts": 1000, "tolerance": 1e12}
-    tables["actor"] |= {"envs": envs, "epsilon_start": epsilon, "epsilon_final": epsilon}
+    tables["actor"] |= {"num_envs": envs, "epsilon_start": epsilon, "epsilon_final": epsilon}
     return resolve({**tables, "run": run, "total_steps": 10**12})
 
 

@@ -1,8 +1,11 @@
-"""The status that each role publishes twice a second, for displays; readers ignore fields that they do not know."""
+"""The status that each role publishes twice a second, for displays, and the replay service's counters on request.
+
+Readers of a status ignore fields that they do not know.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 import msgspec
 from msgspec import Meta
@@ -11,7 +14,7 @@ from coop.common.bounded import Counter, Name, Real, Share, Text
 from coop.common.bounds import MAX_POINTS
 from coop.common.messaging import wire
 from coop.common.messaging.members import ROLES
-from coop.common.messaging.messages.body import bad_field, check_kind
+from coop.common.messaging.messages.body import Body, bad_field, check_kind
 from coop.common.messaging.messages.weights import Network
 from coop.common.messaging.wire import Message
 from coop.common.metrics import MEASURED
@@ -170,4 +173,33 @@ class LearnerStatus(Status, frozen=True):
     members: Annotated[list[Member], Meta(max_length=MAX_MEMBERS)] = []
     measured: Measured | None = None
     bad_messages: Counter = 0
+    faults: Counter = 0
+
+
+class StatsQuestion(Body, frozen=True):
+    """Asks for the counters."""
+
+    kind: ClassVar[str] = "stats"
+
+
+class ReplayStats(Body, frozen=True):
+    """The replay service's counters, in transitions unless stated otherwise.
+
+    drawn: batches. lost: transitions acknowledged to an actor but missing here. duplicates: segments delivered again
+    and refused. faults: answers that failed because of a bug in this program.
+    """
+
+    kind: ClassVar[str] = "stats"
+
+    size: Counter
+    inserted: Counter
+    drawn: Counter
+    evicted: Counter
+    evicted_unsampled: Counter
+    duplicates: Counter
+    lost: Counter
+    episodes: Counter
+    bad_messages: Counter
+    inserts_wait_for: Text
+    samples_wait_for: Text
     faults: Counter = 0

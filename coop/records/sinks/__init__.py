@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from coop.common.errors import CoopError, UsageError, first_line
+from coop.common.imports import check_extra
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.metrics import TAGS
 from coop.common.process.console import say
-from coop.common.process.extras import check_extra
 from coop.common.registry import Registry
 from coop.common.types import EpisodeRow
 

@@ -92,7 +92,7 @@ class EvaluationsFile(LineFile):
     def __init__(self, folder: Path, env_step: int | None) -> None:
         """Create the file, or continue it with the lines of a run that is resumed after `env_step` steps.
 
-        Lines stay by their step, and not up to a size as in other files: results arrive later than the epoch of the
+        Lines stay by their step, and not up to a size as in other files: results arrive after the checkpoint of the
         networks that they are of.
 
         Raises:

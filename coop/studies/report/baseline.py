@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from coop.common.errors import UsageError
-from coop.common.suggestions import closest, refusal
+from coop.common.errors import UsageError, closest, refusal
 from coop.studies.report.comparisons import MEASURES
 from coop.studies.report.intervals import Estimate, over_seeds
 from coop.studies.report.learning import by_seed, differences
@@ -109,8 +108,8 @@ def baseline_table(study: Study, baseline: Baseline) -> ResultTable:
         f"Each method's mean minus that of {baseline.name}, over the seeds that both have, with 95 % t "
         "intervals over seeds (none for one seed). area: mean over steps of the running mean of 100 episodes."
     )
-    beside = {"difference": ["low", "high"]}
-    return ResultTable("baseline", f"Differences from {baseline.name}", columns, rows, note, beside)
+    spreads = {"difference": ["low", "high"]}
+    return ResultTable("baseline", f"Differences from {baseline.name}", columns, rows, note, spreads)
 
 
 def baseline_figure(study: Study, baseline: Baseline) -> Figure:

@@ -63,7 +63,7 @@ def _run() -> None:
     else:
         from coop.studies.report.writer import write_report  # noqa: PLC0415
 
-        beside = runs if runs.is_dir() else runs.with_suffix("")
+        base = runs if runs.is_dir() else runs.with_suffix("")
         if options.out is None:
-            refuse_links(beside / "report")
-        print(shown(write_report(runs, options.out or beside / "report", options.baseline)))
+            refuse_links(base / "report")
+        print(shown(write_report(runs, options.out or base / "report", options.baseline)))

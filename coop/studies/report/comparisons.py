@@ -68,8 +68,8 @@ def learning_table(study: Study) -> ResultTable:
         "the squared difference of the two mean Q-values over the last 100 episodes. diverged: runs that count nowhere "
         f"else. {LATER}"
     )
-    beside = {"area": ["sd over runs"], "running mean": ["sd of running mean"]}
-    return ResultTable("learning", "The course of learning", columns, rows, note, beside)
+    spreads = {"area": ["sd over runs"], "running mean": ["sd of running mean"]}
+    return ResultTable("learning", "The course of learning", columns, rows, note, spreads)
 
 
 def paired_table(study: Study) -> ResultTable:
@@ -99,8 +99,8 @@ def sizes_table(study: Study) -> ResultTable:
             low, high = whole[small].mean(axis="columns"), whole[large].mean(axis="columns")
             rows.append([_words(study, others), method, low.mean(), high.mean(), *over_seeds(high - low), len(whole)])
     columns = ["setting", "method", "small", "large", "large - small", "low", "high", "seeds"]
-    beside = {"large - small": BOUNDS}
-    return ResultTable("sizes", "Small against large buffers", columns, rows, _sizes_note(study), beside)
+    spreads = {"large - small": BOUNDS}
+    return ResultTable("sizes", "Small against large buffers", columns, rows, _sizes_note(study), spreads)
 
 
 def interaction_table(study: Study) -> ResultTable:
@@ -116,8 +116,8 @@ def interaction_table(study: Study) -> ResultTable:
                 where = _words(study, others)
                 rows.append([name, where, x, y, low.mean(), high.mean(), *over_seeds(low - high), len(apart)])
     columns = ["measure", "setting", "x", "y", "x - y, small", "x - y, large", "interaction", "low", "high", "seeds"]
-    beside = {"interaction": BOUNDS}
-    return ResultTable("interaction", "Size and method", columns, rows, _sizes_note(study), beside)
+    spreads = {"interaction": BOUNDS}
+    return ResultTable("interaction", "Size and method", columns, rows, _sizes_note(study), spreads)
 
 
 def common_breaking_table(study: Study) -> ResultTable:
@@ -137,8 +137,8 @@ def common_breaking_table(study: Study) -> ResultTable:
         f"capacity; 95 % bootstrap interval over seeds. Empty: at none. {LATER}"
     )
     columns = [*names, "method", "best return", "breaking point", "low", "high"]
-    beside = {"breaking point": BOUNDS}
-    return ResultTable("common_breaking", "Breaking points against one threshold", columns, rows, note, beside)
+    spreads = {"breaking point": BOUNDS}
+    return ResultTable("common_breaking", "Breaking points against one threshold", columns, rows, note, spreads)
 
 
 def _course(runs: Sequence[Run]) -> list[Value]:

@@ -219,7 +219,7 @@ def _curves(
     for setting in settings:
         lines = []
         for method in study.methods:
-            runs = [run for run in study.of_beside(method, setting) if usable(run)]
+            runs = [run for run in study.compared(method, setting) if usable(run)]
             if runs:
                 lines.append(_line(method, *curve(runs)))
                 used += runs

@@ -86,7 +86,7 @@ def by_seed(study: Study, measure: Callable[[Run], float]) -> pd.DataFrame:
 
     Runs without a replay buffer count at each setting of the others' buffers.
     """
-    measured = study.beside.assign(value=study.beside["run"].map(measure))
+    measured = study.comparable.assign(value=study.comparable["run"].map(measure))
     return measured.pivot_table("value", "seed", ["method", "setting"], aggfunc="last")
 
 

@@ -133,8 +133,8 @@ def draw(figure: Figure, path: Path) -> None:
                     handles.setdefault(line.label, _handle(panel, line, colour))
             _finish_panel(axes, panel, columns)
             below = place + columns < number and figure.panels[place + columns].x == panel.x
-            beside = place % columns > 0 and figure.panels[place - 1].y == panel.y
-            _name_axes(axes, panel, x=not below, y=not beside)
+            beside_another = place % columns > 0 and figure.panels[place - 1].y == panel.y
+            _name_axes(axes, panel, x=not below, y=not beside_another)
             if panel.ticks and place % columns and panel.ticks == figure.panels[place - 1].ticks:
                 axes.tick_params(labelleft=False)
         for axes in grid.flat[number:]:

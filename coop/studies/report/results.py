@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -9,10 +10,23 @@ import numpy as np
 from coop.studies.report.comparisons import comparison_tables
 from coop.studies.report.intervals import improvement, iqm_of, iqm_overall
 from coop.studies.report.measures import breaking_point, diagnostic, diagnostics_of, score, shorter_runs, spread
-from coop.studies.report.paper import table_1
 from coop.studies.report.slices import CAPACITY, along, label, matrices, other_settings, pairs, seeds_of
 from coop.studies.report.study import Floats, Run, Setting, Study
 from coop.studies.report.table import ResultTable, Value, plain
+
+TABLE_1: dict[str, dict[str, tuple[float, float]]] = {
+    "cartpole": {"dqn": (193.6, 0.71), "edql": (199.6, 0.82), "g-coop": (200.0, 0.82), "coop": (200.0, 0.2123)},
+    "breakout": {"dqn": (287.0, 78.0), "edql": (290.0, 55.0), "g-coop": (314.0, 15.0), "coop": (313.0, 25.0)},
+    "spaceinvaders": {"dqn": (1139, 158), "edql": (980, 163), "g-coop": (1174, 163), "coop": (1144, 121)},
+    "pong": {"dqn": (18.9, 2.12), "edql": (19.11, 1.88), "g-coop": (18.91, 1.32), "coop": (19.15, 2.1)},
+}  # fmt: skip
+
+
+def table_1(env_id: str) -> dict[str, tuple[float, float]]:
+    """The column of an environment, (mean, sd) by method; empty if the paper has none."""
+    name = re.sub(r"^.*/|-v\d+$|[^A-Za-z]", "", env_id).lower()
+    return TABLE_1.get(name, {})
+
 
 OVER_RUNS = {"mean": ["sd over runs"], "IQM": ["IQM low", "IQM high"]}
 
@@ -41,7 +55,7 @@ def paper_table(study: Study) -> ResultTable:
             env if axis == "env.id" else value for axis, value in zip(study.axes, study.reference, strict=True)
         )
         for method in study.methods:
-            if runs := study.of_beside(method, setting):
+            if runs := study.compared(method, setting):
                 rows.append([env, method, *column.get(method, (None, None)), *_over_runs(runs), *_lengths(runs)])
     columns = [
         *("environment", "method", "paper mean", "paper sd"),
@@ -54,8 +68,8 @@ def paper_table(study: Study) -> ResultTable:
         "over runs; IQM: interquartile mean over runs with its 95 % bootstrap interval over seeds."
         + (f" Runs at {at}, the values nearest to the preset's." if at else "")
     )
-    beside = {"paper mean": ["paper sd"], **OVER_RUNS}
-    return ResultTable("table1", "The paper's Table 1 beside these runs", columns, rows, note, beside)
+    spreads = {"paper mean": ["paper sd"], **OVER_RUNS}
+    return ResultTable("table1", "The paper's Table 1 beside these runs", columns, rows, note, spreads)
 
 
 def settings_table(study: Study) -> ResultTable:
@@ -103,8 +117,8 @@ def breaking_table(study: Study) -> ResultTable:
         "low and high: its 95 % bootstrap interval over seeds. gaps: some larger capacity falls below 95 %. Where the "
         "return at the largest is poor, nothing was learnt that could break. Empty: no run at the largest."
     )
-    beside = {"breaking point": ["low", "high"]}
-    return ResultTable("breaking_points", "Breaking points", columns, rows, note, beside)
+    spreads = {"breaking point": ["low", "high"]}
+    return ResultTable("breaking_points", "Breaking points", columns, rows, note, spreads)
 
 
 def aggregate_table(study: Study) -> ResultTable:
@@ -128,8 +142,8 @@ def improvement_table(study: Study) -> ResultTable:
         values = [float(interval.value[0]), float(interval.low[0]), float(interval.high[0])]
         rows.append([x, y, *values, len(scores[x]), len(scores[y]), scores[x].shape[1]])
     columns = ["x", "y", "P(x > y)", "low", "high", "seeds of x", "seeds of y", "settings"]
-    note, beside = _matrix_note(study), {"P(x > y)": ["low", "high"]}
-    return ResultTable("improvement", "Probability of improvement", columns, rows, note, beside)
+    note, spreads = _matrix_note(study), {"P(x > y)": ["low", "high"]}
+    return ResultTable("improvement", "Probability of improvement", columns, rows, note, spreads)
 
 
 def runs_table(study: Study) -> ResultTable:

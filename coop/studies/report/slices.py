@@ -29,8 +29,8 @@ def along(
 ) -> tuple[list[int], list[Floats]]:
     """The values of one axis, others fixed, at which a method has runs, and a measure of the runs at each value."""
     place = study.axes.index(axis)
-    settings = [s for s in study.settings if s[:place] + s[place + 1 :] == others and study.of_beside(method, s)]
-    measured = [np.array([measure(run) for run in study.of_beside(method, setting)]) for setting in settings]
+    settings = [s for s in study.settings if s[:place] + s[place + 1 :] == others and study.compared(method, s)]
+    measured = [np.array([measure(run) for run in study.compared(method, setting)]) for setting in settings]
     return [setting[place] for setting in settings], measured
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from coop.common.errors import RunError
-from coop.common.process.notices import warn
+from coop.common.process.output import warn
 from coop.common.process.untrusted import check_links, check_run_name, read_text
 from coop.common.settings.tables import check_toml
 from coop.records.reading import check_records, column, read_csv, read_jsonl

@@ -132,16 +132,16 @@ class Study:
         return self._frame(lambda run: [self.setting(run)])
 
     @cached_property
-    def beside(self) -> pd.DataFrame:
+    def comparable(self) -> pd.DataFrame:
         """Like `frame`, but a run without a replay buffer has a row at each setting of the others' buffers."""
-        return self._frame(self._settings_beside)
+        return self._frame(self._compared_settings)
 
     def _frame(self, settings_of: Callable[[Run], Sequence[Setting]]) -> pd.DataFrame:
         places = {setting: place for place, setting in enumerate(self.settings)}
         rows = [(run, run.config.method, run.config.seed, places[at]) for run in self.runs for at in settings_of(run)]
         return pd.DataFrame(rows, columns=["run", "method", "seed", "setting"]).sort_values("seed", kind="stable")
 
-    def _settings_beside(self, run: Run) -> list[Setting]:
+    def _compared_settings(self, run: Run) -> list[Setting]:
         """The settings at which a run is compared with others."""
         own = self.setting(run)
         if not run.config.streaming:
@@ -153,9 +153,9 @@ class Study:
         """The runs of one method at one setting, ordered by seed."""
         return self._find(self._groups, method, setting)
 
-    def of_beside(self, method: str, setting: Setting) -> list[Run]:
+    def compared(self, method: str, setting: Setting) -> list[Run]:
         """The runs with which others at a setting are compared: as `of`, or those without a replay buffer."""
-        return self._find(self._groups_beside, method, setting)
+        return self._find(self._comparable_groups, method, setting)
 
     def _find(self, groups: Groups, method: str, setting: Setting) -> list[Run]:
         return groups.get((method, self.settings.index(setting)), []) if setting in self.settings else []
@@ -165,8 +165,8 @@ class Study:
         return _grouped(self.frame)
 
     @cached_property
-    def _groups_beside(self) -> Groups:
-        return _grouped(self.beside)
+    def _comparable_groups(self) -> Groups:
+        return _grouped(self.comparable)
 
     def index(self, axis: str) -> int | None:
         """The index of an axis in a setting; None if the runs do not differ in it."""

@@ -17,7 +17,7 @@ Value = str | int | float | None  # None: the number does not exist
 class ResultTable:
     """A table; `name`: of its files. `note`: what a reader must know about it.
 
-    beside: columns that readers see beside others, by the column whose value they follow: one in parentheses, a
+    spreads: columns that readers see beside others, by the column whose value they follow: one in parentheses, a
     deviation; two in brackets, the bounds of an interval. aside: columns that only the CSV has.
     """
 
@@ -26,7 +26,7 @@ class ResultTable:
     columns: Sequence[str]
     rows: Sequence[Sequence[Value]]
     note: str = ""
-    beside: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    spreads: Mapping[str, Sequence[str]] = field(default_factory=dict)
     aside: Sequence[str] = ()
 
     @cached_property
@@ -42,7 +42,7 @@ class ResultTable:
     def readable(self) -> pd.DataFrame:
         """The table as text for readers, rounded, with deviations and intervals beside their values."""
         shown = self.frame.map(rounded).drop(columns=list(self.aside))
-        for name, others in self.beside.items():
+        for name, others in self.spreads.items():
             left, right = "()" if len(others) == 1 else "[]"
             added = shown[others[0]].str.cat([shown[other] for other in others[1:]], sep=", ")
             there = self.frame[others[0]].map(_exists)

@@ -11,7 +11,7 @@ import numpy as np
 
 from coop.common.errors import RunError, UsageError
 from coop.common.process.limits import cores
-from coop.common.process.notices import warn
+from coop.common.process.output import warn
 from coop.common.process.untrusted import refuse_links
 from coop.records.curve import draw_curve
 from coop.studies.report.baseline import baseline_figure, baseline_table, find_baseline

@@ -3,7 +3,7 @@
     runs = [Lockstep(replace(config, seed=seed)) for seed in range(30)]
     seeds = Seeds(runs)
     while seeds.step < config.total_steps:
-        for told in seeds.play(200): ...
+        for block in seeds.play(200): ...
     seeds.save_into(0)         # now runs[0] is where its seed is, for Lockstep.save
 
 What chance decides depends on no network, so it is drawn for a block of steps ahead, from the runs' own generators.
@@ -38,7 +38,7 @@ _SHOWN = np.dtype([("obs", np.float32, 4), ("reward", np.float64), ("terminated"
 
 
 @dataclass(frozen=True)
-class Told:
+class PlayedBlock:
     """What a block of steps tells of one run: rows for episodes.csv and metrics.jsonl, in order."""
 
     run: Lockstep
@@ -97,7 +97,7 @@ class Seeds:
                     buffer[number, k] = optimizer.buffers[name]
         self._waiting: list[tuple[Any, ...]] = []  # steps since the last segment's end
 
-    def play(self, most: int) -> list[Told]:
+    def play(self, most: int) -> list[PlayedBlock]:
         """Play some steps, at least 1 and about `most`, to the end of a segment; those runs that diverge are dropped.
 
         A row of metrics, or a due checkpoint, ends a block.
@@ -107,11 +107,11 @@ class Seeds:
         metrics: list[list[dict[str, Any]]] = [[] for _ in self.runs]
         with np.errstate(all="ignore"), torch.inference_mode():
             self._play(block, episodes, metrics)
-        told = [Told(*each) for each in zip(self.runs, episodes, metrics, strict=True)]
+        played = [PlayedBlock(*each) for each in zip(self.runs, episodes, metrics, strict=True)]
         alive = np.array([k for k, run in enumerate(self.runs) if not run.trainer.diverged], np.intp)
         if len(alive) < len(self.runs):
             self._keep(alive)
-        return told
+        return played
 
     def _keep(self, runs: NDArray[np.intp]) -> None:
         self.runs, self._agents = [self.runs[k] for k in runs], [self._agents[k] for k in runs]

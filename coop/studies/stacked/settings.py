@@ -52,7 +52,7 @@ class StackSettings:
     eps: float = 1e-8
     decay: float = 1.0
     decay_every: int = 1000
-    decay_stepwise: bool = False
+    decay_staircase: bool = False
     noise: str = "constant"
     capacity: int = 5000
     learning_starts: int = 128
@@ -178,7 +178,7 @@ def from_config(config: RunConfig) -> tuple[StackSettings, Runs]:
         ("network.dtype", network.dtype, "float32"), ("replay.sampling", replay.sampling, "uniform"),
         ("replay.replacement", replay.replacement, True), ("replay.n_step", replay.n_step, 1),
         ("learner.momentum", learner.momentum, 0.0), ("learner.weight_decay", learner.weight_decay, ()),
-        ("learner.swap_unit", learner.swap_unit, "updates"), ("actor.envs", actor.envs, 1),
+        ("learner.swap_unit", learner.swap_unit, "updates"), ("actor.num_envs", actor.num_envs, 1),
         ("learner.reset_role_at_episode", learner.reset_role_at_episode, False),
         ("learner.initial_networks", learner.initial_networks, ""),
     )  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.process.randomness import generator_state, set_generator_state
+from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.config import RunConfig
 from coop.common.types import Array, Batch, EnvSpec
 from coop.lockstep.memory import TableMemory

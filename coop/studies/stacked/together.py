@@ -28,8 +28,8 @@ from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
 from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import Summary
-from coop.studies.stacked.eligible import why_not
 from coop.studies.stacked.seeds import MOST, Seeds
+from coop.studies.sweep.stacking import why_not
 
 PROGRAM = "coop-lockstep"
 
@@ -103,16 +103,16 @@ class _Group:
     def _block(self) -> None:
         """Play a block of steps, write what it tells, and save what is due."""
         seeds = self._seeds
-        for told in seeds.play(MOST):
-            directory = self._files[told.run]
-            directory.record(told.episodes, None)
-            for row in told.metrics:
+        for block in seeds.play(MOST):
+            directory = self._files[block.run]
+            directory.record(block.episodes, None)
+            for row in block.metrics:
                 directory.record((), row)
-            if told.run.trainer.diverged:
-                self._end(told.run, told.run.trainer.diverged)
+            if block.run.trainer.diverged:
+                self._end(block.run, block.run.trainer.diverged)
         for k, run in enumerate(seeds.runs):
-            if run.trainer.epoch_due() and seeds.step < run.config.total_steps:
-                run.trainer.epoch_begun()
+            if run.trainer.checkpoint_due() and seeds.step < run.config.total_steps:
+                run.trainer.checkpoint_begun()
                 seeds.save_into(k)
                 self._save(run)
 
@@ -179,7 +179,7 @@ def _run() -> None:
     if failed:
         raise RunError(f"{len(failed)} of {len(configs)} runs can't go on: {failed[0]}")
     if stop.is_set():
-        stop.leave()
+        stop.raise_for_status()
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -9,25 +10,73 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.console import Group, RenderableType
+from rich.progress_bar import ProgressBar
+from rich.table import Table
 from tyro.conf import Positional
 
-from coop.common.errors import Interrupted, RunError, UsageError
+from coop.common.errors import Interrupted, RunError, UsageError, closest, refusal
+from coop.common.imports import check_extra
 from coop.common.places import absolute, shown
 from coop.common.process.cli import parse
 from coop.common.process.console import say
-from coop.common.process.extras import check_extra
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.limits import cores
-from coop.common.suggestions import closest, refusal
+from coop.monitor.display import LiveDisplay
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.studies.sweep import slurm
-from coop.studies.sweep.beside import side_by_side
-from coop.studies.sweep.display import SweepDisplay
-from coop.studies.sweep.executor import Executor
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
 from coop.studies.sweep.grid import Grid, GridFile, load_grid
 from coop.studies.sweep.local import LocalProcesses
-from coop.studies.sweep.runner import Runner
+from coop.studies.sweep.runner import Executor, Runner
+from coop.studies.sweep.stacking import stacks_of
+
+PLAIN_EVERY = 30.0  # seconds between lines if the output is no terminal
+
+
+class SweepDisplay(LiveDisplay):
+    """Live view of a runner."""
+
+    def __init__(self, runner: Runner) -> None:
+        super().__init__(PLAIN_EVERY, refreshes=2)
+        self._runner = runner
+        self._began = time.monotonic()
+
+    def line(self) -> str:
+        """The sweep in one line."""
+        runner = self._runner
+        runner.look()
+        text = f"{runner.finished} of {len(runner.folders)} cells finished"
+        if runner.skipped:
+            text += f" ({runner.skipped} before)"
+        text += f", {len(runner.running)} running, {len(runner.waiting)} waiting"
+        if runner.diverged:
+            text += f", {len(runner.diverged)} diverged"
+        if runner.failed:
+            text += f", {len(runner.failed)} FAILED"
+        return f"{text}; {self._time_left()}"
+
+    def _time_left(self) -> str:
+        """Estimate the time left from this sweep's mean speed, although methods and replay ratios differ in speed."""
+        done, left = self._runner.steps_done(), self._runner.steps_left()
+        if not left:
+            return "no time left"
+        if not done:
+            return "time left not known yet"
+        seconds = round(left * (time.monotonic() - self._began) / done)
+        return f"about {seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02} left"
+
+    def picture(self) -> RenderableType:
+        """The running cells, above the line."""
+        table = Table(box=None, header_style="dim")
+        for column in ("cell", "steps", "", "return"):
+            table.add_column(column, justify="right" if column in ("steps", "return") else "left")
+        for run in self._runner.running:
+            total, progress = run.folder.cell.config.total_steps, run.progress
+            bar = ProgressBar(total=total, completed=progress.step, width=24)
+            table.add_row(run.folder.cell.name, f"{progress.step:,}/{total:,}", bar, f"{progress.mean_return:.1f}")
+        return Group(table, self.line())
+
 
 TICK = 0.2  # seconds
 
@@ -90,10 +139,10 @@ def _run() -> None:
 
 def _executor(options: SweepOptions, grid: GridFile, folders: Sequence[CellFolder]) -> AbstractContextManager[Executor]:
     if options.dask is None:
-        beside, reasons = side_by_side(grid, folders, options.jobs or cores(), options.stack)
+        stacks, reasons = stacks_of(grid, folders, options.jobs or cores(), options.stack)
         for line in reasons if (options.stack or 1) > 1 else ():
             say(f"--stack: {line}")
-        return nullcontext(LocalProcesses(grid, options.jobs, beside=beside))
+        return nullcontext(LocalProcesses(grid, options.jobs, stacks=stacks))
     from coop.studies.sweep.dask import workers_at  # noqa: PLC0415 - takes a second, and may not be installed
 
     return workers_at(options.dask, grid, options.jobs)

@@ -17,7 +17,7 @@ import tomli_w
 from pydantic import ConfigDict, Field
 
 from coop.common.envs.make import env_spec
-from coop.common.errors import UsageError
+from coop.common.errors import UsageError, closest, refusal
 from coop.common.process.untrusted import check_run_name
 from coop.common.settings.config import RunConfig, check_distributed
 from coop.common.settings.environment import EnvSettings
@@ -26,7 +26,6 @@ from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
 from coop.common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
-from coop.common.suggestions import closest, refusal
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 
@@ -222,8 +221,8 @@ def _check_environments(cells: list[Cell]) -> None:
 
 
 def _check_lockstep(config: RunConfig) -> None:
-    if config.actor.envs != 1:
-        raise UsageError(f"actor.envs = {config.actor.envs}: lockstep cells play one emulator; fix it to 1")
+    if config.actor.num_envs != 1:
+        raise UsageError(f"actor.num_envs = {config.actor.num_envs}: lockstep cells play one emulator; fix it to 1")
 
 
 def _check_collisions(cells: list[Cell]) -> None:

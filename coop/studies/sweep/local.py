@@ -14,9 +14,9 @@ from coop.common.errors import RunError
 from coop.common.process.limits import cores
 from coop.common.process.processes import ChildProcess, command
 from coop.records.locks import RunLock
-from coop.studies.sweep.beside import Beside
 from coop.studies.sweep.folder import CellFolder, Ending
 from coop.studies.sweep.grid import GridFile
+from coop.studies.sweep.stacking import Stacks
 
 TOGETHER = "coop.studies.stacked.together"  # the module that plays several cells
 # By default, the libraries that a run uses start a thread per core, and concurrent runs would starve each other.
@@ -38,7 +38,7 @@ class LocalProcesses:
 
     Args:
         jobs: number of processes to run concurrently; the number of cores of this job if None.
-        beside: the cells that a cell's process plays side by side (see `side_by_side`).
+        stacks: the cells that a cell's process plays side by side (see `stacks_of`).
         directory: working directory of the cells, where they find users' own modules; this process's if None.
     """
 
@@ -47,12 +47,12 @@ class LocalProcesses:
         grid: GridFile,
         jobs: int | None,
         directory: Path | None = None,
-        beside: Beside = MappingProxyType({}),
+        stacks: Stacks = MappingProxyType({}),
     ) -> None:
         self._grid = grid
         self._jobs = jobs or cores()
         self._directory = directory
-        self._beside = beside
+        self._stacks = stacks
         self._processes: dict[str, ChildProcess] = {}
         self._locks: dict[str, RunLock] = {}
         self._cards: dict[str, str] = {}
@@ -90,7 +90,7 @@ class LocalProcesses:
 
     def _mates(self, name: str) -> list[CellFolder]:
         """The other cells that the process of a cell may play."""
-        return [cell for cell in self._beside.get(name, ()) if cell.cell.name not in (name, *self._processes)]
+        return [cell for cell in self._stacks.get(name, ()) if cell.cell.name not in (name, *self._processes)]
 
     def _taken_along(self, folder: CellFolder, locks: dict[str, RunLock]) -> bool:
         """As `_take`, but leave a cell that fails: it says why once it is started itself."""
@@ -122,7 +122,7 @@ class LocalProcesses:
             return None
         self._ended(name)
         ending = folder.ending()
-        alone = name not in self._beside  # otherwise the status may be that of another cell
+        alone = name not in self._stacks  # otherwise the status may be that of another cell
         if ending is None or (ending.kind == "finished" and status and alone):
             why = process.why() if status else f"stopped early: {folder.outcome() or 'no summary.json'}"
             return Ending("failed", why)

@@ -17,11 +17,11 @@ from coop.common.process.limits import cores
 from coop.common.settings.config import value_of
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.records.summaries import read_summary
-from coop.studies.sweep.beside import side_by_side
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
 from coop.studies.sweep.grid import load_grid, parse_grid
 from coop.studies.sweep.local import LocalProcesses
 from coop.studies.sweep.runner import Runner
+from coop.studies.sweep.stacking import stacks_of
 
 TICK = 0.2  # seconds
 
@@ -78,8 +78,8 @@ def sweep(
         path = absolute(default_folder(grid, quick) if folder is None else folder, "folder")
     cells = [CellFolder(path, cell, names) for cell in checked.cells]
     claim_folder(checked, cells, path)
-    beside, _ = side_by_side(checked.file, cells, jobs or cores(), stack)
-    runner = Runner(cells, LocalProcesses(checked.file, jobs, beside=beside))
+    stacks, _ = stacks_of(checked.file, cells, jobs or cores(), stack)
+    runner = Runner(cells, LocalProcesses(checked.file, jobs, stacks=stacks))
     try:
         while not runner.done:
             runner.tick()

@@ -248,7 +248,7 @@ def _run() -> None:
     stop.on_signals()
     play(grid, args.out, stop, packed=packed_rows())
     if stop.is_set():
-        stop.leave()
+        stop.raise_for_status()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The replay service's parts of a run's epochs: writes them during operation, restores them, deletes old ones."""
+"""The replay service's parts of a run's checkpoints: writes them during operation, restores them, deletes old ones."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from coop.replay.persistence.journal import Journal, journal_names
 from coop.replay.persistence.storage import Mark, load_snapshot, save_snapshot
 
 
-class ReplayEpochs:
-    """Parts of epochs under `checkpoints/` of a folder, written one at a time in a separate thread."""
+class ReplayCheckpoints:
+    """Parts of checkpoints under `checkpoints/` of a folder, written one at a time in a separate thread."""
 
     def __init__(self, folder: Path, run_id: int, journal: Journal | None = None) -> None:
         self._folder = folder
@@ -40,15 +40,15 @@ class ReplayEpochs:
     def begin(self, core: ReplayCore, lock: threading.Condition, number: int, keep: list[int]) -> None:
         """Freeze the core's present state and begin to write it; return before it is written.
 
-        keep: the older epochs that are still needed. A repeated call for the epoch being written changes nothing.
+        keep: the older checkpoints still needed. A repeated call for the checkpoint being written changes nothing.
 
         Raises:
-            RunError: another epoch is being written, or there is no space for the journal.
+            RunError: another checkpoint is being written, or there is no space for the journal.
         """
         if self._writer is not None and self._writer.is_alive():
             if number == self._number:
                 return
-            raise RunError(f"epoch {number}: epoch {self._number} is still being written")
+            raise RunError(f"checkpoint {number}: checkpoint {self._number} is still being written")
         path = part_path(self._folder, number)
         with lock:
             try:
@@ -71,17 +71,17 @@ class ReplayEpochs:
                 raise
 
         self._number, self._on_disk, self._problem = number, False, ""
-        self._writer = threading.Thread(target=write, name=f"epoch {number}")
+        self._writer = threading.Thread(target=write, name=f"checkpoint {number}")
         self._writer.start()
 
     def written(self, number: int, seconds: float) -> bool:
-        """Wait up to `seconds`; return whether the part of epoch `number` is on disk (False: it is being written).
+        """Wait up to `seconds`; return whether the part of checkpoint `number` is on disk (False: it is being written).
 
         Raises:
             RunError: it was not begun or could not be written.
         """
         if number != self._number or self._writer is None:
-            raise RunError(f"epoch {number} was not begun")
+            raise RunError(f"checkpoint {number} was not begun")
         self._writer.join(seconds)
         if self._writer.is_alive():
             return False
@@ -106,7 +106,7 @@ class ReplayEpochs:
         return ""
 
     def restore(self, core: ReplayCore, number: int) -> tuple[int, str]:
-        """Restore a new core from the newest intact part up to epoch `number`, if there is one.
+        """Restore a new core from the newest intact part up to checkpoint `number`, if there is one.
 
         Returns:
             The first file of the journal that continues it, and a description of the part.
@@ -122,12 +122,12 @@ class ReplayEpochs:
             except Damaged as error:
                 torn += f"passed over {part_path(self._folder, found)}, {error}; "
                 continue
-            text = f"restored epoch {found}: {core.table.inserted:,} transitions, {core.drawn:,} batches"
+            text = f"restored checkpoint {found}: {core.table.inserted:,} transitions, {core.drawn:,} batches"
             return mark.journal, torn + text
-        return 1, f"{torn}no epoch to restore"
+        return 1, f"{torn}no checkpoint to restore"
 
     def go_back(self, number: int, *, anew: bool) -> str:
-        """Move aside what is younger than checkpoint `number`, and everything if the run begins anew.
+        """Move aside what is younger than checkpoint `number`, and everything if the run starts over.
 
         A learner that shares the folder moves whole checkpoints. Returns where it is now; empty if there was nothing.
 
@@ -157,9 +157,9 @@ class ReplayEpochs:
                 self._journal.close()
 
     def _drop(self, keep: set[int], covered: list[int]) -> None:
-        """Delete the parts not in `keep`, and the journal's files that no finished epoch needs.
+        """Delete the parts not in `keep`, and the journal's files that no finished checkpoint needs.
 
-        covered: numbers of the epochs that the learner has finished. If there are none, recovery begins with the
+        covered: numbers of the checkpoints that the learner has finished. If there are none, recovery begins with the
         journal's first file.
         """
         for number in set(part_numbers(self._folder)) - keep:

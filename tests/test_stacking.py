@@ -8,10 +8,10 @@ import pytest
 
 from coop.records.locks import RunLock
 from coop.records.summaries import read_summary
-from coop.studies.sweep.beside import MOST, side_by_side
 from coop.studies.sweep.folder import CellFolder
 from coop.studies.sweep.grid import Grid, parse_grid
 from coop.studies.sweep.local import LocalProcesses
+from coop.studies.sweep.stacking import MOST, stacks_of
 
 pytest.importorskip("numba")
 pytestmark = pytest.mark.timeout(300)
@@ -33,8 +33,8 @@ def cells_of(text: str, folder: Path) -> tuple[Grid, list[CellFolder]]:
 
 def sizes(text: str, jobs: int, most: int | None) -> list[int]:
     grid, cells = cells_of(text, Path("nowhere"))
-    beside, _ = side_by_side(grid.file, cells, jobs, most)
-    return sorted(len(part) for part in set(beside.values()))
+    stacks, _ = stacks_of(grid.file, cells, jobs, most)
+    return sorted(len(part) for part in set(stacks.values()))
 
 
 def test_cells_that_differ_in_their_seeds_alone_share_processes() -> None:
@@ -72,8 +72,8 @@ def test_the_seeds_of_a_cell_are_played_by_one_process(tmp_path: Path) -> None:
 
 def test_a_cell_that_another_process_runs_is_not_taken_along(tmp_path: Path) -> None:
     grid, cells = cells_of(GRID.replace(', "medqn"', ""), tmp_path)
-    beside, _ = side_by_side(grid.file, cells, 1, None)
-    executor = LocalProcesses(grid.file, 1, beside=beside)
+    stacks, _ = stacks_of(grid.file, cells, 1, None)
+    executor = LocalProcesses(grid.file, 1, stacks=stacks)
     held = RunLock(cells[1].path, "another", ("learner", "replay")).sign()
     try:
         assert executor.start(cells[0])

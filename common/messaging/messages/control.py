@@ -1,4 +1,4 @@
-"""Joining and leaving: a role asks the learner for the run's data, and tells it before it stops."""
+"""What directs a run: joining and leaving, checkpoints, the limiter's settings, and the end."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated, Any, ClassVar, Self
 import msgspec
 from msgspec import Meta
 
-from coop.common.bounded import Count, Incarnation, Name, Updates
-from coop.common.bounds import MAX_COUNT
+from coop.common.bounded import Count, Counter, Incarnation, Name, Real, Text, Updates
+from coop.common.bounds import MAX_COUNT, MAX_RATIO, MAX_TOLERANCE
 from coop.common.errors import BadMessage, UsageError
 from coop.common.messaging import wire
 from coop.common.messaging.members import JOINING, Origin
@@ -20,16 +20,16 @@ from coop.common.settings.tables import to_tables, validated
 from coop.common.types import EnvSpec
 
 Endpoints = Annotated[list[Name], Meta(max_length=16)]
-MOST_EPOCHS = 16  # epochs in one request
-Epochs = Annotated[list[Updates], Meta(max_length=MOST_EPOCHS)]
+MOST_CHECKPOINTS = 16  # checkpoints in one request
+Checkpoints = Annotated[list[Updates], Meta(max_length=MOST_CHECKPOINTS)]
 
 
 class Join(Body, frozen=True):
     """A process asks to be part of the run.
 
     endpoints: where others can reach it; empty for actors, and if a replay service only asks which run this is.
-    index: the index from an earlier join, or -1. epochs: the epochs that a replay service can restore, in ascending
-    order. serving: its table is in memory already and can continue from any epoch of the learner's.
+    index: the index from an earlier join, or -1. checkpoints: those that a replay service can restore, in ascending
+    order. serving: its table is in memory already and can continue from any checkpoint of the learner's.
     origin: its host and process id.
     """
 
@@ -39,24 +39,24 @@ class Join(Body, frozen=True):
     incarnation: Incarnation
     endpoints: Endpoints
     index: Annotated[int, Meta(ge=-1, le=MAX_COUNT)] = -1
-    epochs: Epochs = msgspec.field(default_factory=list)
+    checkpoints: Checkpoints = msgspec.field(default_factory=list)
     serving: bool = False
     origin: Origin = msgspec.field(default_factory=Origin.here)
 
 
-class Joined(Body, frozen=True):
+class JoinReply(Body, frozen=True):
     """All that a role needs to take part.
 
     replay_endpoints: where the replay service listens; empty while none has joined.
     index: number of processes of this role that joined the run before (makes actors' random streams distinct).
     layout: digest of the network layout, which the role compares with its own.
     run_id: random id from the run's beginning, which distinguishes it from other runs of the same name.
-    epoch: number of the newest finished epoch, which a replay service restores; 0 if there is none.
+    checkpoint: number of the newest finished checkpoint, which a replay service restores; 0 if there is none.
     anew: the training starts again from the beginning, so a replay service discards its data of the run.
     learner, replay: their hosts and process ids; `replay` is None while no replay service has joined.
     """
 
-    kind: ClassVar[str] = "joined"
+    kind: ClassVar[str] = "join-reply"
 
     config: RunConfig
     spec: EnvSpec
@@ -64,7 +64,7 @@ class Joined(Body, frozen=True):
     index: Count
     replay_endpoints: Endpoints
     run_id: Incarnation
-    epoch: Updates
+    checkpoint: Updates
     anew: bool = False
     learner: Origin = msgspec.field(default_factory=Origin.here)
     replay: Origin | None = None
@@ -105,3 +105,73 @@ class Farewell(Body, frozen=True):
     """The learner's permission to leave."""
 
     kind: ClassVar[str] = "farewell"
+
+
+class Snapshot(Body, frozen=True):
+    """Begins the part of checkpoint `number`; of the older checkpoints, only `keep` is kept."""
+
+    kind: ClassVar[str] = "snapshot"
+
+    number: Updates
+    keep: Checkpoints
+
+
+class Written(Body, frozen=True):
+    """Asks whether the part of checkpoint `number` is on disk."""
+
+    kind: ClassVar[str] = "written"
+
+    number: Updates
+
+
+class LimitsQuestion(Body, frozen=True):
+    """Asks for the settings."""
+
+    kind: ClassVar[str] = "limits"
+
+
+class Limit(Body, frozen=True):
+    """New settings; answered like the question.
+
+    ratio: updates per environment step. tolerance: environment steps by which acting and learning may differ.
+    """
+
+    kind: ClassVar[str] = "limit"
+
+    ratio: Annotated[float, Meta(gt=0, le=MAX_RATIO)]
+    tolerance: Annotated[float, Meta(ge=0, le=MAX_TOLERANCE)]
+
+
+class Limits(Body, frozen=True):
+    """The state of a running replay service's limiter.
+
+    ratio, tolerance: see `Limit`. inserted: transitions so far.
+    drawn: batches so far, out of `planned` in the complete run.
+    inserts_wait_for, samples_wait_for: why they wait, in words; empty if they do not.
+    """
+
+    kind: ClassVar[str] = "limits"
+
+    ratio: Real
+    tolerance: Real
+    inserted: Counter
+    drawn: Counter
+    planned: Counter
+    inserts_wait_for: Text
+    samples_wait_for: Text
+
+
+MAX_REASON = 1024  # characters
+
+
+class EndOfRun(Body, frozen=True):
+    """Says that the run is over, and why."""
+
+    kind: ClassVar[str] = "stop"
+
+    reason: Text
+
+    @classmethod
+    def because(cls, reason: str) -> Self:
+        """Build it with a reason, cut to `MAX_REASON` characters."""
+        return cls(reason[:MAX_REASON])

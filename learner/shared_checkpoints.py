@@ -1,4 +1,4 @@
-"""The epochs that learner and replay service both hold; a resumed run continues from the newest."""
+"""The checkpoints that learner and replay service both hold; a resumed run continues from the newest."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import threading
 from collections.abc import Sequence
 
 from coop.common.errors import UsageError
-from coop.common.messaging.messages.join import Join
+from coop.common.messaging.messages.control import Join
 from coop.common.process.lifecycle import Stop
 
 LOOK_EVERY = 0.1  # seconds
 REFUSAL = 0.5  # seconds for the refusal to reach the replay service before this process ends
 
 
-class SharedEpochs:
-    """Determines the epoch from which a run continues.
+class SharedCheckpoints:
+    """Determines the checkpoint from which a run continues.
 
-    This is decided once: when the replay service has announced its epochs, or at once if the learner has none.
+    This is decided once: when the replay service has announced its checkpoints, or at once if the learner has none.
 
     Args:
-        held: numbers of the learner's intact epochs.
+        held: numbers of the learner's intact checkpoints.
         run: the run directory, for the message of a refusal.
-        restart: start from the beginning if no epoch is held by both.
+        restart: start from the beginning if no checkpoint is held by both.
 
     Attributes:
-        newest: number of the newest shared epoch; 0 if there is none, or before the decision.
+        newest: number of the newest shared checkpoint; 0 if there is none, or before the decision.
     """
 
     def __init__(self, held: Sequence[int], run: str, *, restart: bool = False) -> None:
@@ -39,10 +39,10 @@ class SharedEpochs:
             self._decided.set()
 
     def offered(self, request: Join) -> tuple[int, bool]:
-        """Answer a joining replay service: the epoch to restore, and whether to start from the beginning.
+        """Answer a joining replay service: the checkpoint to restore, and whether to start from the beginning.
 
         Raises:
-            UsageError: no epoch is held by both.
+            UsageError: no checkpoint is held by both.
         """
         if not self._decided.is_set():
             self._decide(request)
@@ -52,14 +52,14 @@ class SharedEpochs:
         return self.newest, request.incarnation == self._began_anew
 
     def finished(self, number: int) -> None:
-        """Note a newly finished epoch."""
+        """Note a newly finished checkpoint."""
         self.newest = number
 
     def wait(self, stop: Stop) -> int | None:
-        """Wait for the decision: the epoch to continue from, 0 for the beginning, None if a stop was requested first.
+        """Wait for the decision: the checkpoint to continue from, 0 for the beginning, None if a stop comes first.
 
         Raises:
-            UsageError: no epoch is held by both.
+            UsageError: no checkpoint is held by both.
         """
         while not self._decided.wait(LOOK_EVERY):
             if stop.is_set():
@@ -71,18 +71,18 @@ class SharedEpochs:
 
     def _decide(self, request: Join) -> None:
         # A service that is already serving has its table in memory; a table ahead of the learner does no harm.
-        both = set(self._held) if request.serving else set(self._held) & set(request.epochs)
+        both = set(self._held) if request.serving else set(self._held) & set(request.checkpoints)
         if both:
             self.newest = max(both)
         elif self._restart:
             self._began_anew = request.incarnation
         else:
             self._problem = (
-                f"no epoch to go on from: {self._run} {_listed(self._held)}, the replay service on "
-                f"{request.origin} {_listed(request.epochs)}; nothing was changed. With --restart the training begins "
-                "anew, and what there is is moved aside"
+                f"no checkpoint to resume from: {self._run} {_listed(self._held)}, the replay service on "
+                f"{request.origin} {_listed(request.checkpoints)}; nothing was changed. With --restart the training "
+                "starts over, and what there is is moved aside"
             )
 
 
-def _listed(epochs: Sequence[int]) -> str:
-    return f"holds epochs {', '.join(map(str, epochs))}" if epochs else "holds none"
+def _listed(checkpoints: Sequence[int]) -> str:
+    return f"holds checkpoints {', '.join(map(str, checkpoints))}" if checkpoints else "holds none"

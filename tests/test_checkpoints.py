@@ -1,4 +1,4 @@
-"""Epochs on disk: what is restored goes on alike, torn ones are passed over, old ones go."""
+"""Checkpoints on disk: what is restored goes on alike, torn ones are passed over, old ones go."""
 
 import threading
 from dataclasses import replace
@@ -16,11 +16,11 @@ from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.types import EnvSpec, EpisodeRecord
 from coop.records.checkpoints import DONE, checkpoint_numbers
-from coop.records.learner_checkpoints import load_learner, newest_epoch, save_epoch
+from coop.records.learner_checkpoints import load_learner, newest_checkpoint, save_checkpoint
 from coop.records.resumption import go_back, survey
 from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.episodes import MOST, EpisodeLog
-from coop.replay.persistence.epochs import ReplayEpochs
+from coop.replay.persistence.checkpoints import ReplayCheckpoints
 
 CONFIG = RunConfig(
     run="test",
@@ -41,16 +41,16 @@ def _used_core(spec: EnvSpec) -> ReplayCore:
     return core
 
 
-def save(core: ReplayCore, epochs: ReplayEpochs, number: int, *keep: int) -> None:
-    epochs.begin(core, threading.Condition(), number, list(keep))
-    assert epochs.written(number, 10)
+def save(core: ReplayCore, checkpoints: ReplayCheckpoints, number: int, *keep: int) -> None:
+    checkpoints.begin(core, threading.Condition(), number, list(keep))
+    assert checkpoints.written(number, 10)
 
 
 def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
     core, twin = _used_core(spec), ReplayCore(CONFIG, spec)
     base = core.drawn - 2
-    save(core, ReplayEpochs(tmp_path, 5), base)
-    assert "restored epoch" in ReplayEpochs(tmp_path, 5).restore(twin, base)[1]
+    save(core, ReplayCheckpoints(tmp_path, 5), base)
+    assert "restored checkpoint" in ReplayCheckpoints(tmp_path, 5).restore(twin, base)[1]
     for one in (core, twin):
         assert one.insert(make_segment(spec, 14)) == 60, "a repeated delivery is still known"
         assert one.insert(make_segment(spec, 15)) == 64
@@ -67,19 +67,19 @@ def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
 
 
 def test_a_run_that_was_complete_may_go_on_for_longer(spec: EnvSpec, tmp_path: Path) -> None:
-    core, epochs = _used_core(spec), ReplayEpochs(tmp_path, 5)
+    core, checkpoints = _used_core(spec), ReplayCheckpoints(tmp_path, 5)
     core.limit(core.limiter.changed(core.table.inserted, core.drawn, ratio=0.5))
-    save(core, epochs, 10)
+    save(core, checkpoints, 10)
     longer = replace(CONFIG, total_steps=2 * CONFIG.total_steps)
-    epochs.restore(twin := ReplayCore(longer, spec), 10)
+    checkpoints.restore(twin := ReplayCore(longer, spec), 10)
     assert (twin.limiter.total, twin.limiter.ratio) == (longer.total_steps, 0.5)
     assert twin.limiter.why_not_insert(CONFIG.total_steps, core.limiter.draws_total or 0) is None
 
 
 def test_the_frames_of_old_answers_are_given_back(spec: EnvSpec, tmp_path: Path) -> None:
     core, twin = _used_core(spec), ReplayCore(CONFIG, spec)
-    save(core, ReplayEpochs(tmp_path, 5), core.drawn - 2)
-    ReplayEpochs(tmp_path, 5).restore(twin, core.drawn - 2)
+    save(core, ReplayCheckpoints(tmp_path, 5), core.drawn - 2)
+    ReplayCheckpoints(tmp_path, 5).restore(twin, core.drawn - 2)
     for one in (core, twin):
         assert len(one.repeatable()) == 2
         assert isinstance(one.draw(DrawRequest(1, one.drawn, one.drawn, 4, 0)), RetryLater)
@@ -88,25 +88,27 @@ def test_the_frames_of_old_answers_are_given_back(spec: EnvSpec, tmp_path: Path)
 
 
 def test_torn_parts_are_passed_over_and_old_ones_go(spec: EnvSpec, tmp_path: Path) -> None:
-    core, epochs = _used_core(spec), ReplayEpochs(tmp_path, 5)
+    core, checkpoints = _used_core(spec), ReplayCheckpoints(tmp_path, 5)
     for number in (10, 20, 30):
-        save(core, epochs, number, number - 10)
+        save(core, checkpoints, number, number - 10)
         core.insert(make_segment(spec, number))
     parts = {number: tmp_path / "checkpoints" / str(number) / "replay" for number in (10, 20, 30)}
     assert [parts[number].exists() for number in (10, 20, 30)] == [False, True, True]
     with (parts[30] / "rewards.npy").open("r+b") as file:
         file.seek(-1, 2)
         file.write(b"\7")
-    found = epochs.restore(twin := ReplayCore(CONFIG, spec), 30)[1]
+    found = checkpoints.restore(twin := ReplayCore(CONFIG, spec), 30)[1]
     assert f"passed over {parts[30]}, rewards.npy: wrong checksum; " in found
-    assert "restored epoch 20" in found
+    assert "restored checkpoint 20" in found
     assert twin.table.inserted == 60
-    assert epochs.restore(ReplayCore(CONFIG, spec), 19) == (1, "no epoch to restore"), "the learner is back before it"
+    assert checkpoints.restore(ReplayCore(CONFIG, spec), 19) == (1, "no checkpoint to restore"), (
+        "the learner is back before it"
+    )
     (parts[20] / "state.msgpack").write_bytes(b"")
-    assert "no epoch to restore" in epochs.restore(ReplayCore(CONFIG, spec), 20)[1]
+    assert "no checkpoint to restore" in checkpoints.restore(ReplayCore(CONFIG, spec), 20)[1]
     (parts[30] / "rewards.npy").unlink()
     with pytest.raises(RunError, match="belongs to another run than the learner's"):
-        ReplayEpochs(tmp_path, 6).restore(ReplayCore(CONFIG, spec), 30)
+        ReplayCheckpoints(tmp_path, 6).restore(ReplayCore(CONFIG, spec), 30)
 
 
 def test_a_writer_that_dies_of_anything_has_written_nothing(
@@ -115,26 +117,26 @@ def test_a_writer_that_dies_of_anything_has_written_nothing(
     def fails(*_: object) -> None:
         raise OverflowError
 
-    epochs = ReplayEpochs(tmp_path, 5)
+    checkpoints = ReplayCheckpoints(tmp_path, 5)
     monkeypatch.setattr("coop.replay.persistence.storage.write_manifest", fails)
     monkeypatch.setattr(threading, "excepthook", lambda args: None)
-    epochs.begin(_used_core(spec), threading.Condition(), 10, [])
+    checkpoints.begin(_used_core(spec), threading.Condition(), 10, [])
     with pytest.raises(RunError, match="10/replay: OverflowError"):
-        epochs.written(10, 10)
+        checkpoints.written(10, 10)
 
 
 def test_old_folders_go_where_nothing_else_is_in_them(spec: EnvSpec, tmp_path: Path) -> None:
-    core, epochs = _used_core(spec), ReplayEpochs(tmp_path, 5)
+    core, checkpoints = _used_core(spec), ReplayCheckpoints(tmp_path, 5)
     (tmp_path / "checkpoints" / "20").mkdir(parents=True)
     (tmp_path / "checkpoints" / "20" / "learner.pt").write_bytes(b"the learner's")
     for number in (10, 20, 30):
-        save(core, epochs, number)
+        save(core, checkpoints, number)
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["20", "30"]
 
 
 def test_episodes_are_kept_as_long_as_they_may_be_asked_for(spec: EnvSpec, tmp_path: Path) -> None:
-    core, epochs, sequence = ReplayCore(CONFIG, spec), ReplayEpochs(tmp_path, 5), 0
-    told: dict[int, int] = {}
+    core, checkpoints, sequence = ReplayCore(CONFIG, spec), ReplayCheckpoints(tmp_path, 5), 0
+    first_episodes: dict[int, int] = {}
     for turn in range(1, 6):
         for _ in range(10):
             core.insert(make_segment(spec, sequence))  # an episode each
@@ -143,25 +145,27 @@ def test_episodes_are_kept_as_long_as_they_may_be_asked_for(spec: EnvSpec, tmp_p
                 reply := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, sequence - 1)), RetryLater
             ):
                 last = reply
-        told[core.drawn] = last.drawn.first_episode
-        save(core, epochs, core.drawn, *list(told)[-3:-1])
-        kept = core.snapshot(core.drawn, list(told)[-3:-1])
-        assert kept.state["first_episode"] <= told[list(told)[max(0, turn - 3)]]
+        first_episodes[core.drawn] = last.drawn.first_episode
+        save(core, checkpoints, core.drawn, *list(first_episodes)[-3:-1])
+        kept = core.snapshot(core.drawn, list(first_episodes)[-3:-1])
+        assert kept.state["first_episode"] <= first_episodes[list(first_episodes)[max(0, turn - 3)]]
         assert len(kept.episodes) <= 31
         kept.table.frames.release()
     twin = ReplayCore(CONFIG, spec)
-    back = list(told)[-2]
-    ReplayEpochs(tmp_path, 5).restore(twin, back)
+    back = list(first_episodes)[-2]
+    ReplayCheckpoints(tmp_path, 5).restore(twin, back)
     for number in range(twin.table.inserted // 4, twin.table.inserted // 4 + 2):
         assert not isinstance(twin.insert(make_segment(spec, number)), RetryLater)
     for one in (core, twin):
-        reply = one.draw(DrawRequest(2, back, back, 4, told[back]))
+        reply = one.draw(DrawRequest(2, back, back, 4, first_episodes[back]))
         assert not isinstance(reply, RetryLater)
-        assert reply.drawn.first_episode == told[back]
+        assert reply.drawn.first_episode == first_episodes[back]
         steps = [record.env_step for record in reply.drawn.episodes]
-        assert steps == [4 * (number + 1) for number in range(told[back], one.table.inserted // 4)]
+        assert steps == [4 * (number + 1) for number in range(first_episodes[back], one.table.inserted // 4)]
     kept = twin.snapshot(twin.drawn, [back])
-    assert kept.state["first_episode"] == told[back], "the restored one knows which episodes an epoch needs"
+    assert kept.state["first_episode"] == first_episodes[back], (
+        "the restored one knows which episodes a checkpoint needs"
+    )
     kept.table.frames.release()
 
 
@@ -177,7 +181,7 @@ def test_a_draw_that_may_be_repeated_keeps_its_episodes(spec: EnvSpec) -> None:
         kept.table.frames.release()
 
 
-def test_a_run_without_epochs_keeps_a_bounded_number_of_episodes(spec: EnvSpec) -> None:
+def test_a_run_without_checkpoints_keeps_a_bounded_number_of_episodes(spec: EnvSpec) -> None:
     log = EpisodeLog()
     (end,) = make_segment(spec).episodes
     for number in range(3):
@@ -207,14 +211,14 @@ def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
 
 def save_learner(run_dir: Path, number: int, state: dict[str, Any]) -> None:
     """A checkpoint of a learner whose records are empty."""
-    save_epoch(run_dir, 5, number, state, lambda _: None, records={})
+    save_checkpoint(run_dir, 5, number, state, lambda _: None, records={})
 
 
 def finished(run_dir: Path) -> list[int]:
     return checkpoint_numbers(run_dir, DONE)
 
 
-def test_learner_epochs(tmp_path: Path) -> None:
+def test_learner_checkpoints(tmp_path: Path) -> None:
     for number in (100, 200, 300):
         save_learner(tmp_path, number, {"flat": torch.full((3,), float(number))})
     assert finished(tmp_path) == [200, 300]
@@ -228,17 +232,17 @@ def test_learner_epochs(tmp_path: Path) -> None:
     assert found.newest is not None
     assert found.newest.state["flat"].tolist() == [200.0] * 3
     assert set(found.problems) == {300, 400}
-    told = go_back(found, found.newest.number)
+    moved = go_back(found, found.newest.number)
     assert finished(tmp_path) == [200], "the torn ones count not among the two to keep"
     (aside,) = (tmp_path / "aside").iterdir()
-    assert told == f"what is younger is in {aside}"
+    assert moved == f"what is younger is in {aside}"
     assert (aside / "checkpoints" / "400" / "learner.pt").read_bytes() == b"half", "and nothing is deleted"
 
     def fails(folder: str) -> None:
         raise RunError(f"no room for {folder}")
 
     with pytest.raises(RunError):
-        save_epoch(tmp_path, 5, 500, {}, fails, records={})
+        save_checkpoint(tmp_path, 5, 500, {}, fails, records={})
     assert finished(tmp_path) == [200]
     assert not (tmp_path / "checkpoints" / "500").exists()
-    assert newest_epoch(tmp_path) is not None
+    assert newest_checkpoint(tmp_path) is not None
