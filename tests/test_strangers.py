@@ -406,7 +406,7 @@ def test_an_array_is_no_larger_than_its_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="greater than file size"):
         load_array(path, 1 << 20)
     path.write_bytes(pickle.dumps([1]))
-    with pytest.raises(ValueError, match="allow_pickle=False"):
+    with pytest.raises(ValueError, match="contains pickled"):
         load_array(path, 1 << 20)
 
 
