@@ -326,6 +326,9 @@ def rewritten_as(path: Path, how: int) -> None:
             archive.writestr(name, content)
 
 
+PAIRS = b"K\x01" + b"".join(bytes([0x71, each, 0x68, each, 0x86]) for each in range(40))  # x = (x, x), 40 times
+
+
 def test_a_checkpoint_asks_for_no_more_than_it_holds(tmp_path: Path) -> None:
     path = tmp_path / "learner.pt"
     torch.save({"networks": [torch.rand(1 << 16)]}, path)
@@ -351,6 +354,14 @@ def test_a_checkpoint_asks_for_no_more_than_it_holds(tmp_path: Path) -> None:
     for attack in (
         b"\x80\x02cbuiltins\nbytearray\nK\x05\x85R.",
         b"\x80\x05\x96\xff\xff\xff\xff\xff\x00\x00\x00.",
+        b"\x80\x02}" + PAIRS + b"K\x01s.",  # a key of 2^40 numbers to hash
+        b"\x80\x02}(" + PAIRS + b"K\x01u.",
+        b"\x80\x02(" + PAIRS + b"K\x01d.",
+        b"\x80\x02ccollections\nOrderedDict\n(" + PAIRS + b"K\x01\x86\x85\x85R.",
+        b"\x80\x04(" + PAIRS + b"\x91.",
+        b"\x80\x04\x8f(" + PAIRS + b"\x90.",
+        b"\x80\x02(X\x07\x00\x00\x00storageX\x05\x00\x00\x00Float" + PAIRS + b"X\x03\x00\x00\x00cpuK\x00tQ.",
+        b"\x80\x02(X\x07\x00\x00\x00storage" + PAIRS + b"X\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x00tQ.",
         b"\x80\x02",
     ):
         rewritten(zipfile.ZIP_STORED, **{"data.pkl": attack})
@@ -541,6 +552,16 @@ def test_neither_a_pipe_nor_a_device_is_opened(trained: Path, tmp_path: Path) ->
                 look(run)
         with pytest.raises(RunError, match="neither a file nor a folder"):
             coop.train(resume=True, run_dir=run)
+
+
+@pytest.mark.parametrize("place", ["run/summary.json", "run/run-id", "sweep.toml"])
+def test_a_report_opens_no_pipe(trained: Path, tmp_path: Path, place: str) -> None:
+    a_copy(trained, tmp_path / "theirs" / "run")
+    (tmp_path / "theirs" / place).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / "theirs" / place)
+    done = run_command("coop-report", tmp_path / "theirs", "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"{place}: neither a file nor a folder; not opened\n")
 
 
 def test_a_report_is_not_written_through_links(trained: Path, tmp_path: Path) -> None:

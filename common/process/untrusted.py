@@ -31,7 +31,7 @@ LEFT = (
     "learning_curve.png", "checkpoints", "journal", "videos", "logs", "tb", "wandb",
 )  # fmt: skip
 """What a run leaves in its folder; the rest, but for _BESIDE, is its user's."""
-_BESIDE = ("run.log", ".learner.lock", ".replay.lock", "aside")
+_BESIDE = ("run.log", ".learner.lock", ".replay.lock", "aside", "sweep.toml")
 _SIZES = {  # bytes of an item of PyTorch's storages
     "Double": 8, "Float": 4, "Half": 2, "BFloat16": 2, "Long": 8, "Int": 4, "Short": 2, "Char": 1, "Byte": 1, "Bool": 1,
 }  # fmt: skip
@@ -177,17 +177,13 @@ def check_torch_file(path: Path) -> None:
 class _Described(pickle._Unpickler):  # in Python: it takes no memory in advance
     """Reads what a checkpoint says of its arrays, and makes none; knows no more names than our checkpoints hold."""
 
-    dispatch: ClassVar = {  # without what takes memory for a size that is only declared
-        code: method for code, method in pickle._Unpickler.dispatch.items() if code != pickle.BYTEARRAY8[0]
-    }
-
     def __init__(self, file: Any, sizes: dict[str, int]) -> None:  # noqa: ANN401 (a file in an archive)
         super().__init__(file)
         self._sizes = sizes
 
     def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401 (a name's stand-in)
         if (module, name) == ("collections", "OrderedDict"):
-            return OrderedDict
+            return _ordered
         if module == "torch" and name.removesuffix("Storage") in _SIZES:
             return name.removesuffix("Storage")
         if (module, name) in _MADE:
@@ -196,9 +192,36 @@ class _Described(pickle._Unpickler):  # in Python: it takes no memory in advance
 
     def persistent_load(self, pid: Any) -> None:  # noqa: ANN401 (whatever the file holds)
         _, storage, key, _, items = pid
+        if not (isinstance(storage, str) and isinstance(key, str) and isinstance(items, int)):
+            raise ValueError("an array that is none")  # noqa: TRY004 (what is nested may be without end to print)
         held = self._sizes.get(f"data/{key}")
         if held != items * _SIZES[storage]:
             raise ValueError(f"array {key!r}: {items:,} items, {held} bytes")
+
+    def _set_items(self: Any) -> None:
+        items = self.pop_mark()
+        self._fill(items)
+
+    def _set_item(self: Any) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._fill([key, value])
+
+    def _fill(self: Any, items: list[Any]) -> None:
+        if not all(isinstance(key, str | int) for key in items[::2]):  # what is nested may be without end to hash
+            raise ValueError("a key that is neither a text nor a number")
+        self.stack[-1].update(zip(items[::2], items[1::2], strict=True))
+
+    dispatch: ClassVar[dict[int, Any]] = {
+        **pickle._Unpickler.dispatch,
+        pickle.SETITEM[0]: _set_item,
+        pickle.SETITEMS[0]: _set_items,
+    }
+    for each in (pickle.BYTEARRAY8, pickle.DICT, pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET):
+        del dispatch[each[0]]  # takes memory for a size that is only declared, or hashes whatever it is given
+
+
+def _ordered() -> OrderedDict[Any, Any]:
+    return OrderedDict()
 
 
 def _nothing(*_: Any) -> None:  # noqa: ANN401 (the arguments that make a tensor or the like)
