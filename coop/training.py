@@ -19,7 +19,6 @@ from coop.common.process.console import say
 from coop.common.process.files import make_folder
 from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import ChildProcess, command
-from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig, check_distributed
 from coop.common.settings.effects import without_effect
 from coop.common.settings.overrides import leaves, merged
@@ -256,7 +255,6 @@ def _named(settings: Mapping[str, Any]) -> list[str]:
 def _topology(
     config: RunConfig, directory: Path, actors: int, start: Start, named: list[str], log: tuple[str, ...]
 ) -> _Topology:
-    check_links(directory)
     with RunLock(directory, "coop.train", ("learner", "replay")):  # the process takes it after this one
         start.prepare(directory, replay=True, settings=settings_digest(config))
     logs = directory / "logs"

@@ -336,7 +336,11 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
     save_checkpoint(tmp_path, 5, 100, {"a": 1}, lambda _: calls.append("replay"), records=records)
     order = [calls.index(each) for each in ("name checkpoints/100/learner.pt", "replay", "sync episodes.csv")]
     done = calls.index("name checkpoints/100/DONE")
+    for place, name in ((place, call.removeprefix("name ")) for place, call in enumerate(calls) if call[:4] == "name"):
+        assert calls[place - 1].startswith(f"sync {name}."), "its content, under another name"
+        assert calls[place + 1] == f"sync {Path(name).parent}"
     assert order == sorted(order)
+    assert calls.index("sync checkpoints/100") < order[0], "the mark of what has only been begun"
     assert calls.index("sync checkpoints") < done, "the folder that names the checkpoint's"
     last = len(calls) - calls[::-1].index("sync .")
     assert max(order) < calls.index("sync metrics.jsonl") < last <= done

@@ -342,6 +342,10 @@ def test_a_file_is_never_lengthened(tmp_path: Path) -> None:
     assert path.read_bytes() == b"twelve bytes"
     truncate(path, 6)
     assert path.read_bytes() == b"twelve"
+    (tmp_path / "link").symlink_to(path)
+    with pytest.raises(RunError, match="is a link, which is not followed"):
+        truncate(tmp_path / "link", 3)
+    assert path.read_bytes() == b"twelve"
     config = RunOptions().run_config()
     seals = Manifest(5, 100, {}, {"episodes.csv": FileDigest(99, 0)})
     with pytest.raises(RunError, match="has 6 bytes, and should have at least 99"):

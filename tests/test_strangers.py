@@ -2,9 +2,11 @@
 
 import json
 import os
+import pickle
 import re
 import shutil
 import sys
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,12 +28,16 @@ from coop.common.process import untrusted
 from coop.common.process.files import LineFile, measure, write_atomic
 from coop.common.process.untrusted import check_links, check_run_name, check_torch_file, load_array, page_sizes
 from coop.common.settings.tables import sealed_toml
+from coop.lockstep.reexecute import reexecute
 from coop.records.checkpoints import read_manifest, write_manifest
+from coop.records.locks import RunLock
+from coop.records.run_options import chosen_config
 from coop.records.summaries import SUMMARY, read_summary, summary_text
 from coop.studies.report import packed
 from coop.studies.report.packed import PackedStudy
 from coop.studies.report.packing import study_file
 from coop.studies.report.sources import open_source
+from coop.studies.sweep.folder import CellFolder
 from coop.studies.sweep.grid import parse_grid
 
 pytestmark = pytest.mark.timeout(300)
@@ -128,6 +134,37 @@ def test_no_link_leads_out_of_a_run(trained: Path, tmp_path: Path, place: str) -
     with pytest.raises(RunError, match="a link that leads out of the run"):
         open_source(tmp_path)
     assert list(mine.iterdir()) == [] if mine.is_dir() else mine.read_text() == "precious"
+
+
+def cell(run: Path) -> CellFolder:
+    """The run as the cell of a sweep."""
+    (one,) = parse_grid('methods = ["dqn"]\nseeds = [0]\n', "g.toml").cells
+    folder = CellFolder(run.parent, one)
+    if not folder.path.is_symlink():
+        folder.path.symlink_to(run)
+    return folder
+
+
+LOOKS: list[Callable[[Path], object]] = [
+    lambda run: RunLock(run, "coop-replay", ("replay",)),
+    lambda run: chosen_config(None, None, None, None, run),
+    lambda run: cell(run).check(),
+    open_source,
+    lambda run: open_source(run.parent),
+    reexecute,
+    lambda run: coop.train(
+        method="dqn", total_steps=40, learner={"initial_networks": str(run)}, run_dir=run.parent.with_name("new")
+    ).wait(),
+]
+
+
+@pytest.mark.parametrize("number", range(len(LOOKS)))
+def test_whatever_looks_into_a_run_refuses_links(number: int, trained: Path, tmp_path: Path) -> None:
+    run = a_copy(trained, tmp_path / "theirs" / "run")
+    shutil.move(run / "episodes.csv", tmp_path / "mine")
+    (run / "episodes.csv").symlink_to(tmp_path / "mine")
+    with pytest.raises(RunError, match=r"episodes\.csv: a link that leads out of the run"):
+        LOOKS[number](run)
 
 
 def test_links_within_a_run_and_a_user_s_own_are_left_alone(trained: Path, tmp_path: Path) -> None:
@@ -289,6 +326,9 @@ def rewritten_as(path: Path, how: int) -> None:
             archive.writestr(name, content)
 
 
+PAIRS = b"K\x01" + b"".join(bytes([0x71, each, 0x68, each, 0x86]) for each in range(40))  # x = (x, x), 40 times
+
+
 def test_a_checkpoint_asks_for_no_more_than_it_holds(tmp_path: Path) -> None:
     path = tmp_path / "learner.pt"
     torch.save({"networks": [torch.rand(1 << 16)]}, path)
@@ -314,6 +354,14 @@ def test_a_checkpoint_asks_for_no_more_than_it_holds(tmp_path: Path) -> None:
     for attack in (
         b"\x80\x02cbuiltins\nbytearray\nK\x05\x85R.",
         b"\x80\x05\x96\xff\xff\xff\xff\xff\x00\x00\x00.",
+        b"\x80\x02}" + PAIRS + b"K\x01s.",  # a key of 2^40 numbers to hash
+        b"\x80\x02}(" + PAIRS + b"K\x01u.",
+        b"\x80\x02(" + PAIRS + b"K\x01d.",
+        b"\x80\x02ccollections\nOrderedDict\n(" + PAIRS + b"K\x01\x86\x85\x85R.",
+        b"\x80\x04(" + PAIRS + b"\x91.",
+        b"\x80\x04\x8f(" + PAIRS + b"\x90.",
+        b"\x80\x02(X\x07\x00\x00\x00storageX\x05\x00\x00\x00Float" + PAIRS + b"X\x03\x00\x00\x00cpuK\x00tQ.",
+        b"\x80\x02(X\x07\x00\x00\x00storage" + PAIRS + b"X\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x00tQ.",
         b"\x80\x02",
     ):
         rewritten(zipfile.ZIP_STORED, **{"data.pkl": attack})
@@ -322,6 +370,40 @@ def test_a_checkpoint_asks_for_no_more_than_it_holds(tmp_path: Path) -> None:
     path.write_bytes(b"PK no archive")
     with pytest.raises(RunError, match="can't be read"):
         check_torch_file(path)
+
+
+def text(word: str) -> bytes:
+    """A text in a pickle."""
+    return b"X" + len(word).to_bytes(4, "little") + word.encode()
+
+
+@pytest.mark.parametrize("claimed", ["bytes", "entry"])
+def test_a_checkpoint_s_sizes_are_those_of_the_file(claimed: str, tmp_path: Path) -> None:
+    """Neither the pickle nor the archive's list of entries says how much memory is taken."""
+    path, items = tmp_path / "learner.pt", 1 << 29  # float32 of 2 GiB
+    taken = b"(" + b"".join(map(text, ("storage", "FloatStorage", "0", "cpu"))) + b"J" + items.to_bytes(4, "little")
+    taken = taken.replace(text("FloatStorage"), b"ctorch\nFloatStorage\n") + b"tQ"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a/data.pkl", b"\x80\x05" + taken + b".")
+        archive.writestr("a/data/0", bytes(64))
+    with pytest.raises(RunError, match="array '0': 536,870,912 items, 64 bytes"):
+        check_torch_file(path)
+    if claimed == "entry":
+        content = bytearray(path.read_bytes())
+        at = content.rindex(b"a/data/0") - 46 + 20  # both sizes in the entry of the list
+        content[at : at + 8] = 2 * (4 * items).to_bytes(4, "little")
+        path.write_bytes(content)
+        with pytest.raises(RunError, match="larger than the file"):
+            check_torch_file(path)
+        return
+    with zipfile.ZipFile(path, "w") as archive:  # the reader would take the memory before it looks for the bytes
+        archive.writestr("a/data.pkl", b"\x80\x05\x96" + (1 << 28).to_bytes(8, "little") + b".")
+    tracemalloc.start()
+    with pytest.raises(RunError, match="can't be read"):
+        check_torch_file(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 1 << 25
 
 
 def test_an_array_is_no_larger_than_its_file(tmp_path: Path) -> None:
@@ -333,6 +415,9 @@ def test_an_array_is_no_larger_than_its_file(tmp_path: Path) -> None:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40,)})
         file.write(bytes(64))
     with pytest.raises(ValueError, match="greater than file size"):
+        load_array(path, 1 << 20)
+    path.write_bytes(pickle.dumps([1]))
+    with pytest.raises(ValueError, match="contains pickled"):
         load_array(path, 1 << 20)
 
 
@@ -349,6 +434,9 @@ def test_a_study_is_measured_before_it_is_spread_out(tmp_path: Path, monkeypatch
     path.write_bytes(study_file(pa.table({"run": ["a"], "episodes.csv/actor": texts})))
     assert path.stat().st_size < 10_000
     with pytest.raises(UsageError, match=r"not a packed study: 100,000,00\d bytes of text"):
+        PackedStudy(path)
+    os.truncate(path, 1 << 21)
+    with pytest.raises(UsageError, match=r"not a packed study: 2,097,152 bytes; a study has at most"):
         PackedStudy(path)
 
 
@@ -428,7 +516,7 @@ def pages(content: bytes) -> list[tuple[int, int]]:
     return list(page_sizes(content, start, column.total_compressed_size))
 
 
-def test_pages_that_are_none(tmp_path: Path) -> None:
+def test_pages_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "study.parquet"
     pq.write_table(pa.table({"run": ["a"], "metrics.jsonl/x": [[1, 2, 3]]}), path)
     content = path.read_bytes()
@@ -442,6 +530,15 @@ def test_pages_that_are_none(tmp_path: Path) -> None:
             list(page_sizes(data, 0, len(data)))
     for bad in (b"\x15\x00\x15\x01\x15\x00\x00", b"\x15\x00\x15\x02\x15\x01\x00"):  # sizes of -1
         with pytest.raises(ValueError, match="negative"):
+            list(page_sizes(bad, 0, len(bad)))
+    monkeypatch.setattr(untrusted, "MAX_ENTRIES", 100)
+    for bad, said in (
+        (b"\x1c" * 5_000, "a page's header that is none"),  # structures within structures
+        (b"\x19\x00\x25\x00\x15\x00\x00", "a page's header that is none"),  # a list
+        (b"\x15" + b"\xff" * 100, "a number without an end"),
+        (b"\x15\x00\x15\x00\x15\x00\x00" * 101, "more than 100 pages"),
+    ):
+        with pytest.raises(ValueError, match=said):
             list(page_sizes(bad, 0, len(bad)))
 
 
@@ -457,6 +554,16 @@ def test_neither_a_pipe_nor_a_device_is_opened(trained: Path, tmp_path: Path) ->
             coop.train(resume=True, run_dir=run)
 
 
+@pytest.mark.parametrize("place", ["run/summary.json", "run/run-id", "sweep.toml"])
+def test_a_report_opens_no_pipe(trained: Path, tmp_path: Path, place: str) -> None:
+    a_copy(trained, tmp_path / "theirs" / "run")
+    (tmp_path / "theirs" / place).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / "theirs" / place)
+    done = run_command("coop-report", tmp_path / "theirs", "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"{place}: neither a file nor a folder; not opened\n")
+
+
 def test_a_report_is_not_written_through_links(trained: Path, tmp_path: Path) -> None:
     a_copy(trained, tmp_path / "theirs" / "run")
     (tmp_path / "mine").mkdir()
@@ -469,6 +576,13 @@ def test_a_report_is_not_written_through_links(trained: Path, tmp_path: Path) ->
     (tmp_path / "theirs" / "report" / "index.html").symlink_to(tmp_path / "mine" / "page")
     done = run_command("coop-report", tmp_path / "theirs")
     assert "index.html: a link, to " in done.stderr
+    (tmp_path / "curves").mkdir()
+    for place in ("run", "run/learning_curve.png"):
+        (tmp_path / "curves" / place).symlink_to(tmp_path / "mine")
+        done = run_command("coop-report", tmp_path / "theirs", "--curves", tmp_path / "curves")
+        assert f"{place}: a link, to " in done.stderr
+        (tmp_path / "curves" / place).unlink()
+        (tmp_path / "curves" / "run").mkdir(exist_ok=True)
     assert list((tmp_path / "mine").iterdir()) == []
 
 

@@ -31,7 +31,7 @@ LEFT = (
     "learning_curve.png", "checkpoints", "journal", "videos", "logs", "tb", "wandb",
 )  # fmt: skip
 """What a run leaves in its folder; the rest, but for _BESIDE, is its user's."""
-_BESIDE = ("run.log", ".learner.lock", ".replay.lock", "aside")
+_BESIDE = ("run.log", ".learner.lock", ".replay.lock", "aside", "sweep.toml")
 _SIZES = {  # bytes of an item of PyTorch's storages
     "Double": 8, "Float": 4, "Half": 2, "BFloat16": 2, "Long": 8, "Int": 4, "Short": 2, "Char": 1, "Byte": 1, "Bool": 1,
 }  # fmt: skip
@@ -40,7 +40,7 @@ _MADE = {
     *(("torch", name) for name in ("Size", "device", "float32", "float64", "bfloat16", "int64", "uint8", "bool")),
     ("_codecs", "encode"),
 }
-MAX_ENTRIES = 1 << 20  # of an archive
+MAX_ENTRIES = 1 << 20  # pages of a column
 
 
 RUN = r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,63}$"  # what a run is called on the wire; always a name of a folder too
@@ -164,8 +164,6 @@ def check_torch_file(path: Path) -> None:
             size = path.stat().st_size
             if any(entry.compress_type != zipfile.ZIP_STORED or entry.file_size > size for entry in entries.values()):
                 raise ValueError("an entry is compressed, or larger than the file")
-            if len(entries) > MAX_ENTRIES:
-                raise ValueError(f"{len(entries):,} entries")
             (name,) = (each for each in entries if each.endswith("/data.pkl"))
             root = name.removesuffix("data.pkl")
             with archive.open(name) as file:
@@ -179,19 +177,13 @@ def check_torch_file(path: Path) -> None:
 class _Described(pickle._Unpickler):  # in Python: it takes no memory in advance
     """Reads what a checkpoint says of its arrays, and makes none; knows no more names than our checkpoints hold."""
 
-    dispatch: ClassVar = {
-        code: method
-        for code, method in pickle._Unpickler.dispatch.items()
-        if code not in {pickle.BYTEARRAY8[0], pickle.NEXT_BUFFER[0], pickle.LONG4[0], pickle.INST[0], pickle.OBJ[0]}
-    }
-
     def __init__(self, file: Any, sizes: dict[str, int]) -> None:  # noqa: ANN401 (a file in an archive)
         super().__init__(file)
         self._sizes = sizes
 
     def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401 (a name's stand-in)
         if (module, name) == ("collections", "OrderedDict"):
-            return OrderedDict
+            return _ordered
         if module == "torch" and name.removesuffix("Storage") in _SIZES:
             return name.removesuffix("Storage")
         if (module, name) in _MADE:
@@ -199,10 +191,37 @@ class _Described(pickle._Unpickler):  # in Python: it takes no memory in advance
         raise ValueError(f"names {module}.{name}")
 
     def persistent_load(self, pid: Any) -> None:  # noqa: ANN401 (whatever the file holds)
-        kind, storage, key, _, items = pid
+        _, storage, key, _, items = pid
+        if not (isinstance(storage, str) and isinstance(key, str) and isinstance(items, int)):
+            raise ValueError("an array that is none")  # noqa: TRY004 (what is nested may be without end to print)
         held = self._sizes.get(f"data/{key}")
-        if kind != "storage" or items < 0 or held != items * _SIZES[storage]:
+        if held != items * _SIZES[storage]:
             raise ValueError(f"array {key!r}: {items:,} items, {held} bytes")
+
+    def _set_items(self: Any) -> None:
+        items = self.pop_mark()
+        self._fill(items)
+
+    def _set_item(self: Any) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._fill([key, value])
+
+    def _fill(self: Any, items: list[Any]) -> None:
+        if not all(isinstance(key, str | int) for key in items[::2]):  # what is nested may be without end to hash
+            raise ValueError("a key that is neither a text nor a number")
+        self.stack[-1].update(zip(items[::2], items[1::2], strict=True))
+
+    dispatch: ClassVar[dict[int, Any]] = {
+        **pickle._Unpickler.dispatch,
+        pickle.SETITEM[0]: _set_item,
+        pickle.SETITEMS[0]: _set_items,
+    }
+    for each in (pickle.BYTEARRAY8, pickle.DICT, pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET):
+        del dispatch[each[0]]  # takes memory for a size that is only declared, or hashes whatever it is given
+
+
+def _ordered() -> OrderedDict[Any, Any]:
+    return OrderedDict()
 
 
 def _nothing(*_: Any) -> None:  # noqa: ANN401 (the arguments that make a tensor or the like)

@@ -49,9 +49,10 @@ class FolderSource:
         self._folder = folder.resolve().parent if single else folder
         check_links(folder)
         self.sweep = None if single else self._sweep()
-        self.names = [folder.resolve().name] if single else self._distinct(run_names(folder))
-        for run in self.names:
+        names = [folder.resolve().name] if single else run_names(folder)
+        for run in names:
             check_links(self._folder / run)
+        self.names = self._distinct(names)
 
     def _distinct(self, names: list[str]) -> list[str]:
         """The runs without a user's copies of them, which are no further runs; a warning names these."""
