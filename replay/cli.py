@@ -129,16 +129,16 @@ def _service(
     first, found = epochs.restore(core, joined.epoch)
     for line in filter(None, (aside, found)):
         console.event(line)
-    if joined.config.replay.journal:
+    settings, journal = joined.config.replay, None
+    if settings.journal != "off":
         number, told = recover(core, folder.journal, first, folder.run_id)
         for line in told:
             console.event(line)
+        sync, keep, accepted = settings.journal == "sync", settings.journal_keep, core.table.inserted
         try:
-            settings = joined.config.replay
-            accepted = core.table.inserted
-            journal = Journal(folder.journal, folder.run_id, number, keep=settings.journal_keep, accepted=accepted)
+            journal = Journal(folder.journal, folder.run_id, number, keep=keep, sync=sync, accepted=accepted)
         except OSError as error:
             raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
         core.recorder = journal
         epochs = ReplayEpochs(folder.path, folder.run_id, journal)
-    return ReplayService(node, core, epochs, confirmed=0.0)
+    return ReplayService(node, core, epochs, confirmed=0.0, synced=journal if settings.journal == "sync" else None)
