@@ -38,9 +38,8 @@ def main() -> None:
     if os.geteuid():
         sys.exit("acked: loop mounts need root")
     rng = random.Random(options.seed)
-    print(
-        "| journal | cuts | acknowledged | of them lost: median (most) | cuts that lost any |\n| --- | ---: | ---: | ---: | ---: |"
-    )
+    print("| journal | cuts | acknowledged | of them lost: median (most) | cuts that lost any |")
+    print("| --- | ---: | ---: | ---: | ---: |")
     found = {}
     for journal in ("sync", "async"):
         counts = []
@@ -64,6 +63,8 @@ def cut(journal: str, folder: Path, cuts: int, rng: random.Random) -> list[tuple
         done = threading.Event()
         writer = threading.Thread(target=lambda: [service.insert(0.2, save=False) for _ in iter(done.is_set, True)])
         writer.start()
+        while not service.acked:
+            time.sleep(0.1)
         for number in range(cuts):
             time.sleep(rng.uniform(0.1, 0.8))
             image, acked = folder / f"cut{number}.img", service.acked

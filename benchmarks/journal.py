@@ -1,4 +1,4 @@
-"""The cost of the journal: `python benchmarks/journal.py` inserts Atari segments without a journal, and with both kinds.
+"""The cost of the journal: `python benchmarks/journal.py` inserts Atari segments without one, and with both kinds.
 
 Real `coop-replay` processes on TCP, one inserting client with 100 segments in flight. The services take turns
 for a second each, so that the ratios hold on a busy machine. Prints transitions/s and the processor time that the

@@ -83,7 +83,7 @@ def parse(
 def _with_values(args: Sequence[str]) -> list[str]:
     """The command line, in which each flag of `_ALONE` has a value."""
     words: list[str] = []
-    for token, after in zip(args, (*args[1:], "--"), strict=True):
+    for token, after in zip(args, (*args[1:], "--"), strict=False):
         words.append(token)
         if token in _ALONE and after.startswith("-"):
             words.append(_ALONE[token])
