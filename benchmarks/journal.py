@@ -1,7 +1,7 @@
-"""The cost of the journal: `python benchmarks/journal.py` inserts Atari segments with and without a journal.
+"""The cost of the journal: `python benchmarks/journal.py` inserts Atari segments without one, and with both kinds.
 
-Real `coop-replay` processes on TCP, one inserting client with a window of 16 segments. Both services take turns
-for a second each, so that the ratio holds on a busy machine. Prints transitions/s and the processor time that the
+Real `coop-replay` processes on TCP, one inserting client with 100 segments in flight. The services take turns
+for a second each, so that the ratios hold on a busy machine. Prints transitions/s and the processor time that the
 service spent on them, which other load affects less. After each turn a checkpoint releases the journal's files.
 """
 
@@ -27,28 +27,29 @@ from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
 from coop.common.process.lifecycle import Stop
 from coop.common.process.memory import keep_freed_memory
 from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import validated
 from coop.learner.join_service import JoinService
 from coop.learner.roster import Roster
 from coop.learner.shared_checkpoints import SharedCheckpoints
 
-STEPS, WINDOW, CAPACITY = 64, 16, 5000
+STEPS, WINDOW, CAPACITY = 16, 100, 5000
+KINDS = ("off", "async", "sync")
 TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def settings(run: str, journal: str) -> RunConfig:
+    """Of a run that waits for no batches."""
+    replay = {"capacity": CAPACITY, "learning_starts": 1000, "tolerance": 1e12, "journal": journal}
+    return validated({"run": run, "total_steps": 10**12, "env": {"id": "breakout"}, "replay": replay})
 
 
 class Service:
     """A replay service and a client of it."""
 
-    def __init__(self, stack: ExitStack, journal: bool, folder: Path) -> None:
-        run = f"journal-{journal}".lower()
-        config = validated(
-            {
-                "run": run,
-                "total_steps": 10**12,
-                "env": {"id": "breakout"},
-                "replay": {"capacity": CAPACITY, "learning_starts": 1000, "tolerance": 1e12, "journal": journal},
-            }
-        )
+    def __init__(self, stack: ExitStack, journal: str, folder: Path) -> None:
+        run = f"journal-{journal}"
+        config = settings(run, journal)
         head, at = free_endpoint(), free_endpoint()
         learner = stack.enter_context(Node(open_session((head,)), run, "learner", new_incarnation()))
         JoinService(
@@ -71,9 +72,8 @@ class Service:
         self._client = InsertClient(self._node, Stop(), WINDOW)
         self._stream = (msgspec.structs.replace(segment, incarnation=incarnation) for segment in segments(ATARI, STEPS))
         self._checkpoint = 0
-        self.insert(1.0)
 
-    def insert(self, seconds: float) -> tuple[float, float]:
+    def insert(self, seconds: float, save: bool = True) -> tuple[float, float]:
         """Insert as fast as it goes: (transitions/s, the service's processor time in us per transition)."""
         before, begun, acked = self._processor_time(), time.monotonic(), self._client.acked
         while time.monotonic() < begun + seconds:
@@ -81,8 +81,14 @@ class Service:
         self._client.drain()
         done, took = self._client.acked - acked, time.monotonic() - begun
         figures = done / took, 1e6 * (self._processor_time() - before) / done
-        self._save()
+        if save:
+            self._save()
         return figures
+
+    @property
+    def acked(self) -> int:
+        """Transitions acknowledged so far."""
+        return self._client.acked
 
     def _processor_time(self) -> float:
         fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
@@ -115,19 +121,22 @@ def main() -> None:
     keep_freed_memory()
     rounds = []
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        services = [Service(stack, journal, Path(folder) / str(journal)) for journal in (False, True)]
+        services = [Service(stack, journal, Path(folder) / journal) for journal in KINDS]
+        for service in services:
+            service.insert(1.0)
         for number in range(options.rounds):
             order = services if number % 2 else services[::-1]
             taken = {id(service): service.insert(options.seconds) for service in order}
             rounds.append([taken[id(service)] for service in services])
     print(f"{options.rounds} rounds of {options.seconds:g} s, segments of {STEPS} steps: median (lowest to highest)")
-    for place, name in enumerate(("without", "with journal")):
+    for place, name in enumerate(KINDS):
         rates, costs = zip(*(turn[place] for turn in rounds), strict=True)
         print(f"{name:14}{shown(list(rates), '{:,.0f}'.format)} transitions/s", end=", ")
         print(f"{shown(list(costs), '{:.1f}'.format)} us of processor time each")
-    for what, index in (("transitions/s", 0), ("processor time", 1)):
-        ratios = [turn[1][index] / turn[0][index] for turn in rounds]
-        print(f"with / without, {what}: {shown(ratios, '{:.2f}'.format)}")
+    for one, other in ((1, 0), (2, 0), (2, 1)):
+        for what, index in (("transitions/s", 0), ("processor time", 1)):
+            ratios = [turn[one][index] / turn[other][index] for turn in rounds]
+            print(f"{KINDS[one]} / {KINDS[other]}, {what}: {shown(ratios, '{:.2f}'.format)}")
 
 
 if __name__ == "__main__":

@@ -129,16 +129,16 @@ def _service(
     first, found = checkpoints.restore(core, reply.checkpoint)
     for line in filter(None, (aside, found)):
         console.event(line)
-    if reply.config.replay.journal:
+    settings, journal = reply.config.replay, None
+    if settings.journal != "off":
         number, notices = recover(core, folder.journal, first, folder.run_id)
         for line in notices:
             console.event(line)
+        sync, keep, accepted = settings.journal == "sync", settings.journal_keep, core.table.inserted
         try:
-            settings = reply.config.replay
-            accepted = core.table.inserted
-            journal = Journal(folder.journal, folder.run_id, number, keep=settings.journal_keep, accepted=accepted)
+            journal = Journal(folder.journal, folder.run_id, number, keep=keep, sync=sync, accepted=accepted)
         except OSError as error:
             raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
         core.recorder = journal
         checkpoints = ReplayCheckpoints(folder.path, folder.run_id, journal)
-    return ReplayService(node, core, checkpoints, confirmed=0.0)
+    return ReplayService(node, core, checkpoints, confirmed=0.0, synced=journal if settings.journal == "sync" else None)

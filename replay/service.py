@@ -30,6 +30,7 @@ from coop.common.process.lifecycle import Stop
 from coop.replay.core import ReplayCore, Reply, RetryLater
 from coop.replay.gate import HOLD, Gate
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
+from coop.replay.persistence.journal import Journal
 
 LEAVING = "the replay service is stopping"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"
@@ -46,15 +47,22 @@ class ReplayService:
         checkpoints: writes the core's part of checkpoints; the core may have been restored from one.
         confirmed: the time on the monotonic clock until which this service may acknowledge and draw (default: for
             ever). Later another one may serve, which a process that was frozen or cut off cannot know.
+        synced: a journal that is flushed to the disk before an insert is acknowledged.
     """
 
     def __init__(
-        self, node: Node, core: ReplayCore, checkpoints: ReplayCheckpoints, confirmed: float = math.inf
+        self,
+        node: Node,
+        core: ReplayCore,
+        checkpoints: ReplayCheckpoints,
+        confirmed: float = math.inf,
+        synced: Journal | None = None,
     ) -> None:
         self._node = node
         self._core = core
         self._checkpoints = checkpoints
         self._confirmed = confirmed
+        self._synced = synced
         self._read_segment = SegmentReader(core.table.spec)
         self._changed = threading.Condition()
         self._inserts = Gate(time.monotonic())
@@ -67,7 +75,7 @@ class ReplayService:
     def start(self) -> None:
         """Begin to answer requests."""
         node = self._node
-        node.serve(replay_key(node, "insert"), self._insert)
+        node.serve(replay_key(node, "insert"), self._insert, self._flush if self._synced else None)
         node.serve(replay_key(node, "sample"), self._sample)
         node.serve(replay_key(node, "stats"), self._stats)
         node.serve(replay_key(node, "limits"), self._limits)
@@ -145,6 +153,16 @@ class ReplayService:
         if isinstance(outcome, RetryLater):
             return Retry(outcome.reason).encode(self._node.run)
         return Ack(outcome, self._window()).encode(self._node.run)
+
+    def _flush(self) -> bool:
+        """Flush the journal to the disk; a disk that fails once may have dropped what a later flush calls written."""
+        assert self._synced is not None
+        if not self._broken:
+            try:
+                self._synced.flush(self._changed)
+            except OSError as error:
+                self._broken = f"the journal can't be flushed to the disk: {error.strerror or error}"
+        return not self._broken
 
     def _window(self) -> int:
         """Segments that each actor may have in flight; behind a router, actors have no connections of their own."""

@@ -40,6 +40,22 @@ def test_presets_of_atari_games_differ_in_nothing_but_the_game(size: str) -> Non
 
 
 @pytest.mark.parametrize(
+    ("flags", "journal"),
+    [
+        ([], "off"),
+        (["--replay.journal"], "async"),
+        (["--replay.journal", "--seed", "3"], "async"),
+        (["--replay.journal", "sync"], "sync"),
+        (["--replay.journal=sync", "--replay.journal-keep"], "sync"),
+        (["--preset", "breakout", "--replay.journal", "off"], "off"),
+    ],
+)
+def test_the_journal_s_flag_needs_no_value(flags: list[str], journal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["coop-local", *flags])
+    assert parse_run(RunOptions, "coop-local", "").run_config().replay.journal == journal
+
+
+@pytest.mark.parametrize(
     ("flags", "words"),
     [
         (["--preset", "breakout", "--learner.batch-size", "60000"], "learner.batch_size = 60000: allowed: at most 75"),
@@ -148,6 +164,8 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
             ["--replay.sampling", "prioritized", "--replay.no-replacement"],
             ["replay.sampling = 'prioritized': allowed: 'uniform' with replay.replacement = False"],
         ),
+        (["--replay.journal", "disk"], ["--replay.journal disk: unknown", "off, async, sync"]),
+        (["--replay.journal-keep"], ["replay.journal_keep", "'async' or 'sync'"]),
         (["--replay.eviction", "lru"], ["replay.eviction = 'lru': unknown", "reservoir"]),
         (["stray"], ["stray", "unknown"]),
         (["--total-steps", "300", "--replay.learning-starts", "300"], ["total_steps", "300", "at least 301"]),

@@ -49,7 +49,7 @@ def test_each_command_line_is_accepted(overlay: str, monkeypatch: pytest.MonkeyP
     assert options["learner"].resume
     assert options["replay"].resume
     config = options["learner"].run_config()
-    assert (config.total_steps, config.replay.journal) == (50_000, True)
+    assert (config.total_steps, config.replay.journal) == (50_000, "async")
     assert options["replay"].connect[0] == f"{protocol}/learner:7447"
     assert options["learner"].listen == (f"{protocol}/0.0.0.0:7447",)
     for name, each in options.items():

@@ -1,5 +1,11 @@
 """The journal: what was acknowledged is there after a kill, torn ends are cut, a full disk loses nothing."""
 
+import errno
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +15,19 @@ from samples import make_segment
 from test_checkpoints import CONFIG, save
 
 from coop.common.errors import RunError
+from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.session import open_session
+from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
+from coop.common.process.console import Console
+from coop.common.process.lifecycle import Stop
 from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import Journal, journal_files
 from coop.replay.persistence.recovery import recover
+from coop.replay.service import ReplayService
 
 
 def _insert(core: ReplayCore, spec: EnvSpec, sequence: int) -> int | RetryLater:
@@ -126,3 +138,64 @@ def test_priorities_are_carried_out_again(spec: EnvSpec, tmp_path: Path) -> None
     twin = ReplayCore(config, spec)
     recover(twin, tmp_path, 1, 5)
     _assert_alike(core, twin)
+
+
+def test_no_insert_is_acknowledged_before_it_is_flushed(
+    spec: EnvSpec, tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed, gate = [], threading.Event()
+    real = os.fdatasync
+
+    def slow(file: int) -> None:
+        gate.wait(20)
+        real(file)
+        flushed.append(os.fstat(file).st_size)
+
+    monkeypatch.setattr(os, "fdatasync", slow)
+    with served(endpoint, spec, tmp_path) as (client, _):
+        pending = [client.begin(replay_key(client, "insert"), segment_bytes(spec, number)) for number in range(5)]
+        time.sleep(0.5)
+        assert [each.ready() for each in pending] == [None] * 5
+        gate.set()
+        assert [each.wait().kind for each in pending] == ["ack"] * 5
+    assert len(flushed) < 5  # one for all that wait
+    twin = ReplayCore(CONFIG, spec)
+    recover(twin, tmp_path / "journal", 1, 5)
+    assert twin.table.inserted == 20
+
+
+def test_a_disk_that_fails_once_ends_the_service_and_acknowledges_nothing(
+    spec: EnvSpec, tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(file: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with served(endpoint, spec, tmp_path) as (client, service):
+        monkeypatch.setattr(os, "fdatasync", fail)
+        with pytest.raises(NoAnswer):
+            client.ask(replay_key(client, "insert"), segment_bytes(spec, 0), timeout=1.0)
+        monkeypatch.undo()
+        with pytest.raises(NoAnswer):  # it is not trusted again
+            client.ask(replay_key(client, "insert"), segment_bytes(spec, 0), timeout=1.0)
+        stop = Stop()
+        service.run(stop, Console())
+        assert stop.failed
+        assert stop.reason == "the journal can't be flushed to the disk: Input/output error"
+
+
+@contextmanager
+def served(endpoint: str, spec: EnvSpec, folder: Path) -> Iterator[tuple[Node, ReplayService]]:
+    """A service with a journal that is flushed, and a client of it."""
+    journal = Journal(folder / "journal", 5, 1, keep=False, sync=True)
+    core = ReplayCore(CONFIG, spec, journal)
+    with (
+        Node(open_session((endpoint,)), "test", "replay", new_incarnation()) as node,
+        Node(open_session((), (endpoint,)), "test", "actor", new_incarnation()) as client,
+    ):
+        service = ReplayService(node, core, ReplayCheckpoints(folder, 5, journal), synced=journal)
+        service.start()
+        yield client, service
+
+
+def segment_bytes(spec: EnvSpec, sequence: int) -> bytearray:
+    return encode_segment("test", make_segment(spec, sequence, acked=0))

@@ -7,11 +7,12 @@ loop answers in its own thread; weights, role and status are `publish`ed and rea
 from __future__ import annotations
 
 import contextlib
+import queue
 import secrets
 import threading
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import zenoh
 
@@ -32,6 +33,10 @@ ASK_TIMEOUT = 5.0  # seconds
 MOST_REFUSALS = 8  # lines that say what is wrong with messages of one key
 LONGEST_REFUSAL = 200  # characters
 QUEUE = 1 << 14  # queries that wait for an answer: one more blocks Zenoh's thread, which receives everything else
+
+
+_Waiting: TypeAlias = "queue.SimpleQueue[tuple[Any, bytearray] | None]"
+"""Queries and their replies, which wait for a flush; None: there will be no more."""
 
 
 class NoAnswer(RunError):
@@ -122,37 +127,65 @@ class Node:
         """Send a query and wait for its answer; raises as `Pending.wait`."""
         return self.begin(key, payload, timeout).wait()
 
-    def serve(self, key: str, answer: Callable[[Message], bytearray]) -> None:
+    def serve(self, key: str, answer: Callable[[Message], bytearray], flush: Callable[[], bool] | None = None) -> None:
         """Answer the queries on `key`, one after another, in a new thread, until the session closes.
+
+        flush: called in another thread before replies leave, once for all that wait then; they do if it returns True.
 
         A message that cannot be decoded, names another run, or makes `answer` raise BadMessage gets an error reply, is
         counted, and changes nothing. Any other CoopError of `answer` also becomes an error reply, and so does any
         other exception, which is a bug and is noted in `faults`.
         """
         queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(QUEUE), complete=True)
-        thread = threading.Thread(target=self._serve, args=(queryable, key, answer), name=f"serve {key}", daemon=True)
+        waiting: _Waiting | None = None
+        if flush is not None:
+            waiting = queue.SimpleQueue()
+            self._start(f"flush {key}", self._reply_flushed, waiting, key, flush)
+        self._start(f"serve {key}", self._serve, queryable, key, answer, waiting)
+
+    def _start(self, name: str, target: Callable[..., None], *args: Any) -> None:  # noqa: ANN401
+        thread = threading.Thread(target=target, args=args, name=name, daemon=True)
         self._threads.append(thread)
         thread.start()
 
-    def _serve(self, queryable: Any, key: str, answer: Callable[[Message], bytearray]) -> None:  # noqa: ANN401
+    def _serve(
+        self,
+        queryable: Any,  # noqa: ANN401 (zenoh's have no public name)
+        key: str,
+        answer: Callable[[Message], bytearray],
+        waiting: _Waiting | None,
+    ) -> None:
         while not self._closing:
             try:
                 query = queryable.recv()
-            except zenoh.ZError:
-                return  # the session was closed
-            with query:
-                try:
-                    reply = answer(self.read(query.payload))
-                except Exception as error:
-                    if isinstance(error, BadMessage):
-                        self.count_bad(key, error)
-                    elif not isinstance(error, CoopError):
-                        self.faults.note(f"serving {key}", error)
-                    with contextlib.suppress(zenoh.ZError):
-                        query.reply_err(Error.of(error).encode(self.run))
-                    continue
-                with contextlib.suppress(zenoh.ZError):  # the asker may be gone; otherwise it asks again
-                    query.reply(key, reply)
+            except zenoh.ZError:  # the session was closed
+                break
+            try:
+                answered = answer(self.read(query.payload))
+            except Exception as error:
+                if isinstance(error, BadMessage):
+                    self.count_bad(key, error)
+                elif not isinstance(error, CoopError):
+                    self.faults.note(f"serving {key}", error)
+                with query, contextlib.suppress(zenoh.ZError):
+                    query.reply_err(Error.of(error).encode(self.run))
+            else:
+                if waiting is None:
+                    _reply(key, query, answered)
+                else:
+                    waiting.put((query, answered))
+        if waiting is not None:
+            waiting.put(None)
+
+    def _reply_flushed(self, waiting: _Waiting, key: str, flush: Callable[[], bool]) -> None:
+        """Send replies once `flush` has returned that was called after they were made."""
+        while (first := waiting.get()) is not None:
+            group = [first]
+            while not waiting.empty() and (another := waiting.get()) is not None:
+                group.append(another)
+            if flush():
+                for query, answered in group:
+                    _reply(key, query, answered)
 
     def read(self, payload: zenoh.ZBytes | None) -> Message:
         """Decode a payload of this run; raises BadMessage."""
@@ -236,6 +269,11 @@ class Latest:
         except BadMessage as error:
             self._node.count_bad(str(sample.key_expr), error)
             return None
+
+
+def _reply(key: str, query: Any, answered: bytearray) -> None:  # noqa: ANN401 (zenoh's query)
+    with query, contextlib.suppress(zenoh.ZError):  # the asker may be gone; otherwise it asks again
+        query.reply(key, answered)
 
 
 def _answer(reply: zenoh.Reply) -> Message:

@@ -222,6 +222,7 @@ def _width() -> int:
 
 
 PACKAGE = "coop-rl"
+_ALONE = {"--replay.journal": "async"}  # what flags mean that are given without a value
 ANSWERS = ("--help", "--help-all", "--version", "--completion")
 
 T = TypeVar("T")
@@ -259,7 +260,7 @@ def parse(
         UsageError: an unknown flag or a value of the wrong type.
         ProcessExit: the flags asked for help, the version or a completion script; it has been printed.
     """
-    args = sys.argv[1:] if args is None else args
+    args = _with_values(sys.argv[1:] if args is None else args)
     asked = {token.partition("=")[0].replace("_", "-") for token in args}
     if "--help-all" in asked:
         _answer(full_help(program, description, sections(kind, default)))
@@ -277,6 +278,16 @@ def parse(
         if default is None:
             return _with_absolute_paths(tyro.cli(kind, prog=program, args=args, add_help=False))
         return _with_absolute_paths(tyro.cli(kind, prog=program, args=args, add_help=False, default=default))
+
+
+def _with_values(args: Sequence[str]) -> list[str]:
+    """The command line, in which each flag of `_ALONE` has a value."""
+    words: list[str] = []
+    for token, after in zip(args, (*args[1:], "--"), strict=False):
+        words.append(token)
+        if token in _ALONE and after.startswith("-"):
+            words.append(_ALONE[token])
+    return words
 
 
 def given_flags(args: Sequence[str]) -> set[str]:

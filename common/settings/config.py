@@ -163,9 +163,10 @@ class ReplaySettings:
     """alpha of prioritized sampling; 0 draws uniformly."""
     importance_exponent: Share = 0.4
     """beta of the importance-sampling weights; 0 corrects nothing, 1 corrects fully."""
-    journal: bool = False
-    """Write each accepted segment and each draw to a file before answering, so that the kill of a process loses none;
-    the death of the machine may lose those since the newest checkpoint."""
+    journal: Literal["off", "async", "sync"] = "off"
+    """Write each accepted segment and each draw to a file before answering, so that the kill of a process loses none.
+    async (the flag alone): the death of the machine may lose those since the newest checkpoint; sync: none, since
+    segments are on the disk before they are acknowledged."""
     journal_keep: bool = False
     """Keep journal files that a checkpoint has made redundant: the run can then be re-executed from its beginning."""
 

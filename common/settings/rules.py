@@ -53,8 +53,8 @@ def _replay_problems(config: RunConfig) -> Iterator[str]:
     if not replay.replacement and not SAMPLERS.get(replay.sampling).without_replacement:
         able = ", ".join(repr(name) for name in SAMPLERS.names() if SAMPLERS.get(name).without_replacement)
         yield f"replay.sampling = {replay.sampling!r}: allowed: {able} with replay.replacement = False"
-    if replay.journal_keep and not replay.journal:
-        yield "replay.journal_keep = True: needs replay.journal = True"
+    if replay.journal_keep and replay.journal == "off":
+        yield "replay.journal_keep = True: needs replay.journal = 'async' or 'sync'"
     if replay.prioritized and learner.batch_size * learner.prefetch > MAX_PRIORITIES:
         most = MAX_PRIORITIES // learner.prefetch
         yield (
