@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.messaging.messages.sample import Drawn
 from coop.common.errors import UsageError
+from coop.common.messaging.messages.sample import Drawn
 from coop.common.metrics import COLUMNS
 from coop.common.numbers import RETURN_WINDOW
 from coop.common.types import Array, Batch
@@ -91,7 +91,9 @@ class Telemetry:
         """The columns of the method's rule; raises UsageError for names of other columns."""
         own = {name: float(value) for name, value in agent.rule.metrics().items()}
         if taken := own.keys() & COLUMNS:
-            raise UsageError(f"method = {agent.config.method!r}: its metrics can't be called {min(taken)!r}, as others are")
+            raise UsageError(
+                f"method = {agent.config.method!r}: its metrics can't be called {min(taken)!r}, as others are"
+            )
         return own
 
     def q_bound(self, agent: AnyAgent) -> float | None:

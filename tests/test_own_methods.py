@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from commands import run
+from commands import run_command
 from test_agent import SPEC, batches
 
 import coop
@@ -83,7 +83,8 @@ def test_munchausen_by_the_paper_s_formula() -> None:
     q = torch.from_numpy(values(agent, batch)).double()
     log, log_next = (0.5 * torch.log_softmax(q[1, when] / 0.5, 1) for when in (0, 1))
     taken = log.numpy()[np.arange(32), batch.actions]
-    assert (taken < -0.4).any() and (taken > -0.4).any()
+    assert (taken < -0.4).any()
+    assert (taken > -0.4).any()
     soft = ((log_next / 0.5).exp() * (q[1, 1] - log_next)).sum(1).numpy()
     targets = batch.rewards + 0.8 * taken.clip(-0.4, 0) + discounts(batch) * soft
     expected = q[0, 0].numpy()[np.arange(32), batch.actions] - targets
@@ -179,7 +180,12 @@ class Counting(UpdateRule):
 
 
 def test_a_method_s_metrics_are_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flags: dict[str, Any] = {"method": f"{__name__}:Counting", "total_steps": 330, "network": {"hidden": [8]}, "log": "none"}
+    flags: dict[str, Any] = {
+        "method": f"{__name__}:Counting",
+        "total_steps": 330,
+        "network": {"hidden": [8]},
+        "log": "none",
+    }
     coop.train(run_dir=tmp_path / "a", **flags).wait()
     assert coop.load(tmp_path / "a").metrics["mine"].tolist() == [7.0]
     monkeypatch.setattr(Counting, "name", "loss")
@@ -206,7 +212,9 @@ def test_a_role_imports_only_what_its_user_permits(monkeypatch: pytest.MonkeyPat
     with pytest.raises(JoinError, match="method = 'minto:MAXMIN': this process may not import 'minto'"):
         Joined.decode(wire.decode(answer))
     permit(["minto"])
-    with pytest.raises(JoinError, match=r"replay.eviction = 'best_returns:BestReturns': .* --allow-import best_returns"):
+    with pytest.raises(
+        JoinError, match=r"replay.eviction = 'best_returns:BestReturns': .* --allow-import best_returns"
+    ):
         Joined.decode(wire.decode(answer))
     permit(["best_returns"])
     assert Joined.decode(wire.decode(answer)).config == config
@@ -215,8 +223,11 @@ def test_a_role_imports_only_what_its_user_permits(monkeypatch: pytest.MonkeyPat
 def test_a_topology_with_a_method_and_a_policy_of_one_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
     flags = ("--method", "minto:MAXMIN", "--replay.eviction", "best_returns:BestReturns", "--replay.capacity", "50")
-    done = run("coop-local", *flags, "--total-steps", "400", "--run-dir", str(tmp_path / "a"), timeout=240)
+    done = run_command("coop-local", *flags, "--total-steps", "400", "--run-dir", tmp_path / "a", timeout=240)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "settings: preset cartpole; method: minto:MAXMIN; gamma: 0.95; replay: capacity 50, eviction best_ret" in done.stdout
+    assert (
+        "settings: preset cartpole; method: minto:MAXMIN; gamma: 0.95; replay: capacity 50, eviction best_ret"
+        in done.stdout
+    )
     assert coop.load(tmp_path / "a").summary["exit"] == "complete"  # type: ignore[index]
     assert coop.load(tmp_path / "a").policy().spec == SPEC

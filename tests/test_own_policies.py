@@ -1,4 +1,4 @@
-"""Policies of eviction and sampling that see observations, actions, rewards, episodes and what comes, and may refuse it."""
+"""Policies of eviction and sampling that see observations, rewards, episodes and what comes, and may refuse it."""
 
 from __future__ import annotations
 
@@ -61,7 +61,11 @@ def test_what_a_policy_sees_and_refuses() -> None:
     view, rows = SEEN["table"], np.arange(2)
     assert view.observations(rows)[:, 0].tolist() == [0, 2]
     assert view.next_observations(rows)[:, 0].tolist() == [1, 3]
-    assert (view.rewards[:2].tolist(), view.actions[:2].tolist(), view.episodes[:2].tolist()) == ([0, 2], [0, 2], [0, 1])
+    assert (view.rewards[:2].tolist(), view.actions[:2].tolist(), view.episodes[:2].tolist()) == (
+        [0, 2],
+        [0, 2],
+        [0, 1],
+    )
     table.insert(make_segment(SPEC, 1, 4, episodes=()))
     assert SEEN["episodes"].tolist() == [2, 2, 2, 2], "an episode goes on from segment to segment"
     table.insert(make_segment(SPEC, 0, 4, incarnation=8, episodes=ends(3)))
@@ -103,7 +107,7 @@ def test_a_restored_table_goes_on_as_the_saved_one() -> None:
     ("rows", "kept", "words"),
     [
         ([0, 0], slice(0, 2), "a row twice"),
-        ([0, 2], slice(0, 2), "row 2, with 0 in use"),
+        ([0, 2], slice(0, 2), r"rows \[0, 2\] with 0 in use"),
         ([0], slice(0, 2), "1 rows for 2 transitions"),
         ([0, 6], slice(0, 2), "rows from 0 to 6, must be from 0 to 5"),
         ([-1, 0], slice(0, 2), "rows from -1 to 0"),
@@ -144,7 +148,7 @@ def test_best_returns_keeps_the_best_episodes() -> None:
 
 
 def test_coverage_keeps_rare_observations() -> None:
-    """Of 40 transitions near one point and one at another, a table of ten keeps the one, and refuses most of the rest."""
+    """Of 40 transitions near one point and one at another, a table of ten keeps the one, and refuses the rest."""
     from hashed_coverage import Coverage  # noqa: PLC0415
 
     table = table_of(Coverage, 10)

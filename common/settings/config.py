@@ -25,7 +25,17 @@ from coop.common.bounds import (
 from coop.common.errors import UsageError
 from coop.common.process.untrusted import RUN
 from coop.common.settings.environment import EnvSettings
-from coop.common.settings.fields import NONE, Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
+from coop.common.settings.fields import (
+    NONE,
+    Count,
+    Decay,
+    NonNegative,
+    Positive,
+    PositiveFloat,
+    PositiveShare,
+    Share,
+    Steps,
+)
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import EvictionName, MethodName, SamplingName
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
@@ -195,7 +205,7 @@ class ActorSettings:
     epsilon_decay: Literal["exponential", "linear"] = "linear"
     """Shape of the decay of epsilon."""
     epsilon_steps: Steps = 5000
-    """Environment steps: time constant of the exponential decay, or length of the linear one; default: total_steps / 10."""
+    """Steps: time constant of the exponential decay, length of the linear one; default: total_steps / 10."""
     segment_steps: Annotated[int, Field(gt=0, le=MAX_SEGMENT_STEPS)] = 16
     """Steps of one emulator that are sent together."""
     window: Annotated[int, Field(gt=0, le=MAX_GAPS)] = 2

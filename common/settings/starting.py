@@ -1,4 +1,4 @@
-"""What a run starts from: a preset, that of its environment, or neutral settings; and what its settings are, in a line."""
+"""What a run starts from: a preset, that of its environment, or neutral settings; and its settings in a line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def starting_tables(env_id: str | None) -> dict[str, Any]:
     """The settings of a run that names neither a preset nor a file.
 
     They are those of the preset of its environment (None: CartPole-v0); of another ALE game, those that the presets of
-    Atari games share; of any other environment none, so the neutral defaults hold (`coop.common.settings.tables.resolve`).
+    Atari games share; of any other environment none, so the neutral defaults hold (`tables.resolve`).
     """
     env = EnvSettings() if env_id is None else EnvSettings(env_id)
     preset = preset_of(env.id)
@@ -47,7 +47,9 @@ def source_of(preset: str | None, file: object | None, resumed: bool, env_id: st
 def settings_line(config: RunConfig, source: str) -> str:
     """The settings that matter most, in one line; source: see `source_of`."""
     replay, network = config.replay, config.network
-    table = f"capacity {replay.capacity:,}, eviction {replay.eviction}, sampling {replay.sampling}, ratio {replay.ratio:g}"
+    table = (
+        f"capacity {replay.capacity:,}, eviction {replay.eviction}, sampling {replay.sampling}, ratio {replay.ratio:g}"
+    )
     parts = {
         "settings": source,
         "method": config.method,

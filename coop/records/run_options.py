@@ -153,8 +153,10 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     parsed = fitted(parsed, given, lockstep=lockstep)
     options: OptionsT = replace(parsed, own=getattr(parsed, table_of(parsed.method), None))
     permit([*options.allow_import, *(value for name, value in options.imports.items() if name in given)])
-    if "learner.swap_every" in given and not options.two_networks and not (
-        options.learner.target_update_every or options.soft_targets
+    if (
+        "learner.swap_every" in given
+        and not options.two_networks
+        and not (options.learner.target_update_every or options.soft_targets)
     ):
         warn(f"--learner.swap-every: of {options.method}, the flag is --learner.target-update-every")
     for line in without_effect(options, given, lockstep=lockstep):

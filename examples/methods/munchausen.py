@@ -34,4 +34,6 @@ class Munchausen(UpdateRule):
         return step.rewards + own.alpha * taken.clip(own.low, 0) + step.discounts * soft_next
 
 
-MUNCHAUSEN = coop.Method("munchausen", "DQN with a share of the log-policy", rule=Munchausen, settings=MunchausenSettings)
+MUNCHAUSEN = coop.Method(
+    "munchausen", "DQN with a share of the log-policy", rule=Munchausen, settings=MunchausenSettings
+)

@@ -106,7 +106,10 @@ class Step:
 
 
 def slope_of(cost: Callable[[Step, Tensor], Tensor], step: Step, values: Any) -> Tensor:  # noqa: ANN401
-    """The gradient of a cost of the Q-values at obs, float32 [batch, actions], by autograd; values: those, of any library."""
+    """The gradient of a cost of the Q-values at obs, by autograd: float32 [batch, actions].
+
+    values: the Q-values, of either library.
+    """
     with torch.inference_mode(mode=False), torch.enable_grad():
         q = _outside_inference(values).requires_grad_()
         (slope,) = torch.autograd.grad(cost(step.in_tensors(), q), q)
@@ -115,8 +118,10 @@ def slope_of(cost: Callable[[Step, Tensor], Tensor], step: Step, values: Any) ->
 
 def to_host(values: Any) -> Any:  # noqa: ANN401
     """An array of either library as numpy's."""
-    return as_float32(values).cpu().numpy() if isinstance(values, Tensor) and values.is_floating_point() else (
-        values.cpu().numpy() if isinstance(values, Tensor) else values
+    return (
+        as_float32(values).cpu().numpy()
+        if isinstance(values, Tensor) and values.is_floating_point()
+        else (values.cpu().numpy() if isinstance(values, Tensor) else values)
     )
 
 

@@ -100,7 +100,7 @@ class Incoming:
         return self._segment.frames[self._segment.next_index].reshape(self._shape)
 
 
-class Eviction(ABC):
+class Eviction:
     """Assigns every new transition a row of the table, or none; defines `place`, or `admit` to see the transitions.
 
     Rows 0..capacity-1 are first filled in order, so a table holds `table.size` transitions in its lowest rows; of a
@@ -128,7 +128,7 @@ class Eviction(ABC):
         """Assign rows to transitions that it sees, or refuse them; returns as `place`."""
         return self.place(incoming.first, incoming.count)
 
-    def prioritise(self, rows: Rows) -> None:  # noqa: B027 (most policies need nothing)
+    def prioritise(self, rows: Rows) -> None:
         """Note that ids or priorities of these rows have changed; called if a policy of the table uses priorities."""
 
 
@@ -179,7 +179,7 @@ def check_placed(placed: tuple[Rows, slice | Rows], steps: int, size: int, capac
     elif len(np.unique(rows)) < len(rows):
         problem = "a row twice"
     elif not np.array_equal(fresh, np.arange(size, size + len(fresh))):
-        problem = f"row {fresh[0]}, with {size} in use: unused rows are filled in order"
+        problem = f"rows {fresh.tolist()} with {size} in use: unused rows are filled in order"
     else:
         return
     raise UsageError(f"replay.eviction = {policy!r}: gives {problem}")

@@ -95,6 +95,12 @@ class Study:
         return [method for method in self.methods if METHODS.get(method).stream is None]
 
     @property
+    def eviction(self) -> str:
+        """By which policies the buffers of the runs evict, as a sentence; empty if no run has a buffer."""
+        found = sorted({run.config.replay.eviction for run in self.runs if not run.config.streaming})
+        return f"Eviction: {', '.join(found)}." if found else ""
+
+    @property
     def environments(self) -> list[str]:
         """The environments of the runs."""
         return sorted({run.config.env.id for run in self.runs})

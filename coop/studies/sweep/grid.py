@@ -25,7 +25,7 @@ from coop.common.settings.fields import Count, Positive
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
-from coop.common.settings.starting import stated, starting_tables
+from coop.common.settings.starting import starting_tables, stated
 from coop.common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
 from coop.common.suggestions import closest, refusal
 
@@ -42,7 +42,7 @@ class GridFile:
     title: str = ""
     """The grid's question, in one line."""
     preset: str = ""
-    """Preset from which every cell starts; that of each cell's environment if empty, neutral settings if it has none."""
+    """Preset from which every cell starts; that of its environment if empty, neutral settings if it has none."""
     mode: Literal["lockstep", "distributed"] = "lockstep"
     """Whether a cell is a run of coop-lockstep or of coop-local."""
     actors: Positive = 1
