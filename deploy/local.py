@@ -178,7 +178,7 @@ def _run() -> None:
         with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
             # Before anything is written; what the roles find, they find by the same code.
             _, told = options.start.prepare(directory, replay=not options.restart, settings=settings_digest(config))
-            for line in (options.settings, *told):
+            for line in (*told, options.settings):
                 say(line)
             lock.sign()
             _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)

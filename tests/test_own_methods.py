@@ -169,7 +169,7 @@ def test_a_method_may_move_its_target_network_and_sees_the_step() -> None:
     agent.rule = Half(agent.config, np.random.default_rng(0))
     before = agent.networks[1].snapshot()
     agent.update(batches(1)[0])
-    np.testing.assert_allclose(agent.networks[1].snapshot(), (before + agent.networks[0].snapshot()) / 2, rtol=1e-6)
+    np.testing.assert_allclose(agent.networks[1].snapshot(), (before + agent.networks[0].snapshot()) / 2, rtol=1e-5)
 
 
 class Counting(UpdateRule):
@@ -220,10 +220,11 @@ def test_a_role_imports_only_what_its_user_permits(monkeypatch: pytest.MonkeyPat
     assert Joined.decode(wire.decode(answer)).config == config
 
 
+@pytest.mark.timeout(600)
 def test_a_topology_with_a_method_and_a_policy_of_one_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
     flags = ("--method", "minto:MAXMIN", "--replay.eviction", "best_returns:BestReturns", "--replay.capacity", "50")
-    done = run_command("coop-local", *flags, "--total-steps", "400", "--run-dir", tmp_path / "a", timeout=240)
+    done = run_command("coop-local", *flags, "--total-steps", "300", "--run-dir", tmp_path / "a", timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (
         "settings: preset cartpole; method: minto:MAXMIN; gamma: 0.95; replay: capacity 50, eviction best_ret"
