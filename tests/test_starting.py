@@ -85,9 +85,13 @@ def test_none_is_written_and_read(monkeypatch: pytest.MonkeyPatch) -> None:
     for path, name in (("learner", "target_update_every"), ("learner", "tau"), ("env", "resize")):
         assert getattr(getattr(resolve({path: {name: "None"}}), path), name) is None
     assert resolve({"target_return": "None"}).target_return is None
-    own = {"learner": {"reward_bound": 1.0}, "methods": {"dqn": {"learner": {"reward_bound": "None"}}}}
-    again = resolve(to_tables(resolve(own, "coop")), "dqn")
-    assert again.learner.reward_bound is None, "also behind a resolved config"
+    unset = {"learner": {"reward_bound": 1.0}, "methods": {"dqn": {"learner": {"reward_bound": "None"}}}}
+    bounded = {"methods": {"coop": {"learner": {"reward_bound": 1.0}}}}
+    for tables in (unset, bounded):
+        of_coop = resolve(tables, "coop")
+        assert of_coop.learner.reward_bound == 1
+        again = resolve(to_tables(of_coop), "dqn")
+        assert again.learner.reward_bound is None, "also behind a resolved config"
 
 
 def test_grids_without_a_preset(tmp_path: Path) -> None:
