@@ -19,8 +19,6 @@ class ActorOptions(RoleOptions, HealthOptions):
     """client: --connect names a router, and this process has no other link."""
     envs: int | None = None
     """Emulators in this process; the run's actor.num_envs if not given."""
-    allow_import: tuple[str, ...] = ()
-    """Modules, such as my_envs, that this process may import if the run's environment or network is theirs."""
 
 
 def main() -> None:

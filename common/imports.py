@@ -171,6 +171,11 @@ def check_allowed(path: str, allowed: Collection[str], field: str) -> None:
         )
 
 
+def check_permitted(path: str, field: str) -> None:
+    """As `check_allowed`, of the modules that this process's user has permitted so far."""
+    check_allowed(path, _named, field)
+
+
 def describe(error: BaseException) -> str:
     """An exception of a user's code in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")

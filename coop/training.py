@@ -19,10 +19,11 @@ from coop.common.process.console import say
 from coop.common.process.files import make_folder
 from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import ChildProcess, command
-from coop.common.settings.config import RunConfig, check_distributed
+from coop.common.settings.config import MAY_NAME_MODULES, RunConfig, check_distributed
 from coop.common.settings.effects import without_effect
 from coop.common.settings.overrides import leaves, merged
 from coop.common.settings.resuming import settings_digest
+from coop.common.settings.starting import stated
 from coop.common.settings.tables import to_tables, to_toml, validated
 from coop.lockstep.run import LockstepRun
 from coop.records.locks import RunLock
@@ -151,7 +152,8 @@ def train(
     """Start a run and return at once.
 
     Args:
-        preset: settings that come with the package; "cartpole" if neither it nor `config` is given.
+        preset: settings that come with the package; that of the environment if neither it nor `config` is given,
+            neutral ones if it has none.
         method: the training method.
         config: a TOML file with the fields of a run, in place of a preset.
         run_dir: folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given.
@@ -171,12 +173,15 @@ def train(
         UsageError: a setting is invalid, `run_dir` holds a run already, or one that can't be resumed.
         RunError: `run_dir` is in use.
     """
-    named, names = [*allow_import, *_named(settings)], chosen_sinks(log)
+    named, names = [*allow_import, *_named({"method": method, **settings})], chosen_sinks(log)
     permit(named)
-    options = _options(preset, method, config, run_dir, Start(resume, resume_from, overwrite), settings)
+    given = stated(settings)
+    start = Start(resume, resume_from, overwrite)
+    options = _options(preset, method, config, run_dir, start, settings, given, lockstep=not distributed)
     run_config = options.run_config()
-    for line in without_effect(run_config, {".".join(path) for path, _ in leaves(settings)}, lockstep=not distributed):
+    for line in without_effect(run_config, given, lockstep=not distributed):
         warnings.warn(line, stacklevel=2)
+    say(options.settings)
     if not distributed:
         if actors != 1:
             raise UsageError(f"actors = {actors}: in distributed runs only; a lockstep run is one process")
@@ -199,22 +204,28 @@ def _options(
     run_dir: str | Path | None,
     start: Start,
     settings: Mapping[str, Any],
+    given: Collection[str],
+    *,
+    lockstep: bool,
 ) -> RunOptions:
     """The options that the same flags give on a command line."""
     if preset is not None and file is not None:
         raise UsageError("preset and config: give one of them")
     directory = None if run_dir is None else absolute(run_dir, "run_dir")
-    steps = settings.get("total_steps")
+    steps, env = settings.get("total_steps"), settings.get("env")
+    env_id = env.get("id") if isinstance(env, Mapping) else None
+    path = None if file is None else absolute(file, "config")
     base = chosen_config(
         preset,
-        None if file is None else absolute(file, "config"),
+        path,
         method,
         steps if isinstance(steps, int) else None,
         directory if start.goes_on else None,
+        env_id if isinstance(env_id, str) else None,
     )
-    chosen = validated(merged(to_tables(base), settings))
+    chosen = validated(merged(to_tables(base), settings), given, lockstep=lockstep)
     values = {field.name: getattr(chosen, field.name) for field in fields(RunConfig)}
-    return RunOptions(**values, run_dir=directory, **asdict(start))
+    return RunOptions(**values, preset=preset, config=path, run_dir=directory, **asdict(start))
 
 
 def _play(run: LockstepRun, stop: Stop) -> None:
@@ -247,8 +258,7 @@ class _Topology:
 
 def _named(settings: Mapping[str, Any]) -> list[str]:
     """The modules that the settings of a call name."""
-    tables = ((settings.get("env"), "id"), (settings.get("network"), "kind"))
-    values = [table.get(name) for table, name in tables if isinstance(table, Mapping)]
+    values = [value for path, value in leaves(settings) if ".".join(path) in MAY_NAME_MODULES]
     return [value.partition(":")[0] for value in values if isinstance(value, str) and ":" in value]
 
 

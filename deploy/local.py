@@ -70,10 +70,10 @@ class Topology:
         modules = [path.partition(":")[0] for path in config.imports.values()]
         learning += ["--allow-import", *modules] if modules else []
         learning += [f"--prometheus={options.prometheus}"] if options.prometheus else []
-        serving = [*joining, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}", "--resume"]
         self.learner = ChildProcess("learner", command("coop-learner", *learning), logs / "learner.log", locks)
-        self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]
         playing = [*joining, "--allow-import", *modules] if modules else joining
+        serving = [*playing, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}", "--resume"]
+        self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]
         self._others += [
             ChildProcess(f"actor process {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")
             for number in range(1, options.actors + 1)
@@ -178,7 +178,7 @@ def _run() -> None:
         with RunLock(directory, "coop-local", ("learner", "replay")) as lock:
             # Before anything is written; what the roles find, they find by the same code.
             _, notices = options.start.prepare(directory, replay=not options.restart, settings=settings_digest(config))
-            for line in notices:
+            for line in (*notices, options.settings):
                 say(line)
             lock.sign()
             _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)

@@ -33,11 +33,12 @@ from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.types import Array, Batch, EnvSpec
-from coop.learner.edl.arrays import convert_like
+from coop.learner.edl.arrays import chosen, convert_like
 from coop.learner.edl.branches import Branches
 from coop.learner.given import Given
 from coop.learner.losses import LOSSES, Values, output_error, td_errors
-from coop.learner.methods.rule import UpdateRule
+from coop.learner.methods.rule import AUTOGRAD, UpdateRule
+from coop.learner.methods.step import Step, slope_of, to_host
 from coop.learner.optimizers import make_optimizer
 from coop.learner.qnetwork import as_float32, make_q_network, on_host
 from coop.learner.recorded import Capture, Late, Recorded, cuda_graph
@@ -93,6 +94,7 @@ class Agent:
         self.loss = LOSSES[config.learner.loss]
         self.acting = 0
         self.updates = 0
+        self._tau = config.soft_targets
         self.versions = [0, 0]
         self._noise = np.random.default_rng([config.seed, 2])
         self._networks = [make_q_network(config, spec, number, self.device, self._noise) for number in (0, 1)]
@@ -125,7 +127,7 @@ class Agent:
                 errors = self._led(batch, s, rate)
         return Update(errors, s, swapped=self._count())
 
-    def _learn(self, acting: int, given: Given) -> Any:  # noqa: ANN401
+    def _learn(self, acting: int, given: Given, batch: Batch | None = None) -> Any:  # noqa: ANN401
         """Train the acting network with a batch; returns the TD errors before that, float32 [batch].
 
         It stays with one array library on one device, and no value decides what it does.
@@ -141,18 +143,68 @@ class Agent:
             tape = online.forward(inputs if settings.double else inputs[:size])
             values = as_float32(tape.output)
             branches.join()
-            bootstrap = self._bootstrap(next_values, values[size:] if settings.double else next_values)
-            errors = td_errors(given.columns, values[:size], bootstrap, settings.value_bound)
+            step = None
+            if self.rule.hooks:
+                step = self._step(acting, given, batch, inputs)
+                step.know(q=values[:size], target_q_next=next_values)
+                if settings.double:
+                    step.know(q_next=values[size:])
+            if step is not None and "targets" in self.rule.hooks:
+                errors = self._own_errors(step, given, values[:size])
+            else:
+                bootstrap = self._bootstrap(next_values, values[size:] if settings.double else next_values)
+                errors = td_errors(given.columns, values[:size], bootstrap, settings.value_bound)
             error = output_error(given.columns, self.loss.slope(errors), next_values)
+            if step is not None and self.rule.hooks & AUTOGRAD:
+                error = self._own_error(step, given, errors, error, values[:size])
             online.backward(tape.head(size), error, given.s)
-            self.rule.add_cost(online, target, inputs, self.updates)
+            if step is not None:
+                self.rule.add_gradient(step)
             if self._weight_decay is not None:
                 online.decay(self._weight_decay)
             self.optimizers[acting].step(given.rate)
             online.changed()
-            self.rule.after_update(online, target)
+            if step is not None:
+                self.rule.after_update(step)
             first = errors if first is None else first
+        if self._tau is not None:
+            target.follow(online, self._tau)
         return first
+
+    def _step(self, acting: int, given: Given, batch: Batch | None, inputs: Any = None) -> Step:  # noqa: ANN401
+        """What the rule sees of an update."""
+        give = (lambda values: values) if self.rule.on_device else to_host
+        return Step(self._networks[acting], self._networks[1 - acting], given, batch, self.updates, give, inputs)
+
+    def _own_errors(self, step: Step, given: Given, values: Any) -> Any:  # noqa: ANN401
+        """The TD errors towards the rule's own targets, float32 [batch], in the arrays of `values`."""
+        step.targets = self.rule.targets(step)
+        shape = tuple(getattr(step.targets, "shape", ()))
+        if shape != (len(values),):
+            raise UsageError(f"method = {self.config.method!r}: targets of shape {shape}, must be ({len(values)},)")
+        return chosen(values, given.columns.actions) - convert_like(step.targets, values)
+
+    def _own_error(self, step: Step, given: Given, errors: Any, error: Any, values: Any) -> Any:  # noqa: ANN401
+        """The gradient of the rule's own loss, or of the loss and its extra cost, at the outputs."""
+        hooks = self.rule.hooks
+        if step.targets is None:
+            step.targets = chosen(values, given.columns.actions) - errors
+        if "loss" in hooks:
+            error = convert_like(slope_of(self.rule.loss, step, values), values)
+        if "extra_cost" in hooks:
+            error = error + convert_like(slope_of(self.rule.extra_cost, step, values), values)
+        return error
+
+    def own_td_errors(self, batch: Batch) -> Values | None:
+        """The TD errors of a batch by the rule's own targets, float32 [batch]; None if it has none of its own."""
+        if "targets" not in self.rule.hooks:
+            return None
+        device = None if self._networks[0].in_numpy else self.device
+        with torch.inference_mode(), np.errstate(all="ignore"):
+            given = Given.of(batch, self.config.learner.gamma, 0.0, 0.0, device)
+            step = self._step(self.acting, given, batch)
+            values = step.online.values(step.inputs[: len(batch)])
+            return on_host(self._own_errors(step, given, values))
 
     def _bootstrap(self, next_values: Any, preferred: Any) -> Any:  # noqa: ANN401
         """V(x') by the method's rule, in the networks' arrays: float32 [batch]."""
@@ -163,7 +215,7 @@ class Agent:
     def _led(self, batch: Batch, s: float, rate: float) -> Values:
         """Do an update step by step."""
         device = None if self._networks[0].in_numpy else self.device
-        return on_host(self._learn(self.acting, Given.of(batch, self.config.learner.gamma, s, rate, device)))
+        return on_host(self._learn(self.acting, Given.of(batch, self.config.learner.gamma, s, rate, device), batch))
 
     def _repeated(self, batch: Batch, s: float, rate: float) -> Late | None:
         """Repeat the recorded update; None if none is, the batch does not fit it, or recording fails."""
@@ -183,6 +235,8 @@ class Agent:
             return "the network is small and runs in numpy"
         if not self._networks[0].plain:
             return f"network.kind = {self.config.network.kind!r} is no plain stack of layers"
+        if self.rule.hooks & AUTOGRAD:
+            return f"the rule of {self.config.method} has a cost of its own, by autograd"
         if not self.rule.on_device:
             return f"the rule of {self.config.method} uses the host"
         if self.config.feedback == "weight-gradient":
@@ -250,6 +304,9 @@ class Agent:
         self.updates += 1
         self.versions[self.acting] = self.updates
         settings = self.config.learner
+        if self._tau is not None:
+            self.versions[1] = self.updates
+            return False
         # (swap due)
         due = settings.swap_unit == "updates" and self.updates % self.config.swap_period == 0
         if due:

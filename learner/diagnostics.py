@@ -62,10 +62,13 @@ class Diagnostics:
             hidden = hidden_layers(agent.networks[acting].module, inputs)
         generator = agent.rule.rng.bit_generator  # a method's own rule may draw numbers of the run from it
         before = generator.state
-        bootstrap = agent.rule.bootstrap(next_values, preferred)
+        errors = agent.own_td_errors(archive)
+        if errors is None:
+            bootstrap = agent.rule.bootstrap(next_values, preferred)
+            held = columns(archive, settings.gamma)
+            errors = td_errors(held, q[acting, :size], bootstrap, settings.value_bound)
         generator.state = before
         q = q[:, :size]
-        errors = td_errors(columns(archive, settings.gamma), q[acting], bootstrap, settings.value_bound)
         return {
             "q_gap": float(np.linalg.norm(q[0] - q[1], axis=1).mean()),
             "q1_mean": float(q[0].mean()),

@@ -47,7 +47,7 @@ def learn(options: LearnerOptions, config: RunConfig, spec: EnvSpec) -> None:
             path, replay=False, settings=settings_digest(config), load=load_learner, every=True
         )
         _check_origin(found)
-        for line in notices:
+        for line in (*notices, options.settings):
             console.event(line)
         lock.sign()
         _train(options, config, spec, found, stop, console)

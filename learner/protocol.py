@@ -59,6 +59,9 @@ class AnyAgent(Protocol):
     def q_values(self, obs: Array) -> tuple[Values, Values]:
         """Q1 and Q2, float32 [batch, actions], of stored observations <frame_dtype>[batch, *obs_shape]."""
 
+    def own_td_errors(self, batch: Batch) -> Values | None:
+        """The TD errors of a batch by a method's own targets, float32 [batch]; None if it has none of its own."""
+
     def state(self) -> dict[str, Any]:
         """The state for `load_state`."""
 

@@ -39,6 +39,7 @@ class QNetwork:
 
     Attributes:
         theta, gradient: float32 [P], of PyTorch or numpy, for the optimizer.
+        double, value_bound: as the learner's settings have them.
         in_numpy: the passes take arrays of numpy. plain: the network is a plain stack, with hand-written passes.
     """
 
@@ -52,6 +53,7 @@ class QNetwork:
     ) -> None:
         self.network = network
         self._half = half
+        self.double, self.value_bound = config.learner.double, config.learner.value_bound
         example = None if config.feedback == "none" else sample_inputs(spec, 8).to(network.flat.device)
         try:
             self._trained = Trainable(network, True, example)
@@ -110,6 +112,11 @@ class QNetwork:
         before = self.gradient * 1  # a copy, in either library
         self.backward(tape, output_error, 0.0)
         self.gradient += before
+
+    def follow(self, other: QNetwork, share: float) -> None:
+        """Move all parameters towards another network's by this share of the way."""
+        self.theta += share * (other.theta - self.theta)
+        self.changed()
 
     def decay(self, rates: AnyArray) -> None:
         """Add rates * theta, rates float32 [P], to the gradient."""

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coop.common.bounds import MAX_POINTS
+from coop.common.errors import UsageError
 from coop.common.messaging.messages.sample import Drawn
+from coop.common.metrics import COLUMNS
 from coop.common.numbers import RETURN_WINDOW
 from coop.common.types import Array, Batch
 from coop.learner.diagnostics import Diagnostics
@@ -82,7 +84,17 @@ class Telemetry:
             "distinct_share": distinct / len(reuse),
             "evicted_unsampled": drawn.evicted_unsampled / max(1, drawn.evicted),
             "weight_lag_mean": float(lag.mean()),
+            **self._own(agent),
         }
+
+    def _own(self, agent: AnyAgent) -> dict[str, float]:
+        """The columns of the method's rule; raises UsageError for names of other columns."""
+        own = {name: float(value) for name, value in agent.rule.metrics().items()}
+        if taken := own.keys() & COLUMNS:
+            raise UsageError(
+                f"method = {agent.config.method!r}: its metrics can't be called {min(taken)!r}, as others are"
+            )
+        return own
 
     def q_bound(self, agent: AnyAgent) -> float | None:
         """The largest possible |Q|, (largest |reward| seen) / (1 - gamma); None if gamma is 1."""

@@ -12,7 +12,6 @@ from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process import cli
 from coop.common.process.lifecycle import Stop, run_main
-from coop.common.process.untrusted import check_run
 from coop.common.settings.options import RoleOptions
 
 
@@ -24,10 +23,6 @@ class LimitsOptions(RoleOptions):
     """New ratio of updates per environment step, from now on; unchanged if not given."""
     tolerance: float | None = None
     """New tolerance in environment steps between acting and learning; unchanged if not given."""
-
-    def __post_init__(self) -> None:
-        """Raise UsageError for a name that no run has."""
-        check_run(self.run)
 
 
 def main() -> None:

@@ -20,6 +20,7 @@ from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.limits import use_threads
 from coop.common.settings.methods import METHODS
+from coop.common.settings.policies import EVICTIONS, SAMPLERS
 from coop.common.types import EnvSpec
 
 # torch.compile's own processes would outlive the tests.
@@ -137,6 +138,8 @@ def nothing_left_behind() -> Iterator[None]:
 def parts_of_ones_own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """No test meets the methods that another one registered, nor its modules `my_...`, which have the same names."""
     monkeypatch.setattr(METHODS, "_all", {**METHODS._all})
+    for registry in (METHODS, EVICTIONS, SAMPLERS):
+        monkeypatch.setattr(registry, "_own", {})
     yield
     for name, module in list(sys.modules.items()):
         if name.startswith("my_") and not Path(module.__file__ or "").is_relative_to(Path(__file__).parent):

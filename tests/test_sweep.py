@@ -103,7 +103,10 @@ def test_cells_share_the_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         ("seeds = [-1]", "-1"),
         ('preset = "cartpol"', "'cartpol': unknown; did you mean cartpole? allowed: "),
         ('mode = "both"', "mode = 'both'"),
-        ("vary.replay.capacity = [50]", "replay.learning_starts = 128: must not exceed replay.capacity = 50"),
+        (
+            "vary.replay.capacity = [50]\nfixed.replay.learning_starts = 128",
+            "128: must not exceed replay.capacity = 50",
+        ),
         ("vary.replay.capacity = [500, 500]", "two cells collide: both are called coop-capacity=500-seed=0"),
         ("vary.replay.ratio = [1, 1.0]", "two cells collide: coop-ratio=1-seed=0 and coop-ratio=1.0-seed=0"),
         ("seeds = [3, 3]", "two cells collide: both are called coop-seed=3"),
@@ -111,7 +114,7 @@ def test_cells_share_the_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         ("fixed.edl.rate = 0.1\nvary.edl.rate = [0.1]", "edl.rate: both in [fixed] and in [vary]"),
         ("fixed.replay = 5", "replay = 5: must be a table"),
         ('fixed.env.id = "CartPoles-v0"', "CartPoles-v0"),
-        ('preset = "catch"', "actor.num_envs = 4: lockstep cells play one emulator"),
+        ("fixed.actor.num_envs = 4", "actor.num_envs = 4: lockstep cells play one emulator"),
         (
             'mode = "distributed"\nfixed.learner.swap_unit = "steps"',
             "learner.swap_unit = 'steps': in lockstep runs only",

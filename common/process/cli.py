@@ -7,6 +7,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from itertools import chain
@@ -223,6 +224,17 @@ def _width() -> int:
 
 PACKAGE = "coop-rl"
 _ALONE = {"--replay.journal": "async"}  # what flags mean that are given without a value
+_JOINED = re.compile(r"((?P<flag>--[^=]+)=)?(?P<numbers>[-+.\de_]+(,[-+.\de_]+)+)")
+_ALSO_CALLED = {  # what other libraries call a flag
+    "--lr": "--learner.learning-rate",
+    "--discount": "--learner.gamma",
+    "--buffer-size": "--replay.capacity",
+    "--target-update-interval": "--learner.target-update-every",
+    "--n-envs": "--actor.num-envs",
+    "--timesteps": "--total-steps",
+    "--total-timesteps": "--total-steps",
+    "--n-steps": "--replay.n-step",
+}
 ANSWERS = ("--help", "--help-all", "--version", "--completion")
 
 T = TypeVar("T")
@@ -244,6 +256,31 @@ def _path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
     )
 
 
+@_PATHS.primitive_rule
+def _int(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
+    """Reads every flag that is a whole number as `whole_number` does."""
+    if info.type is not int:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda words: whole_number(words[0]),
+        is_instance=lambda value: isinstance(value, int) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def whole_number(text: str) -> int:
+    """Read a whole number: 1000000, 1_000_000 or 1e6."""
+    try:
+        return int(text)
+    except ValueError:
+        with suppress(ValueError):
+            if (number := float(text)).is_integer():
+                return int(number)
+        raise
+
+
 def parse(
     kind: type[T],
     program: str,
@@ -260,7 +297,7 @@ def parse(
         UsageError: an unknown flag or a value of the wrong type.
         ProcessExit: the flags asked for help, the version or a completion script; it has been printed.
     """
-    args = _with_values(sys.argv[1:] if args is None else args)
+    args = _separated(_with_values(sys.argv[1:] if args is None else args), kind, default)
     asked = {token.partition("=")[0].replace("_", "-") for token in args}
     if "--help-all" in asked:
         _answer(full_help(program, description, sections(kind, default)))
@@ -287,6 +324,23 @@ def _with_values(args: Sequence[str]) -> list[str]:
         words.append(token)
         if token in _ALONE and after.startswith("-"):
             words.append(_ALONE[token])
+    return words
+
+
+def _separated(args: Sequence[str], kind: type[Any], default: object) -> list[str]:
+    """The command line, in which numbers joined by commas are given one by one to flags that take several."""
+    if not any(_JOINED.fullmatch(token) for token in args):
+        return list(args)
+    several = {flag.name for part in sections(kind, default) for flag in part.flags if flag.value.endswith("...")}
+    words: list[str] = []
+    flag = ""
+    for token in args:
+        found = _JOINED.fullmatch(token)
+        flag = (found and found["flag"]) or (token if token.startswith("--") else flag)
+        if found and flag.replace("_", "-") in several:
+            words += [*([flag] if found["flag"] else []), *found["numbers"].split(",")]
+        else:
+            words.append(token)
     return words
 
 
@@ -338,7 +392,8 @@ def _problem(event: tyro_errors.ParseErrorEvent, kind: type[Any]) -> str:
         case tyro_errors.BadValue(argument=argument):
             return f"{argument.display_name()}: needs a value"
         case tyro_errors.InstantiationFailure(message=message, argument=argument) if argument:
-            return f"{argument.display_name()}: {_reason(message)}; allowed: {placeholder(argument)}"
+            unset = ", or None" if (argument.lowered.metavar or "").startswith("{None}|") else ""
+            return f"{argument.display_name()}: {_reason(message)}; allowed: {placeholder(argument)}{unset}"
     return "the command line can't be read; --help-all lists every flag"
 
 
@@ -360,7 +415,7 @@ def _unknown(token: str, kind: type[Any]) -> str:
     known = {name: name for part in sections(kind) for each in part.flags for name in (each.name, each.negative)}
     if not token.startswith("-"):
         return refusal("unknown", known.get(f"--{word}"), "it follows no flag that takes it")
-    first = next((name for name in known if name.startswith(f"{word}.")), None)
+    first = known.get(_ALSO_CALLED.get(word, "")) or next((name for name in known if name.startswith(f"{word}.")), None)
     without = {f"--{name.rpartition('.')[2]}": name for name in reversed(known) if "." in name}
     known = {**without, **known, **{name: name for name in ANSWERS}}
     near = first or closest(word, known)

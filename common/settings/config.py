@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -25,7 +25,17 @@ from coop.common.bounds import (
 from coop.common.errors import UsageError
 from coop.common.process.untrusted import RUN
 from coop.common.settings.environment import EnvSettings
-from coop.common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
+from coop.common.settings.fields import (
+    NONE,
+    Count,
+    Decay,
+    NonNegative,
+    Positive,
+    PositiveFloat,
+    PositiveShare,
+    Share,
+    Steps,
+)
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import EvictionName, MethodName, SamplingName
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
@@ -34,6 +44,9 @@ OUTSIDE = ("checkpoint_every", "eval_every", "eval_episodes", "video_every")  # 
 OF_MACHINE = ("device", "threads", "mirror")  # of `learner`: a run may move to another machine
 NETWORK_KINDS = ("mlp", "nature", "nips2013", "minatar")
 OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
+
+OF_REGISTRIES = ("method", "replay.eviction", "replay.sampling")
+MAY_NAME_MODULES = ("env.id", "network.kind", *OF_REGISTRIES)  # as "module:name"
 
 _STRICT = ConfigDict(extra="forbid")
 
@@ -60,8 +73,11 @@ class LearnerSettings:
     """Transitions per update."""
     swap_every: Positive = 30
     """C: updates between swaps of the acting role."""
-    target_update_every: Positive | None = None
+    target_update_every: Annotated[Positive | None, NONE] = None
     """C of methods with one network: updates between copies to the target network; default: swap_every."""
+    tau: Annotated[PositiveShare | None, NONE] = None
+    """Soft targets of methods with one network: after each update the target network moves by this share towards the
+    trained one, in place of a copy every target_update_every."""
     swap_unit: Literal["updates", "steps"] = "updates"
     """Unit of swap_every and target_update_every; "steps" means environment steps, in lockstep runs only."""
     reset_role_at_episode: bool = False
@@ -72,7 +88,7 @@ class LearnerSettings:
     """squared: 1/2 e^2 (paper); mse: e^2 (authors' code; halves the weight of s); huber: slope clipped to [-1, 1]."""
     double: bool = False
     """Double Q-learning: the trained network chooses the action at which the target network is evaluated."""
-    reward_bound: PositiveFloat | None = None
+    reward_bound: Annotated[PositiveFloat | None, NONE] = None
     """Largest |reward| possible, if known: targets then take no value of a next state beyond +-this / (1 - gamma)."""
     optimizer: OptimizerName = "rmsprop"
     """Optimizer; rmsprop-mnih: centred, eps inside the square root, gradients summed over the batch; else PyTorch's."""
@@ -146,7 +162,7 @@ class ReplaySettings:
     capacity: Steps = 5000
     """Exact number of transitions in the full table."""
     learning_starts: Steps = 500
-    """Transitions to collect before the first update; --total-steps limits a preset's value to a tenth of the run."""
+    """Transitions to collect before the first update; unless given, at most the capacity and a tenth of the run."""
     ratio: Annotated[float, Field(gt=0, le=MAX_RATIO)] = 1.0
     """Updates per environment step."""
     tolerance: Annotated[float, Field(gt=0, le=MAX_TOLERANCE)] = 64.0
@@ -187,10 +203,10 @@ class ActorSettings:
     """Probability of a random action at the run's beginning."""
     epsilon_final: Share = 0.05
     """Probability of a random action at the end of the decay."""
-    epsilon_decay: Literal["exponential", "linear"] = "exponential"
+    epsilon_decay: Literal["exponential", "linear"] = "linear"
     """Shape of the decay of epsilon."""
-    epsilon_steps: Steps = 10_000
-    """Environment steps: time constant of the exponential decay, or length of the linear decay."""
+    epsilon_steps: Steps = 5000
+    """Steps: time constant of the exponential decay, length of the linear one; default: total_steps / 10."""
     segment_steps: Annotated[int, Field(gt=0, le=MAX_SEGMENT_STEPS)] = 16
     """Steps of one emulator that are sent together."""
     max_in_flight: Annotated[int, Field(gt=0, le=MAX_GAPS)] = 2
@@ -214,7 +230,7 @@ class RunConfig:
     """Stop after this many updates; 0: no limit."""
     total_episodes: Count = 0
     """Stop after this many finished episodes; 0: no limit."""
-    target_return: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    target_return: Annotated[Annotated[float, Field(allow_inf_nan=False)] | None, NONE] = None
     """Stop once the mean return of the last 100 episodes reaches this."""
     checkpoint_every: Count = 10_000
     """Updates between checkpoints of the whole system; 0: only at the end."""
@@ -240,8 +256,8 @@ class RunConfig:
     @property
     def imports(self) -> dict[str, str]:
         """The settings that name a module to import, with their values ("module:name")."""
-        named = {"env.id": self.env.id, "network.kind": self.network.kind}
-        return {field: value for field, value in named.items() if ":" in value}
+        named = ((name, _at(self, name)) for name in MAY_NAME_MODULES)
+        return {field: value for field, value in named if ":" in value}
 
     @cached_property
     def planned_updates(self) -> int:
@@ -265,9 +281,19 @@ class RunConfig:
         return settings.swap_every if self.two_networks else settings.target_update_every or settings.swap_every
 
     @cached_property
+    def soft_targets(self) -> float | None:
+        """`learner.tau` of a method with one network; None if its target network is copied, or it has none."""
+        return None if self.two_networks else self.learner.tau
+
+    @cached_property
     def feedback(self) -> str:
         """The feedback of this method: "none" for the gradient methods."""
         return self.edl.feedback if METHODS.get(self.method).error_driven else "none"
+
+
+def _at(config: RunConfig, name: str) -> Any:  # noqa: ANN401 (a value of any field)
+    """The value of a field by its dotted name."""
+    return reduce(getattr, name.split("."), config)
 
 
 def value_of(config: RunConfig, name: str) -> Any:  # noqa: ANN401 (a value of any field)

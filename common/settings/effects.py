@@ -31,6 +31,12 @@ _CONDITIONS = (
         lambda c: not c.two_networks,
         "{c.method} has no target network; its roles swap every learner.swap_every",
     ),
+    Condition(("learner.tau",), lambda c: not c.two_networks, "{c.method} has no target network"),
+    Condition(
+        ("learner.swap_every", "learner.target_update_every", "learner.swap_unit"),
+        lambda c: c.soft_targets is None,
+        "the target network follows at each update, learner.tau = {c.learner.tau}",
+    ),
     Condition(
         ("learner.reset_role_at_episode",), lambda c: c.two_networks, "in {c.method} it is always network 1 that acts"
     ),

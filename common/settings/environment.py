@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 
 from coop.common.bounds import MAX_ENV_ID, MAX_FRAME_SKIP, MAX_GAME_STEPS, MAX_NOOPS, MAX_SIDE, MAX_STACK
-from coop.common.settings.fields import Table
+from coop.common.settings.fields import NONE, Table
 
 Side = Annotated[int, Field(gt=0, le=MAX_SIDE)]
 
@@ -32,7 +32,7 @@ class EnvSettings:
     """Emulator frames per step, of which the last two are max-pooled; ALE only."""
     stack: Annotated[int, Field(gt=0, le=MAX_STACK)] = 1
     """Frames per observation."""
-    resize: tuple[Side, Side] | None = None
+    resize: Annotated[tuple[Side, Side] | None, NONE] = None
     """Height and width to which pictures are resized; ALE games always have 84 x 84."""
     grayscale: bool = False
     """Convert colour pictures to grayscale; ALE games always are."""

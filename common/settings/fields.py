@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import msgspec
 import tomli_w
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from tyro.constructors import PrimitiveConstructorSpec
 
 from coop.common.bounds import MAX_INTEGER, MAX_KWARGS, MAX_STEPS
@@ -22,6 +22,8 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 PositiveShare = Annotated[float, Field(gt=0, le=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
+NONE = BeforeValidator(lambda value: None if value in ("None", "none") else value)
+"""Lets an optional field be unset in TOML too, which has no null: "None"."""
 
 
 def _read_table(words: Sequence[str]) -> dict[str, Any]:

@@ -51,7 +51,7 @@ class Method:
 
 def table_of(method: str) -> str:
     """The name of a method's own settings in TOML and in flags."""
-    return method.replace("-", "_")
+    return METHODS.get(method).table if ":" in method else method.replace("-", "_")
 
 
 # The first four in the order of the paper's table, in the palette of Okabe and Ito, which colour-blind readers can
@@ -68,6 +68,11 @@ METHODS = Registry(
         "medqn": "coop.common.settings.medqn:MEDQN",
         "stream-q": "coop.common.settings.stream_q:STREAM_Q",
     },
+    entry_of=lambda path, rule: Method(path.partition(":")[2], f"one network and its copy, {path}", rule=rule),
+    meant={
+        **dict.fromkeys(("double-dqn", "ddqn"), "dqn with learner.double = true (--learner.double)"),
+        **dict.fromkeys(("per", "prioritized-dqn"), "dqn with replay.sampling = 'prioritized'"),
+    },
 )
 
 
@@ -75,6 +80,6 @@ def register_method(method: Method) -> None:
     """Add a training method in this process; raises UsageError for a name in use.
 
     The processes of distributed runs and of sweeps know only the methods of installed packages, which add them by an
-    entry point of the group `coop.methods`.
+    entry point of the group `coop.methods`, and those that the setting itself names as "module:name".
     """
     METHODS.register(method)

@@ -15,7 +15,7 @@ from coop.common.settings.policies import EVICTIONS, SAMPLERS
 
 def _known(registry: Registry[Any]) -> AfterValidator:
     def check(name: str) -> str:
-        if name not in registry.names():
+        if not registry.knows(name):
             raise PydanticCustomError("unknown_name", "{reason}", {"reason": registry.unknown(name)})
         return name
 

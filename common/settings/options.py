@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from coop.common.imports import permit
 from coop.common.process.cli import HttpAddress
 from coop.common.process.untrusted import check_run
 
@@ -33,7 +34,10 @@ class RoleOptions:
     """A Zenoh configuration file (TLS, access control); the endpoints given as flags still apply."""
     shared_memory: bool = False
     """Use shared memory between processes on one machine: the learner reads frames in the replay service's."""
+    allow_import: tuple[str, ...] = ()
+    """Modules, such as my_envs, that may be imported for the run's environment, network, method or policies."""
 
     def __post_init__(self) -> None:
-        """Raise UsageError for a name that no run has."""
+        """Raise UsageError for a name that no run has; permit the modules."""
         check_run(self.run)
+        permit(self.allow_import)

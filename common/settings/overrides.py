@@ -60,20 +60,22 @@ def of_method(tables: Mapping[str, Any], method: str | None) -> dict[str, Any]:
     overrides = tables.get("methods", {})
     if not isinstance(overrides, Mapping) or not all(isinstance(over, Mapping) for over in overrides.values()):
         raise UsageError("methods: must hold one table for each method, [methods.NAME]")
-    if unknown := overrides.keys() - set(METHODS.names()):
+    if unknown := [name for name in overrides if not METHODS.knows(name)]:
         raise UsageError(f"methods.{min(unknown)}: no such method; allowed: {', '.join(METHODS.names())}")
-    own = {name: table for name in METHODS.names() if (table := _own_table(name, tables, overrides))}
+    named = [name for name in (*overrides, tables.get("method"), method) if isinstance(name, str) and ":" in name]
+    names = tuple(dict.fromkeys((*METHODS.names(), *named)))
+    own = {name: table for name in names if (table := _own_table(name, tables, overrides))}
     overrides = {name: _without(over, own.get(name, {})) for name, over in overrides.items()}
     stated = _without(tables, {"methods", *map(table_of, own)})
     chosen = stated.get("method", RunConfig.method) if method is None else method
     mine = merged({**stated, "method": chosen}, overrides.get(chosen, {}))
     touched = {path for over in overrides.values() for path, _ in leaves(over)}
     others = {name: table for name, table in own.items() if name != chosen}
-    for other in METHODS.names():
+    for other in names:
         theirs = merged(stated, overrides.get(other, {}))
         for path in sorted(touched) if other != chosen else ():
             if (value := _value(theirs, path)) != _value(mine, path):
-                others = merged(others, nested((other, *path), value))
+                others = merged(others, nested((other, *path), "None" if value is None else value))
     return {**mine, **own.get(chosen, {}), "methods": others}
 
 

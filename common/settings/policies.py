@@ -18,11 +18,18 @@ class Policy:
         make: its class, a function of a `coop.replay.table.policies.TableView`, or "module:Class" to import it in the
             replay service only.
         priorities: it uses the priorities of transitions, which the learner then sends.
+        episodes: it uses the numbers of transitions' episodes, which the table then keeps.
     """
 
     name: str
     make: str | Callable[..., Any]
     priorities: bool = False
+    episodes: bool = False
+
+
+def _uses(policy: type) -> dict[str, bool]:
+    """What a class on `coop.replay.table.policies.Eviction` or `Sampling` says that it uses."""
+    return {name: getattr(policy, name, False) for name in ("priorities", "episodes")}
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,7 @@ EVICTIONS = Registry(
         "reservoir": EvictionPolicy("reservoir", "coop.replay.table.selection:Reservoir"),
         "prioritized": EvictionPolicy("prioritized", "coop.replay.table.selection:LowestPriority", priorities=True),
     },
+    entry_of=lambda path, policy: EvictionPolicy(path, policy, **_uses(policy)),
 )
 SAMPLERS = Registry(
     "replay.sampling",
@@ -65,4 +73,5 @@ SAMPLERS = Registry(
         "uniform": SamplingPolicy("uniform", "coop.replay.table.selection:Uniform", without_replacement=True),
         "prioritized": SamplingPolicy("prioritized", "coop.replay.table.selection:Proportional", priorities=True),
     },
+    entry_of=lambda path, policy: SamplingPolicy(path, policy, **_uses(policy)),
 )

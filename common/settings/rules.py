@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+from typing import TypeVar
 
 from coop.common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
 from coop.common.errors import UsageError
@@ -11,11 +13,28 @@ from coop.common.settings.config import NETWORK_KINDS, RunConfig
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.policies import SAMPLERS
 
+ConfigT = TypeVar("ConfigT", bound=RunConfig)
+
 
 def check_rules(config: RunConfig) -> None:
     """Raise UsageError for the first rule that the config breaks; names the field, its value and what is allowed."""
     if problem := next(_problems(config), None):
         raise UsageError(problem)
+
+
+def fitted(config: ConfigT, given: Collection[str], *, lockstep: bool = False) -> ConfigT:
+    """The config in which what nobody has asked for gives way to what somebody has.
+
+    Learning starts with a full table at the latest, and a lockstep run plays one emulator.
+
+    given: the settings asked for, as dotted names; those of a preset or a file are not among them.
+    """
+    replay, actor = config.replay, config.actor
+    if "replay.learning_starts" not in given and replay.learning_starts > replay.capacity:
+        config = replace(config, replay=replace(replay, learning_starts=max(replay.n_step, replay.capacity)))
+    if lockstep and "actor.num_envs" not in given and actor.num_envs != 1:
+        config = replace(config, actor=replace(actor, num_envs=1))
+    return config
 
 
 def _problems(config: RunConfig) -> Iterator[str]:
@@ -43,6 +62,8 @@ def _problems(config: RunConfig) -> Iterator[str]:
         for name in ("kwargs", "resize", "grayscale"):
             if (value := getattr(config.env, name)) != getattr(plain, name):
                 yield f"env.{name} = {value!r}: not for {config.env.id!r}; ALE's games show 84x84 grayscale pictures"
+    if config.soft_targets is not None and learner.swap_unit == "steps":
+        yield f"learner.tau = {learner.tau}: moves targets at each update; not with learner.swap_unit = 'steps'"
     if learner.initial_networks and config.streaming:
         yield f"learner.initial_networks = {learner.initial_networks!r}: not for method {config.method!r}"
     yield from _replay_problems(config)

@@ -29,7 +29,14 @@ class StreamQSettings:
 
 _UNUSED = (
     *("replay.", "actor.epsilon_start", "actor.epsilon_final", "actor.epsilon_decay", "actor.epsilon_steps"),
-    *("network.dtype", "learner.batch_size", "learner.swap_every", "learner.target_update_every", "learner.swap_unit"),
+    *(
+        "network.dtype",
+        "learner.batch_size",
+        "learner.swap_every",
+        "learner.target_update_every",
+        "learner.swap_unit",
+        "learner.tau",
+    ),
     *("learner.loss", "learner.double", "learner.reward_bound", "learner.optimizer", "learner.learning_rate"),
     *("learner.learning_rate_final", "learner.learning_rate_decay", "learner.learning_rate_decay_every"),
     *("learner.momentum", "learner.alpha"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +18,7 @@ from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.settings.overrides import merged, of_method
-from coop.common.settings.rules import check_rules
+from coop.common.settings.rules import check_rules, fitted
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
 CONFIG = "config.toml"
@@ -50,11 +50,16 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
     return _preset(f"{preset}.toml")
 
 
+def base_tables(name: str) -> dict[str, Any]:
+    """The settings that several presets share, as nested tables."""
+    return _preset("bases", f"{name}.toml")
+
+
 def _preset(*place: str) -> dict[str, Any]:
     """Read a file under presets/, merged over the one in presets/bases/ that it extends."""
     tables = tomllib.loads(files("coop.common.settings").joinpath("presets", *place).read_text(encoding="utf-8"))
     base = tables.pop("extends", None)
-    return tables if base is None else merged(_preset("bases", f"{base}.toml"), tables)
+    return tables if base is None else merged(base_tables(base), tables)
 
 
 def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
@@ -78,14 +83,39 @@ def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
 def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     """Turn tables into a checked config; a `[methods.NAME]` table overrides the rest for that method.
 
+    Two defaults follow from other fields: epsilon falls over a tenth of the run, and learning starts with 500
+    transitions, or with fewer where the table holds fewer or a tenth of the run is shorter.
+
     Raises:
         UsageError: an unknown field or a value out of range; names the field, the value and what is allowed.
     """
-    return validated(of_method(tables, method))
+    return validated(_completed(of_method(tables, method)))
 
 
-def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
+def _completed(tables: dict[str, Any]) -> dict[str, Any]:
+    """The tables with the defaults that follow from other fields; what is no number is refused later."""
+    replay, actor = tables.get("replay", {}), tables.get("actor", {})
+    steps = tables.get("total_steps", RunConfig.total_steps)
+    if not isinstance(replay, Mapping) or not isinstance(actor, Mapping) or not _whole(steps):
+        return tables
+    tenth, capacity = max(1, int(steps) // 10), replay.get("capacity", ReplaySettings.capacity)
+    if "learning_starts" not in replay and _whole(capacity):
+        least = replay.get("n_step", ReplaySettings.n_step)
+        start = min(ReplaySettings.learning_starts, int(capacity), tenth)
+        replay = {**replay, "learning_starts": max(start, least) if isinstance(least, int) else start}
+    return {**tables, "replay": replay, "actor": {"epsilon_steps": tenth, **actor}}
+
+
+def _whole(value: object) -> bool:
+    return isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+
+
+def validated(
+    tables: Mapping[str, Any] | RunConfig, given: Collection[str] | None = None, *, lockstep: bool = False
+) -> RunConfig:
     """Check every field and the rules between fields.
+
+    given, lockstep: see `fitted`; None: all settings have been asked for.
 
     Raises:
         UsageError: as `resolve`.
@@ -98,6 +128,7 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
         config: RunConfig = replace(_ADAPTER.validate_python(tables), method_settings=settings)
     except pydantic.ValidationError as error:
         raise UsageError(first_problem(error, RunConfig())) from error
+    config = config if given is None else fitted(config, given, lockstep=lockstep)
     check_rules(config)
     return config
 
@@ -105,7 +136,8 @@ def validated(tables: Mapping[str, Any] | RunConfig) -> RunConfig:
 def _settings_of_method(tables: dict[str, Any]) -> Any:  # noqa: ANN401 (an instance of `Method.settings`)
     """Take a method's own settings out of its tables; None if it has none."""
     name = tables.get("method", RunConfig.method)
-    method = METHODS.get(name) if name in METHODS.names() else None  # an unknown one is refused with the other fields
+    known = isinstance(name, str) and METHODS.knows(name)  # another one is refused with the other fields
+    method = METHODS.get(name) if known else None
     if method is None or method.settings is None:
         return None
     if method.table in _FIELDS:

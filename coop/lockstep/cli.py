@@ -35,7 +35,7 @@ def _run() -> None:
     replaying = _replaying(stop)
     opened = LockstepRun(config, path, "coop-lockstep", options.start, log=options.log, replaying=replaying)
     with closing(opened) as run:
-        for line in run.notices:
+        for line in (*run.notices, options.settings):
             say(line)
         summary = run.play(stop, _progress)
     stopped = summary.exit == stop.reason  # otherwise the run was complete before the signal

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coop.actors.player import Turn
 from coop.actors.segments import SegmentAssembler
-from coop.common.errors import UsageError
+from coop.common.errors import RunError, UsageError
 from coop.common.registry import loaded
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
@@ -103,6 +103,8 @@ class TableMemory:
 
     def batches(self, step: int) -> Iterator[Batch]:
         """See `Experience`."""
+        if self._due(step) and not len(self.table):
+            raise RunError(f"replay.eviction = {self._config.replay.eviction!r}: keeps none of {step:,} transitions")
         for _ in range(self._due(step)):
             yield self.table.sample(self._config.learner.batch_size)
 

@@ -16,7 +16,7 @@ import tyro
 
 from coop.common.errors import RunError, UsageError
 from coop.common.imports import check_extra, hand_over, permit
-from coop.common.places import absolute
+from coop.common.places import absolute, shown
 from coop.common.process import cli
 from coop.common.process.cli import HttpAddress
 from coop.common.process.output import warn
@@ -25,7 +25,9 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.effects import without_effect
 from coop.common.settings.methods import METHODS, table_of
 from coop.common.settings.resuming import check_resumed
-from coop.common.settings.tables import load_tables, preset_names, resolve, shortened, validated
+from coop.common.settings.rules import fitted
+from coop.common.settings.starting import settings_line, source_of, starting_tables
+from coop.common.settings.tables import CONFIG, load_tables, preset_names, resolve, shortened, validated
 from coop.records.checkpoints import LEARNER, RECORDS, checkpoint_numbers
 from coop.records.reading import read_run_config
 from coop.records.resumption import Start, holds_run
@@ -48,7 +50,7 @@ class RunOptions(RunConfig):
     """The fields of a run's config, their source, and the run directory."""
 
     preset: Annotated[str | None, tyro.conf.arg(metavar=f"{{{','.join(preset_names())}}}")] = None
-    """Settings that come with the package; cartpole if neither --config nor a resumed run gives any."""
+    """Settings that come with the package; that of env.id if neither --config nor a resumed run gives any."""
     config: Path | None = None
     """A TOML file with the fields of a run, for example the config.toml of another run."""
     run_dir: Path | None = None
@@ -76,6 +78,12 @@ class RunOptions(RunConfig):
         return validated(RunConfig(**{each.name: getattr(self, each.name) for each in fields(RunConfig)}))
 
     @property
+    def settings(self) -> str:
+        """The settings that matter most, and where they come from, in one line."""
+        resumed = self.start.goes_on and self.run_dir is not None and (self.run_dir / CONFIG).exists()
+        return settings_line(self, source_of(self.preset, self.config and shown(self.config), resumed, self.env.id))
+
+    @property
     def start(self) -> Start:
         """How the run begins in its directory."""
         return Start(self.resume, self.resume_from, self.overwrite)
@@ -92,7 +100,7 @@ class RunOptions(RunConfig):
         if self.start.goes_on:
             return self._resumed()
         game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
-        named = f"{game}-{self.method}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+        named = f"{game}-{self.method.replace(':', '.')}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         path = self.run_dir or absolute(Path("runs") / named)
         if holds_run(path) and not self.overwrite:
             how = "give another folder, go on with --resume (resume=True in Python), or move it aside with --overwrite"
@@ -136,15 +144,19 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     """
     args = sys.argv[1:]
     base = base_config(args)
-    extended = with_methods(kind)
+    extended = with_methods(kind, base.method)
     of_method = {} if base.method_settings is None else {table_of(base.method): base.method_settings}
     default = extended(**{each.name: getattr(base, each.name) for each in fields(RunConfig)}, **of_method)
     parsed = cli.parse(extended, program, description, default, args, COMMON)
-    options: OptionsT = replace(parsed, method_settings=getattr(parsed, table_of(parsed.method), None))
     given = cli.given_flags(args)
-    named = {"env.id": options.env.id, "network.kind": options.network.kind}
-    permit([*options.allow_import, *(value for name, value in named.items() if name in given)])
-    if "learner.swap_every" in given and not options.two_networks and options.learner.target_update_every is None:
+    parsed = fitted(parsed, given, lockstep=lockstep)
+    options: OptionsT = replace(parsed, method_settings=getattr(parsed, table_of(parsed.method), None))
+    permit([*options.allow_import, *(value for name, value in options.imports.items() if name in given)])
+    if (
+        "learner.swap_every" in given
+        and not options.two_networks
+        and not (options.learner.target_update_every or options.soft_targets)
+    ):
         warn(f"--learner.swap-every: of {options.method}, the flag is --learner.target-update-every")
     for line in without_effect(options, given, lockstep=lockstep):
         warn(line)
@@ -154,19 +166,20 @@ def parse_run(kind: type[OptionsT], program: str, description: str, *, lockstep:
     return options
 
 
-def with_methods(kind: type[OptionsT]) -> type[OptionsT]:
+def with_methods(kind: type[OptionsT], method: str | None = None) -> type[OptionsT]:
     """The options with a field for each method's own settings, and with every method in the help.
 
+    method: the one that the command line names, which may be a user's own.
     A method that can't be imported is refused if it is chosen, and otherwise left out.
     """
     added: list[tuple[str, Any, Any]] = []
     summaries = []
-    for name in METHODS.names():
+    for name in dict.fromkeys((*METHODS.names(), *([method] if method else []))):
         with suppress(UsageError):
-            method = METHODS.get(name)
-            summaries.append(f"{name}: {method.summary}")
-            if method.settings is not None and not hasattr(kind, method.table):
-                added.append((method.table, method.settings, field(default_factory=method.settings)))
+            found = METHODS.get(name)
+            summaries.append(f"{name}: {found.summary}")
+            if found.settings is not None and not hasattr(kind, found.table):
+                added.append((found.table, found.settings, field(default_factory=found.settings)))
     shown = tyro.conf.arg(metavar=f"{{{','.join(METHODS.names())}}}", help=f"Training method; {'; '.join(summaries)}.")
     added.append(("method", Annotated[str, shown], RunConfig.method))
     return make_dataclass(kind.__name__, added, bases=(kind,), frozen=True)
@@ -184,8 +197,10 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     early.add_argument("--preset")
     early.add_argument("--config", type=_path)
     early.add_argument("--method")
-    early.add_argument("--total-steps", "--total_steps", type=int)
+    early.add_argument("--env.id", dest="env_id")
+    early.add_argument("--total-steps", "--total_steps", type=cli.whole_number)
     early.add_argument("--run-dir", "--run_dir", type=_path)
+    early.add_argument("--allow-import", "--allow_import", nargs="*", default=[])
     early.add_argument("--resume", action="store_true")
     early.add_argument("--resume-from", "--resume_from")
     try:
@@ -194,14 +209,20 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
         raise UsageError(str(error)) from error
     if known.preset and known.config:
         raise UsageError("--preset and --config: give one of them")
+    permit([*known.allow_import, *([known.method] if known.method else [])])
     resumed = known.run_dir if known.resume or known.resume_from else None
-    return chosen_config(known.preset, known.config, known.method, known.total_steps, resumed)
+    return chosen_config(known.preset, known.config, known.method, known.total_steps, resumed, known.env_id)
 
 
 def chosen_config(
-    preset: str | None, file: Path | None, method: str | None, total_steps: int | None, resumed: Path | None
+    preset: str | None,
+    file: Path | None,
+    method: str | None,
+    total_steps: int | None,
+    resumed: Path | None,
+    env_id: str | None = None,
 ) -> RunConfig:
-    """The config of a preset or a file; of neither, that of the run in the folder `resumed`, or of the preset cartpole.
+    """The config of a preset or a file; of neither, that of the run in the folder `resumed`, or of an environment.
 
     Raises:
         UsageError: an unknown preset or method, or a bad file.
@@ -216,9 +237,9 @@ def chosen_config(
     if resumed and saved and saved.exists():
         read_run_config(resumed)
         file = saved
-    tables = load_tables(None if file else preset or "cartpole", file)
-    if file is None and total_steps is not None:
-        tables = shortened(tables, total_steps)
+    tables = load_tables(preset, file) if preset or file else starting_tables(env_id)
+    if total_steps is not None:
+        tables = shortened(tables, total_steps) if file is None else {**tables, "total_steps": total_steps}
     if file and method and "methods" not in tables and method != tables.get("method", method):
         warn(f"{file} has no settings for single methods: {method} gets those of {tables['method']}")
     return resolve(tables, method)

@@ -12,7 +12,8 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.medqn import MedqnSettings
 from coop.learner.edl.arrays import AnyArray
 from coop.learner.methods.rule import UpdateRule
-from coop.learner.qnetwork import QNetwork, as_float32, on_host
+from coop.learner.methods.step import Step
+from coop.learner.qnetwork import as_float32, on_host
 
 Bounds = NDArray[np.float32]
 
@@ -37,13 +38,14 @@ class Consolidation(UpdateRule):
         start, end = self.settings.lambda_start, self.settings.lambda_end
         return start + (end - start) * min(1.0, update / self.config.planned_updates)
 
-    def add_cost(self, online: QNetwork, target: QNetwork, inputs: AnyArray, update: int) -> None:
+    def add_gradient(self, step: Step) -> None:
         """See `UpdateRule`."""
+        online, target, inputs = step.online, step.target, step.inputs
         obs = inputs[: len(inputs) // 2]
         states = obs if self.settings.states == "real" else self._draw(inputs, len(obs))
         tape = online.forward(states)
         gap = as_float32(tape.output) - target.values(states)
-        online.add_gradient(tape, 2 * self.strength(update) / len(states) * gap)
+        online.add_gradient(tape, 2 * self.strength(step.update) / len(states) * gap)
 
     def _draw(self, inputs: AnyArray, count: int) -> Bounds:
         """Widen the bounds by inputs [n, *input], and draw `count` states between them."""

@@ -1,18 +1,24 @@
-"""The learner's part of a method: the values that targets bootstrap from, and an extra cost."""
+"""The learner's part of a method: its targets, its loss, extra costs, and what it does behind an update."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from coop.common.settings.config import RunConfig
-from coop.learner.edl.arrays import AnyArray, ArrayT, chosen
-from coop.learner.qnetwork import QNetwork
+from coop.learner.edl.arrays import ArrayT, chosen
+from coop.learner.methods.step import Step
+
+HOOKS = ("targets", "loss", "extra_cost", "add_gradient", "after_update")
+AUTOGRAD = frozenset(("loss", "extra_cost"))
 
 
 class UpdateRule:
     """What a method changes in the update; this one, of the paper's four methods, changes nothing.
+
+    What a subclass does not define costs nothing.
 
     A class of its own gets the values in numpy. With `on_device = True` it gets the arrays of the networks, numpy's
     or tensors on their device, and depends on nothing but their values: a GPU then repeats recorded updates, in which
@@ -23,14 +29,17 @@ class UpdateRule:
         rng: the agent's generator, whose state it saves.
         passes: steps of the optimizer that one update makes with its batch.
         on_device: see above; False for a class that does not say so itself.
+        hooks: names of the methods below that its class defines.
     """
 
     passes = 1
     on_device = True
+    hooks: frozenset[str] = frozenset()
 
     def __init_subclass__(cls) -> None:
         """Let a class that does not know of devices keep to numpy."""
         cls.on_device = vars(cls).get("on_device", False)
+        cls.hooks = frozenset(name for name in HOOKS if getattr(cls, name) is not getattr(UpdateRule, name))
 
     def __init__(self, config: RunConfig, rng: np.random.Generator) -> None:
         self.config = config
@@ -45,14 +54,33 @@ class UpdateRule:
         # (double targets)
         return chosen(next_values, preferred.argmax(1))
 
-    def add_cost(self, online: QNetwork, target: QNetwork, inputs: AnyArray, update: int) -> None:
-        """Add the gradient of the extra cost to that of the TD errors (`QNetwork.add_gradient`).
+    def targets(self, step: Step) -> Any:  # noqa: ANN401
+        """The targets of the batch's Q-values, float32 [batch]: r + gamma^k V(x'), 0 in place of a terminal V(x')."""
+        values = self.bootstrap(step.target_q_next, step.q_next if step.double else step.target_q_next)
+        if step.value_bound is not None:
+            values = values.clip(-step.value_bound, step.value_bound)
+        return step.rewards + step.discounts * values
 
-        inputs: <float>[2 batch, *input], the networks' input for obs and then for next_obs. update: updates done.
+    def loss(self, step: Step, q: Tensor) -> Tensor:
+        """The batch's loss in place of `learner.loss`, a tensor of one; its gradient in q goes back.
+
+        q: Q of the trained network at obs, float32 [batch, actions]. step: in tensors, with its `targets`.
         """
+        raise NotImplementedError
 
-    def after_update(self, online: QNetwork, target: QNetwork) -> None:
-        """Do what the method does behind an update, for example move the target network; `QNetwork.changed` if so."""
+    def extra_cost(self, step: Step, q: Tensor) -> Tensor:
+        """A cost to be added to the loss, a tensor of one; arguments as of `loss`. With it goes the feedback of s."""
+        raise NotImplementedError
+
+    def add_gradient(self, step: Step) -> None:
+        """Add the gradient of a cost at other states than the batch's (`QNetwork.add_gradient`)."""
+
+    def after_update(self, step: Step) -> None:
+        """Do what the method does behind a step, for example change the target network; `QNetwork.changed` if so."""
+
+    def metrics(self) -> dict[str, float]:
+        """Columns of its own for metrics.jsonl, asked for at each row; finite numbers, with names of their own."""
+        return {}
 
     def state(self) -> dict[str, Any]:
         """The state for `load_state`; torch.load reads it with weights_only."""

@@ -130,6 +130,9 @@ class StreamAgent:
         values = self._form(preprocess(obs, self.spec))
         return values, values
 
+    def own_td_errors(self, batch: Batch) -> Values | None:
+        """None: the targets of the archive are the usual ones."""
+
     def state(self) -> dict[str, Any]:
         """The state for `load_state`; torch.load reads it with weights_only."""
         return {

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 from coop.common.errors import UsageError
 from coop.common.registry import loaded
 from coop.common.settings.policies import EVICTIONS, SAMPLERS, EvictionPolicy, SamplingPolicy
+from coop.common.types import Array, EnvSpec, Segment
 
 Rows = NDArray[np.intp]
 Floats = NDArray[np.float64]
@@ -36,6 +39,10 @@ class TableView:
         priority_exponent: alpha of prioritized sampling.
         importance_exponent: beta of prioritized sampling.
         replacement: whether a batch may hold a transition twice.
+        actions: int32 [capacity].
+        episodes: int64 [capacity], the number of each transition's episode in order of its first transition; empty
+            unless a policy of the table says that it uses `episodes`.
+        read, held: see `observations` and `size`.
     """
 
     rng: np.random.Generator
@@ -47,6 +54,23 @@ class TableView:
     priority_exponent: float = PRIORITY_EXPONENT
     importance_exponent: float = IMPORTANCE_EXPONENT
     replacement: bool = True
+    actions: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    episodes: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    read: Callable[[Rows, bool], Array] = lambda rows, following: rows
+    held: Callable[[], int] = lambda: 0
+
+    def observations(self, rows: Rows) -> Array:
+        """A copy of these rows' observations, <frame_dtype>[n, *obs_shape]."""
+        return self.read(rows, False)
+
+    def next_observations(self, rows: Rows) -> Array:
+        """A copy of these rows' next observations, <frame_dtype>[n, *obs_shape]."""
+        return self.read(rows, True)
+
+    @property
+    def size(self) -> int:
+        """Transitions held, in rows 0..size-1."""
+        return self.held()
 
     @property
     def capacity(self) -> int:
@@ -54,30 +78,69 @@ class TableView:
         return len(self.ids)
 
 
-class Eviction(ABC):
-    """Assigns every new transition a row of the table, or none.
+class Incoming:
+    """The transitions of a segment that a table is about to insert.
 
-    Rows 0..capacity-1 are first filled in order, so after `first` insertions a table holds min(first, capacity)
-    transitions in its lowest rows.
+    first: number of the first of all ever inserted. count: how many they are.
+    actions, rewards, terminated: of each, as in a `Segment`. episodes: as of a `TableView`, int64 [count].
     """
+
+    def __init__(self, segment: Segment, spec: EnvSpec, first: int, episodes: NDArray[np.int64]) -> None:
+        self.first, self.count = first, segment.steps
+        self.actions, self.rewards, self.terminated = segment.actions, segment.rewards, segment.terminated
+        self.episodes = episodes
+        self._segment, self._shape = segment, (-1, *spec.obs_shape)
+
+    def observations(self) -> Array:
+        """Their observations, <frame_dtype>[count, *obs_shape]."""
+        return self._segment.frames[self._segment.obs_index].reshape(self._shape)
+
+    def next_observations(self) -> Array:
+        """Their next observations, <frame_dtype>[count, *obs_shape]."""
+        return self._segment.frames[self._segment.next_index].reshape(self._shape)
+
+
+class Eviction:
+    """Assigns every new transition a row of the table, or none; defines `place`, or `admit` to see the transitions.
+
+    Rows 0..capacity-1 are first filled in order, so a table holds `table.size` transitions in its lowest rows; of a
+    policy that refuses none before the table is full, that is min(first, capacity).
+
+    Attributes:
+        priorities, episodes: whether it uses those of the table, see `TableView`.
+    """
+
+    priorities: ClassVar[bool] = False
+    episodes: ClassVar[bool] = False
 
     def __init__(self, table: TableView) -> None:
         self.table = table
 
-    @abstractmethod
     def place(self, first: int, count: int) -> tuple[Rows, slice | Rows]:
         """Assign rows to the transitions numbered first..first+count-1 of all ever inserted.
 
         Returns (rows, kept): distinct rows, and the (ascending) positions in the segment of the transitions
         that go there. The previous content of a row is evicted; a new transition without a row is not kept.
         """
+        raise NotImplementedError
 
-    def prioritise(self, rows: Rows) -> None:  # noqa: B027 (most policies need nothing)
+    def admit(self, incoming: Incoming) -> tuple[Rows, slice | Rows]:
+        """Assign rows to transitions that it sees, or refuse them; returns as `place`."""
+        return self.place(incoming.first, incoming.count)
+
+    def prioritise(self, rows: Rows) -> None:
         """Note that ids or priorities of these rows have changed; called if a policy of the table uses priorities."""
 
 
 class Sampling(ABC):
-    """Draws rows of the table, with importance-sampling weights."""
+    """Draws rows of the table, with importance-sampling weights.
+
+    Attributes:
+        priorities, episodes: whether it uses those of the table, see `TableView`.
+    """
+
+    priorities: ClassVar[bool] = False
+    episodes: ClassVar[bool] = False
 
     def __init__(self, table: TableView) -> None:
         self.table = table
@@ -99,3 +162,33 @@ def make_policies(eviction: EvictionPolicy, sampling: SamplingPolicy, table: Tab
         for policy, registry in ((eviction, EVICTIONS), (sampling, SAMPLERS))
     )
     return evicts, draws
+
+
+def check_placed(placed: tuple[Rows, slice | Rows], steps: int, size: int, capacity: int, policy: str) -> None:
+    """Raise UsageError for an answer of a policy's `place` or `admit` that breaks its promise; the table is unchanged.
+
+    steps: transitions of the segment. size: rows in use.
+    """
+    rows, kept = placed
+    count = len(np.arange(steps)[kept])
+    fresh = np.sort(rows[rows >= size])
+    if len(rows) != count:
+        problem = f"{len(rows)} rows for {count} transitions"
+    elif len(rows) and not 0 <= rows.min() <= rows.max() < capacity:
+        problem = f"rows from {rows.min()} to {rows.max()}, must be from 0 to {capacity - 1}"
+    elif len(np.unique(rows)) < len(rows):
+        problem = "a row twice"
+    elif not np.array_equal(fresh, np.arange(size, size + len(fresh))):
+        problem = f"rows {fresh.tolist()} with {size} in use: unused rows are filled in order"
+    else:
+        return
+    raise UsageError(f"replay.eviction = {policy!r}: gives {problem}")
+
+
+def check_drawn(drawn: tuple[Rows, NDArray[np.float32]], count: int, size: int, policy: str) -> None:
+    """Raise UsageError for an answer of a policy's `draw` that breaks its promise."""
+    rows, weights = drawn
+    if np.shape(rows) != (count,) or np.shape(weights) != (count,):
+        raise UsageError(f"replay.sampling = {policy!r}: draws {len(rows)} rows, {len(weights)} weights, not {count}")
+    if not 0 <= rows.min() <= rows.max() < size:
+        raise UsageError(f"replay.sampling = {policy!r}: draws rows {rows.min()} to {rows.max()} of {size} in use")

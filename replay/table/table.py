@@ -13,7 +13,16 @@ from coop.common.settings.policies import EVICTIONS, SAMPLERS
 from coop.common.types import Array, Batch, EnvSpec, Segment
 from coop.replay.table.columns import Columns
 from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
-from coop.replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
+from coop.replay.table.numbering import EPISODES, EpisodeNumbers
+from coop.replay.table.policies import (
+    IMPORTANCE_EXPONENT,
+    PRIORITY_EXPONENT,
+    Incoming,
+    TableView,
+    check_drawn,
+    check_placed,
+    make_policies,
+)
 from coop.replay.table.streams import StreamTails
 
 REUSE_BUCKETS = 16
@@ -93,15 +102,21 @@ class Table:
         self._columns = seen = Columns(capacity, spec.stack, prioritized=self._prioritized)
         self._max_priority = 1.0
         self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
+        self._held = 0
+        self._episodes = EpisodeNumbers(capacity) if evicts.episodes or draws.episodes else None
         arrays = seen.ids, seen.reuse, seen.rewards, seen.terminated, seen.priorities
-        view = TableView(rng, *arrays, priority_exponent, importance_exponent, replacement)
+        numbers = np.empty(0, np.int64) if self._episodes is None else self._episodes.of_rows
+        exponents = priority_exponent, importance_exponent
+        view = TableView(rng, *arrays, *exponents, replacement, seen.actions, numbers, self._observations, self.__len__)
         self._eviction, self._sampling = make_policies(evicts, draws, view)
+        # Users' own policies see what comes, and what they answer is checked.
+        self._checked = [not type(each).__module__.startswith("coop.") for each in (self._eviction, self._sampling)]
         self._tails = StreamTails(self._frames, spec.stack)
         self._sampled = 0
         self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
 
     def __len__(self) -> int:
-        return min(self.inserted, self.capacity)
+        return self._held
 
     @property
     def shared_memory(self) -> str:
@@ -134,7 +149,10 @@ class Table:
         """Insert a valid segment that is no duplicate; the eviction policy chooses the transitions to evict."""
         size = len(self)
         first = self.inserted
-        rows, kept = self._eviction.place(first, segment.steps)
+        if self._checked[0] or self._episodes is not None:
+            rows, kept = self._admitted(segment)
+        else:
+            rows, kept = self._eviction.place(first, segment.steps)
         index = np.concatenate((segment.obs_index[kept], segment.next_index[kept]), axis=1)
         slots, dropped = self._tails.store(segment, index)
         replaced = rows[rows < size]
@@ -147,10 +165,28 @@ class Table:
         self._columns.write(rows, segment, kept, first, slots[index])
         self._frames.drop(np.concatenate((old, dropped)))
         self.inserted += segment.steps
+        self._held = size + len(rows) - len(replaced)
         if self._row_of is not None:
             self._row_of.update(zip(self._columns.ids[rows].tolist(), rows.tolist(), strict=True))
         if self._prioritized:
             self._set_priorities(rows, np.full(len(rows), self._max_priority))
+
+    def _admitted(self, segment: Segment) -> tuple[Slots, slice | Slots]:
+        """The rows that a policy which sees the transitions gives them; raises UsageError for an impossible answer."""
+        episodes = self._episodes
+        numbers = np.zeros(segment.steps, np.int64) if episodes is None else episodes.number(segment)
+        rows, kept = self._eviction.admit(Incoming(segment, self.spec, self.inserted, numbers))
+        if self._checked[0]:
+            check_placed((rows, kept), segment.steps, len(self), self.capacity, str(self._settings["eviction"]))
+        if episodes is not None:
+            episodes.write(rows, numbers[kept])
+        return rows, kept
+
+    def _observations(self, rows: Slots, following: bool) -> Array:
+        """The observations of these rows, or the next ones: <frame_dtype>[n, *obs_shape], a copy."""
+        stack = self.spec.stack
+        slots = self._columns.slots[rows, stack:] if following else self._columns.slots[rows, :stack]
+        return self._frames.read(slots.ravel().astype(np.intp)).reshape(-1, *self.spec.obs_shape)
 
     def sample(self, batch_size: int) -> Batch:
         """Draw transitions by the sampling policy. Raises ValueError if the table is empty."""
@@ -179,6 +215,8 @@ class Table:
         if size == 0:
             raise ValueError("an empty table has nothing to sample")
         rows, weights = self._sampling.draw(batch_size, size)
+        if self._checked[1]:
+            check_drawn((rows, weights), batch_size, size, str(self._settings["sampling"]))
         # Transition by transition, so that neighbouring frames are read one after another.
         distinct, index = self._frames.unique(self._columns.slots.take(rows, axis=0).astype(np.intp))
         np.add.at(self._columns.reuse, rows, np.int32(1))
@@ -227,6 +265,7 @@ class Table:
         meta = {
             "settings": self._settings,
             "inserted": self.inserted,
+            "held": size,
             "batches": self.batches,
             "sampled": self._sampled,
             "max_priority": self._max_priority,
@@ -237,6 +276,8 @@ class Table:
         arrays = self._columns.state(size)
         arrays["slots"] = index[: slots.size].reshape(slots.shape)
         arrays["tails"] = tail_index
+        if self._episodes is not None:
+            meta["episodes"], arrays[EPISODES] = self._episodes.state(), self._episodes.of_rows[:size].copy()
         return TableSnapshot(meta, arrays, self._frames.pin(distinct))
 
     def load_state(self, meta: dict[str, Any], arrays: dict[str, Array]) -> None:
@@ -259,6 +300,9 @@ class Table:
         self._columns.load_state(arrays, slots[arrays["slots"]])
         self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
         self.inserted = meta["inserted"]
+        self._held = meta.get("held", min(self.inserted, self.capacity))  # an older state lacks it
+        if self._episodes is not None:
+            self._episodes.load_state(meta["episodes"], arrays[EPISODES])
         self.batches = meta["batches"]
         self._sampled = meta["sampled"]
         self._max_priority = meta["max_priority"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Self
 
 import msgspec
@@ -11,11 +11,13 @@ from msgspec import Meta
 from coop.common.bounded import Count, Counter, Incarnation, Name, Real, Text, Updates
 from coop.common.bounds import MAX_COUNT, MAX_RATIO, MAX_TOLERANCE
 from coop.common.errors import BadMessage, UsageError
+from coop.common.imports import check_permitted
 from coop.common.messaging import wire
 from coop.common.messaging.members import JOINING, Origin
 from coop.common.messaging.messages.body import Body
 from coop.common.messaging.wire import Message
-from coop.common.settings.config import RunConfig
+from coop.common.settings.config import OF_REGISTRIES, RunConfig
+from coop.common.settings.overrides import leaves
 from coop.common.settings.tables import to_tables, validated
 from coop.common.types import EnvSpec
 
@@ -79,18 +81,27 @@ class JoinReply(Body, frozen=True):
 
     @classmethod
     def decode(cls, message: Message) -> Self:
-        """Read it; raises BadMessage."""
+        """Read it; raises BadMessage, and JoinError if it needs a module that this process may not import."""
         tables: Any = message.fields.get("config")
         if tables is None:  # missing
             return super().decode(message)
         if not isinstance(tables, dict):
             raise BadMessage("fields.config", "not a table")
+        for name, path in _modules(tables):
+            check_permitted(path, name)
         try:
             config = validated(tables)
         except UsageError as error:
             raise BadMessage("fields.config", str(error)) from error
         fields = {**message.fields, "config": config}
         return super().decode(Message(message.kind, message.run, fields, message.arrays, message.table))
+
+
+def _modules(tables: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """The settings of a config that reading it imports as "module:name", with their values."""
+    for path, value in leaves(tables):
+        if isinstance(value, str) and ":" in value and ".".join(path) in OF_REGISTRIES:
+            yield ".".join(path), value
 
 
 class Leave(Body, frozen=True):

@@ -142,6 +142,7 @@ def buffers(study: Study) -> Figure:
     )
     if len(study.buffered) < len(study.methods):
         text += " Dashed: without a replay buffer, so that its runs are those of size 0 everywhere."
+    text = f"{text} {study.eviction}".rstrip()
     title, used = "Return against buffer size", counts(study.runs)
     return Figure("buffers", title, text, used, panels, same_y=study.one_scale)
 
@@ -155,7 +156,8 @@ def diagnostics(study: Study) -> Figure:
     }
     text = (
         "Mean over runs, of the second half of each run (share evicted: at its end); bars: least and largest run. "
-        "With fifo and reservoir the buffer does not depend on the method, and the lines lie on each other."
+        "With fifo and reservoir the buffer does not depend on the method, and the lines lie on each other. "
+        f"{study.eviction}"
     )
     panels = _against_capacity(study, names, other_settings(study, CAPACITY)[:MOST_PANELS])
     return Figure("diagnostics", "What the buffer hands out", text, counts(study.runs), panels)
@@ -179,7 +181,8 @@ def networks(study: Study) -> list[Figure]:
     place = study.index(CAPACITY)
     if names and place is not None:
         title = "Forgetting, plasticity and churn against buffer size"
-        text = f"{MEANING} Mean over runs, of the second half of each run; bars: least and largest run."
+        bars = "Mean over runs, of the second half of each run; bars: least and largest run."
+        text = f"{MEANING} {bars} {study.eviction}"
         others = [study.reference[:place] + study.reference[place + 1 :]]
         panels = _against_capacity(study, names, others)
         made.append(Figure("networks_buffers", title, text, counts(study.runs), panels))

@@ -92,9 +92,10 @@ def _subject(study: Study) -> str:
     diverged = f", {len(study.diverged)} diverged" if study.diverged else ""
     what = f"{', '.join(study.methods)} on {', '.join(study.environments)}, seeds {seeds_of(study.runs)}"
     fewest = min(filter(None, (len(study.of(method, at)) for method in study.methods for at in study.settings)))
+    subject = f"{runs}{diverged}: {what}. {study.eviction}".rstrip()
     if fewest >= FEW:
-        return f"{runs}{diverged}: {what}."
-    return f"{runs}{diverged}: {what}. Settings with {counted(fewest, 'run')}: their intervals cover less than 95 %."
+        return subject
+    return f"{subject} Settings with {counted(fewest, 'run')}: their intervals cover less than 95 %."
 
 
 def _folded(title: str, more: str, content: str, *, is_open: bool = False) -> str:

@@ -22,7 +22,7 @@ from coop.records.reading import returns_by_step
 from coop.records.summaries import parse_summary
 from coop.studies.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
 from coop.studies.report.sources import RunSource, open_source
-from coop.studies.sweep.grid import parse_grid
+from coop.studies.sweep.grid import parse_grid, starting
 
 Floats = NDArray[np.float64]
 Setting = tuple[Any, ...]  # a value for each axis
@@ -84,13 +84,21 @@ class Study:
 
     @property
     def methods(self) -> list[str]:
-        """The methods with a finished run, in the order of the registry: that of the paper's table first."""
-        return [method for method in METHODS.names() if any(run.config.method == method for run in self.runs)]
+        """The methods with a finished run: those of the registry, of the paper's table first, then users' own."""
+        found = dict.fromkeys(run.config.method for run in self.runs)
+        known = [method for method in METHODS.names() if method in found]
+        return [*known, *(method for method in found if method not in known)]
 
     @property
     def buffered(self) -> list[str]:
         """The methods with a finished run that have a replay buffer."""
         return [method for method in self.methods if METHODS.get(method).stream is None]
+
+    @property
+    def eviction(self) -> str:
+        """By which policies the buffers of the runs evict, as a sentence; empty if no run has a buffer."""
+        found = sorted({run.config.replay.eviction for run in self.runs if not run.config.streaming})
+        return f"Eviction: {', '.join(found)}." if found else ""
 
     @property
     def environments(self) -> list[str]:
@@ -208,7 +216,7 @@ def load_study(path: Path) -> Study:
         more = f" (and {len(missing) - SHOWN} more)" if len(missing) > SHOWN else ""
         raise RunError(f"{path}: none of its {len(names)} runs is finished{also}: {states}{more}")
     axes = _axes([*(run.config for run in runs), *diverged.values()])
-    preset = resolve(load_tables(grid.file.preset if grid else PRESET, None))
+    preset = resolve(starting(grid.file) if grid else load_tables(PRESET, None))
     reference = tuple(_nearest(value_of(preset, axis), {value_of(run.config, axis) for run in runs}) for axis in axes)
     return Study(grid.file.title if grid else "", tuple(runs), missing, diverged, axes, reference)
 

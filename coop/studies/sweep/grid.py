@@ -25,6 +25,7 @@ from coop.common.settings.fields import Count, Positive
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
+from coop.common.settings.starting import starting_tables, stated
 from coop.common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
@@ -39,8 +40,8 @@ class GridFile:
     seeds: Annotated[tuple[Count, ...], Field(min_length=1)] = (0,)
     title: str = ""
     """The grid's question, in one line."""
-    preset: str = "cartpole"
-    """Preset from which every cell starts."""
+    preset: str = ""
+    """Preset from which every cell starts; that of its environment if empty, neutral settings if it has none."""
     mode: Literal["lockstep", "distributed"] = "lockstep"
     """Whether a cell is a run of coop-lockstep or of coop-local."""
     actors: Positive = 1
@@ -159,31 +160,39 @@ def _choices(file: GridFile) -> Iterator[Choice]:
                 continue  # it has no replay buffer: one cell for all settings of the others'
             chosen = {path: value for path, value in chosen.items() if path[0] != "replay"}
         parts = [f"{names[path]}={_word(value)}" for path, value in chosen.items()]
-        name = check_run_name("-".join([method, *parts, f"seed={seed}"]), "a cell")
+        name = check_run_name("-".join([method.replace(":", "."), *parts, f"seed={seed}"]), "a cell")
         yield Choice(name, method, seed, chosen)
 
 
 def _cells(file: GridFile, choices: Iterable[Choice]) -> tuple[Cell, ...]:
-    preset = load_tables(file.preset, None)
 
     @cache
-    def base(method: str, total_steps: int | None) -> dict[str, Any]:
+    def base(method: str, total_steps: int | None, env_id: str | None) -> dict[str, Any]:
+        preset = starting(file, env_id)
         return to_tables(resolve(preset if total_steps is None else shortened(preset, total_steps), method))
 
     cells = []
     for choice in choices:
         total_steps = choice.values.get(("total_steps",), file.fixed.get("total_steps"))
         fits = type(total_steps) is int and total_steps > 0  # other values are refused below
-        start = base(choice.method, total_steps if fits else None)
-        tables = merged(start, file.fixed)
+        given = file.fixed
         for path, value in choice.values.items():
-            tables = merged(tables, nested(path, value))
-        cells.append(Cell(choice.name, validated({**of_method(tables, choice.method), "seed": choice.seed})))
+            given = merged(given, nested(path, value))
+        env = given.get("env")
+        env_id = env.get("id") if isinstance(env, Mapping) else None
+        start = base(choice.method, total_steps if fits else None, env_id if isinstance(env_id, str) else None)
+        tables = {**of_method(merged(start, given), choice.method), "seed": choice.seed}
+        cells.append(Cell(choice.name, validated(tables, stated(given), lockstep=file.mode == "lockstep")))
     for cell in cells:
         check_distributed(cell.config) if file.mode == "distributed" else _check_lockstep(cell.config)
     _check_environments(cells)
     _check_collisions(cells)
     return tuple(cells)
+
+
+def starting(file: GridFile, env_id: str | None = None) -> dict[str, Any]:
+    """The tables from which the cells of an environment start, None for that of most grids."""
+    return load_tables(file.preset, None) if file.preset else starting_tables(env_id)
 
 
 def _axes(file: GridFile) -> dict[FieldPath, list[Any]]:

@@ -29,6 +29,7 @@ def why_not(config: RunConfig) -> str:
         ("replay.eviction", replay.eviction in ("fifo", "reservoir"), "fifo, reservoir"),
         ("replay.ratio", replay.ratio <= 1, "at most 1"), ("replay.n_step", replay.n_step == 1, "1"),
         ("learner.device", learner.device == "cpu", "cpu"),
+        ("learner.tau", learner.tau is None, "none"),
         ("learner.swap_unit", learner.swap_unit == "updates" and not learner.reset_role_at_episode, "updates"),
         ("learner.weight_decay", not any(learner.weight_decay), "0"),
         ("actor.num_envs", config.actor.num_envs == 1, "1"),

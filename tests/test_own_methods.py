@@ -1,0 +1,234 @@
+"""Methods and policies of a user's own, by "module:name": the examples, what hooks see, and how they are refused."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from commands import run_command
+from coop.common.messaging.messages.join import JoinReply
+from test_agent import SPEC, batches
+
+import coop
+from coop.common.errors import JoinError, UsageError
+from coop.common.imports import permit
+from coop.common.messaging import wire
+from coop.common.settings.tables import resolve
+from coop.common.types import Batch
+from coop.learner.agent import Agent
+from coop.learner.methods.rule import UpdateRule
+
+EXAMPLES = Path(__file__).parents[1] / "examples" / "methods"
+
+
+@pytest.fixture(autouse=True)
+def _examples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+
+
+def agent_of(method: str, **tables: Any) -> Agent:
+    """An agent with networks that differ, whose optimizer is plain gradient descent."""
+    learner = {"optimizer": "sgd", "learning_rate": 0.1, "swap_every": 100, **tables.pop("learner", {})}
+    agent = Agent(resolve({"method": method, "network": {"hidden": [8]}, "learner": learner, **tables}), SPEC)
+    flat = agent.networks[1].snapshot()
+    agent.networks[1].load(flat + 0.2 * np.random.default_rng(1).standard_normal(len(flat), np.float32))
+    return agent
+
+
+def values(agent: Agent, batch: Batch) -> Any:
+    """Q of both networks at obs and next_obs: float32 [2, 2, batch, actions]."""
+    both = (batch.frames[index].reshape(-1, 4) for index in (batch.obs_index, batch.next_index))
+    return np.stack([agent.q_values(obs) for obs in both], axis=1)
+
+
+def discounts(batch: Batch, gamma: float = 0.99) -> Any:
+    return gamma**batch.span * ~batch.terminated
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_examples_are_short(path: Path) -> None:
+    assert len(path.read_text().splitlines()) < 40
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *({"method": name} for name in ("munchausen:MUNCHAUSEN", "minto:Minto", "minto:MAXMIN", "cql:CQL")),
+        *({"eviction": name} for name in ("best_returns:BestReturns", "hashed_coverage:Coverage")),
+        *({"sampling": name} for name in ("recency:Combined", "recency:Geometric")),
+    ],
+    ids=lambda settings: next(iter(settings.values())),
+)
+def test_examples_train_and_go_on_to_the_byte(settings: dict[str, str], tmp_path: Path) -> None:
+    """The second half of a run, from its checkpoint, leaves the parameters of the uninterrupted one."""
+    digests = []
+    for steps, name in ((160, "whole"), (80, "halves"), (160, "halves")):
+        tables = {"replay": {"capacity": 60, "learning_starts": 20, **settings}, "network": {"hidden": [8]}}
+        method = tables["replay"].pop("method", "coop")  # type: ignore[attr-defined]
+        run = coop.train(
+            method=method, total_steps=steps, run_dir=tmp_path / name, resume=name == "halves", log="none",
+            actor={"epsilon_steps": 50}, learner={"learning_rate_final": 1.0}, **tables,
+        )  # fmt: skip
+        assert run.wait()["exit"] == "complete"  # type: ignore[index]
+        digests.append([each.snapshot().tobytes() for each in coop.load(tmp_path / name).checkpoint().networks])
+    assert digests[0] == digests[2] != digests[1]
+
+
+def test_munchausen_by_the_paper_s_formula() -> None:
+    agent, batch = agent_of("munchausen:MUNCHAUSEN", munchausen={"tau": 0.5, "alpha": 0.8, "low": -0.4}), batches(1)[0]
+    q = torch.from_numpy(values(agent, batch)).double()
+    log, log_next = (0.5 * torch.log_softmax(q[1, when] / 0.5, 1) for when in (0, 1))
+    taken = log.numpy()[np.arange(32), batch.actions]
+    assert (taken < -0.4).any()
+    assert (taken > -0.4).any()
+    soft = ((log_next / 0.5).exp() * (q[1, 1] - log_next)).sum(1).numpy()
+    targets = batch.rewards + 0.8 * taken.clip(-0.4, 0) + discounts(batch) * soft
+    expected = q[0, 0].numpy()[np.arange(32), batch.actions] - targets
+    np.testing.assert_allclose(agent.own_td_errors(batch), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(agent.update(batch).td_errors, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["minto:Minto", "minto:MAXMIN"])
+def test_minto_takes_the_smaller_value_of_each_action(method: str) -> None:
+    agent, batch = agent_of(method), batches(1)[0]
+    q = values(agent, batch)
+    best = [max(min(one, other) for one, other in zip(*rows, strict=True)) for rows in zip(*q[:, 1], strict=True)]
+    assert not np.allclose(best, q[:, 1].max(2).min(0)), "which is not the smaller of both maxima"
+    targets = batch.rewards + discounts(batch) * np.array(best)
+    expected = q[0, 0][np.arange(32), batch.actions] - targets
+    np.testing.assert_allclose(agent.update(batch).td_errors, expected, rtol=1e-4, atol=1e-5)
+    assert agent.rule.metrics() == {"online_smaller_share": pytest.approx((q[0, 1] < q[1, 1]).mean())}
+    assert agent.config.two_networks == (method == "minto:MAXMIN")
+
+
+def test_cql_s_gradient_is_autograd_s() -> None:
+    """One step of gradient descent on the TD loss and the penalty, both by autograd through the whole network."""
+    agent, batch = agent_of("cql:CQL", cql={"weight": 2.0}), batches(1)[0]
+    before, q = agent.networks[0].snapshot(), values(agent, batch)
+    targets = torch.tensor(batch.rewards + discounts(batch) * q[1, 1].max(1), dtype=torch.float32)
+    module = agent.networks[0].module
+    for parameter in module.parameters():
+        parameter.requires_grad_()
+    out = module(torch.tensor(batch.frames[batch.obs_index].reshape(-1, 4)))
+    taken = out.gather(1, torch.tensor(batch.actions, dtype=torch.int64)[:, None])[:, 0]
+    cost = (0.5 * (taken - targets) ** 2).mean() + 2 * (out.logsumexp(1) - taken).mean()
+    slopes = torch.autograd.grad(cost, list(module.parameters()))
+    for parameter in module.parameters():
+        parameter.requires_grad_(False)
+    expected = before - 0.1 * torch.cat([slope.ravel() for slope in slopes]).numpy()
+    agent.update(batch)
+    np.testing.assert_allclose(agent.networks[0].snapshot(), expected, rtol=1e-4, atol=1e-6)
+
+
+class Squared(UpdateRule):
+    """The default targets and loss, by hooks that see the batch."""
+
+    def targets(self, step: Any) -> Any:
+        assert (step.batch.reuse >= 1).all()
+        assert (step.batch.ids >= 0).all()
+        assert (step.discounts[step.batch.terminated] == 0).all()
+        return super().targets(step)
+
+    def loss(self, step: Any, q: torch.Tensor) -> torch.Tensor:
+        taken = q.gather(1, step.actions[:, None])[:, 0]
+        return (0.5 * step.weights * (taken - step.targets) ** 2).mean()
+
+
+@pytest.mark.parametrize("learner", [{}, {"double": True}, {"reward_bound": 0.001}], ids=str)
+@pytest.mark.parametrize("like", ["dqn", "coop"])
+def test_hooks_that_say_the_same_do_the_same(like: str, learner: dict[str, Any], monkeypatch: Any) -> None:
+    of = coop.Method("squared", "", rule=Squared, two_networks=like == "coop", error_driven=like == "coop")
+    monkeypatch.setattr(sys.modules[__name__], "SQUARED", of, raising=False)
+    own, plain = (agent_of(name, learner=learner) for name in (f"{__name__}:SQUARED", like))
+    for batch in batches(3):
+        np.testing.assert_allclose(own.update(batch).td_errors, plain.update(batch).td_errors, rtol=1e-4, atol=1e-6)
+    for one, other in zip(own.networks, plain.networks, strict=True):
+        np.testing.assert_allclose(one.snapshot(), other.snapshot(), rtol=1e-4, atol=1e-6)
+
+
+def test_soft_targets_follow_by_hand() -> None:
+    agent = agent_of("dqn", learner={"tau": 0.25, "target_update_every": 1})
+    before = agent.networks[1].snapshot()
+    result = agent.update(batches(1)[0])
+    expected = before + 0.25 * (agent.networks[0].snapshot() - before)
+    np.testing.assert_allclose(agent.networks[1].snapshot(), expected, rtol=1e-6)
+    assert (agent.versions, result.swapped) == ([1, 1], False)
+    assert not np.array_equal(agent.networks[0].snapshot(), agent.networks[1].snapshot())
+
+
+def test_a_method_may_move_its_target_network_and_sees_the_step() -> None:
+    class Half(UpdateRule):
+        def after_update(self, step: Any) -> None:
+            step.target.follow(step.online, 0.5)
+
+    agent = agent_of("dqn")
+    agent.rule = Half(agent.config, np.random.default_rng(0))
+    before = agent.networks[1].snapshot()
+    agent.update(batches(1)[0])
+    np.testing.assert_allclose(agent.networks[1].snapshot(), (before + agent.networks[0].snapshot()) / 2, rtol=1e-5)
+
+
+class Counting(UpdateRule):
+    name = "mine"
+
+    def metrics(self) -> dict[str, float]:
+        return {self.name: 7.0}
+
+
+def test_a_method_s_metrics_are_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flags: dict[str, Any] = {
+        "method": f"{__name__}:Counting",
+        "total_steps": 330,
+        "network": {"hidden": [8]},
+        "log": "none",
+    }
+    coop.train(run_dir=tmp_path / "a", **flags).wait()
+    assert coop.load(tmp_path / "a").metrics["mine"].tolist() == [7.0]
+    monkeypatch.setattr(Counting, "name", "loss")
+    with pytest.raises(coop.RunError, match="its metrics can't be called 'loss', as others are"):
+        coop.train(run_dir=tmp_path / "b", **flags).wait()
+
+
+def test_targets_of_another_shape_are_refused() -> None:
+    class Wide(UpdateRule):
+        def targets(self, step: Any) -> Any:
+            return step.target_q_next
+
+    agent = agent_of("dqn")
+    agent.rule = Wide(agent.config, np.random.default_rng(0))
+    with pytest.raises(UsageError, match=r"targets of shape \(32, 2\), must be \(32,\)"):
+        agent.update(batches(1)[0])
+
+
+def test_a_role_imports_only_what_its_user_permits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The learner's answer names the module; reading the config would run it."""
+    config = resolve({"method": "minto:MAXMIN", "replay": {"eviction": "best_returns:BestReturns"}})
+    answer = JoinReply(config, SPEC, "x", 0, [], 1, 0).encode("r")
+    monkeypatch.setattr("coop.common.imports._named", set())
+    with pytest.raises(JoinError, match="method = 'minto:MAXMIN': this process may not import 'minto'"):
+        JoinReply.decode(wire.decode(answer))
+    permit(["minto"])
+    with pytest.raises(
+        JoinError, match=r"replay.eviction = 'best_returns:BestReturns': .* --allow-import best_returns"
+    ):
+        JoinReply.decode(wire.decode(answer))
+    permit(["best_returns"])
+    assert JoinReply.decode(wire.decode(answer)).config == config
+
+
+@pytest.mark.timeout(600)
+def test_a_topology_with_a_method_and_a_policy_of_one_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
+    flags = ("--method", "minto:MAXMIN", "--replay.eviction", "best_returns:BestReturns", "--replay.capacity", "50")
+    done = run_command("coop-local", *flags, "--total-steps", "300", "--run-dir", tmp_path / "a", timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (
+        "settings: preset cartpole; method: minto:MAXMIN; gamma: 0.95; replay: capacity 50, eviction best_ret"
+        in done.stdout
+    )
+    assert coop.load(tmp_path / "a").summary["exit"] == "complete"  # type: ignore[index]
+    assert coop.load(tmp_path / "a").policy().spec == SPEC
