@@ -1,4 +1,4 @@
-"""Numbers: the running mean of returns over the last 100 episodes, the paper's measure, exact text, strict JSON."""
+"""Numbers: updates due, the running mean of returns over the last 100 episodes, exact text, strict JSON."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 RETURN_WINDOW = 100  # episodes
 METRICS_EVERY = 200  # updates from one row of metrics to the next
+
+
+def updates_due(ratio: float, steps: int) -> int:
+    """Updates due after so many steps of a replay ratio: the nearest whole number, of two the larger; at least 0."""
+    return max(0, math.floor(ratio * steps + 0.5))
 
 
 def exact(value: float) -> str:

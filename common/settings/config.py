@@ -23,6 +23,7 @@ from coop.common.bounds import (
     MAX_TOLERANCE,
 )
 from coop.common.errors import UsageError
+from coop.common.numbers import updates_due
 from coop.common.process.untrusted import RUN
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
@@ -245,7 +246,7 @@ class RunConfig:
     @cached_property
     def planned_updates(self) -> int:
         """Updates of a run of all `total_steps`: the ratio applies from `learning_starts` on."""
-        return round(self.replay.ratio * (self.total_steps - self.replay.learning_starts))
+        return updates_due(self.replay.ratio, self.total_steps - self.replay.learning_starts)
 
     @cached_property
     def two_networks(self) -> bool:

@@ -33,7 +33,7 @@ def _problems(config: RunConfig) -> Iterator[str]:
         asked = f"actor.segment_steps = {config.actor.segment_steps}"
         yield f"{asked}: allowed: at most {most} with replay.n_step = {replay.n_step}"
     if config.planned_updates < 1:
-        least = replay.learning_starts + math.floor(0.5 / replay.ratio) + 1
+        least = replay.learning_starts + math.ceil(0.5 / replay.ratio)
         yield (
             f"total_steps = {config.total_steps}: plans no update; allowed: at least {least} "
             f"with replay.learning_starts = {replay.learning_starts} and replay.ratio = {replay.ratio:g}"

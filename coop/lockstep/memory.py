@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -92,28 +91,26 @@ class TableMemory:
 
     def follow(self, turn: Turn, step: int) -> None:
         """See `Experience`: the table is restored from its snapshot."""
-        self._cut(turn, self._updates_by(step - 1), step)
+        self._cut(turn, self.due(step - 1), step)
 
     def _cut(self, turn: Turn, version: int, step: int) -> list[Segment]:
         """Add a step; return the segments that it completes."""
         segments = self._segments.add(turn.actions, turn.steps, version, turn.ended)
-        if self._due(step):
+        if self._due_at(step):
             segments += self._segments.flush()
         return segments
 
     def batches(self, step: int) -> Iterator[Batch]:
         """See `Experience`."""
-        for _ in range(self._due(step)):
+        for _ in range(self._due_at(step)):
             yield self.table.sample(self._config.learner.batch_size)
 
-    def _due(self, step: int) -> int:
-        """Number of updates between the first `step` steps and the next one."""
-        return self._updates_by(step) - self._updates_by(step - 1)
+    def due(self, step: int) -> int:
+        """Number of updates due after the first `step` steps."""
+        return self._core.limiter.due(step)
 
-    def _updates_by(self, step: int) -> int:
-        """Number of updates after the first `step` steps."""
-        settings = self._config.replay
-        return math.floor(settings.ratio * max(0, step - settings.learning_starts))
+    def _due_at(self, step: int) -> int:
+        return self.due(step) - self.due(step - 1)
 
     def counters(self) -> dict[str, int]:
         """See `Experience`."""
