@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from coop.actors.player import Turn
 from coop.actors.segments import SegmentAssembler
 from coop.common.errors import UsageError
+from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.registry import loaded
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
@@ -70,7 +71,6 @@ class TableMemory:
     """
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
-        self._config = config
         self._segments = SegmentAssembler(
             spec, 1, 0, config.actor.segment_steps, n_step=config.replay.n_step, gamma=config.learner.gamma
         )
@@ -87,7 +87,7 @@ class TableMemory:
     def add(self, turn: Turn, step: int) -> None:
         """See `Experience`."""
         for segment in self._cut(turn, turn.version, step):
-            self.table.insert(segment)
+            self._core.apply_insert(segment)
 
     def follow(self, turn: Turn, step: int) -> None:
         """See `Experience`: the table is restored from its snapshot."""
@@ -96,21 +96,19 @@ class TableMemory:
     def _cut(self, turn: Turn, version: int, step: int) -> list[Segment]:
         """Add a step; return the segments that it completes."""
         segments = self._segments.add(turn.actions, turn.steps, version, turn.ended)
-        if self._due_at(step):
+        if self.due(step) > self.due(step - 1):
             segments += self._segments.flush()
         return segments
 
     def batches(self, step: int) -> Iterator[Batch]:
         """See `Experience`."""
-        for _ in range(self._due_at(step)):
-            yield self.table.sample(self._config.learner.batch_size)
+        for number in range(self.due(step - 1), self.due(step)):
+            request = DrawRequest(0, number, number, self._core.batch_size, self._core.episodes_total)
+            yield self._core.apply_draw(request).batch.read()
 
     def due(self, step: int) -> int:
         """Number of updates due after the first `step` steps."""
         return self._core.limiter.due(step)
-
-    def _due_at(self, step: int) -> int:
-        return self.due(step) - self.due(step - 1)
 
     def counters(self) -> dict[str, int]:
         """See `Experience`."""
@@ -124,7 +122,7 @@ class TableMemory:
 
     def save(self, folder: Path, mark: Mark) -> None:
         """See `Experience`."""
-        save_snapshot(self._core.snapshot(mark.number), threading.Condition(), folder, mark)
+        save_snapshot(self._core.snapshot(mark.number, (mark.number,)), threading.Condition(), folder, mark)
 
     def load(self, folder: Path, mark: Mark) -> None:
         """See `Experience`."""
