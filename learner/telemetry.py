@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.messaging.messages.sample import Drawn
 from coop.common.numbers import RETURN_WINDOW
-from coop.common.types import Array, Batch
+from coop.common.transitions import Batch, Drawn
+from coop.common.types import Array
 from coop.learner.diagnostics import Diagnostics
 from coop.learner.losses import Values
 from coop.learner.protocol import AnyAgent

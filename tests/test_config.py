@@ -168,7 +168,6 @@ def test_a_short_run_of_a_long_preset_learns(flags: list[str], start: int, monke
         (["--replay.tolerance", "1e13"], ["replay.tolerance", "1000000000000"]),
         (["--total-steps", "2000000000000"], ["total_steps", "1000000000000"]),
         (["--seed", str(2**63)], ["seed", str(2**63 - 1)]),
-        (["--replay.sampling", "prioritized", "--learner.batch-size", "26000"], ["learner.batch_size", "25000"]),
     ],
 )
 def test_refused_in_one_line(flags: list[str], words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:

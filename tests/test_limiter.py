@@ -222,7 +222,7 @@ def test_bad_settings_are_refused(settings: dict[str, float], words: str) -> Non
 
 @given(ratio=st.floats(0.01, 8), start=st.integers(0, 50), steps=st.integers(1, 400))
 def test_draws_are_due_when_they_are_admitted_with_tolerance_0(ratio: float, start: int, steps: int) -> None:
-    """Lockstep draws what is due, processes what is admitted: the same numbers, up to rounding where two are as near."""
+    """Lockstep draws what is due, processes what is admitted: as many, up to rounding where two numbers are as near."""
     limiter = RateLimiter(ratio=ratio, start=start, tolerance=0)
     drawn = 0
     for inserted in range(1, start + steps + 1):

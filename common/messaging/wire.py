@@ -21,7 +21,7 @@ from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import BadMessage
 from coop.common.types import Array
 
-PROTOCOL = 8
+PROTOCOL = 9
 MAGIC = 0x434F4F50  # "COOP"
 ALIGNMENT = 64
 MAX_HEADER = 1 << 20

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from coop.common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
+from coop.common.bounds import MAX_SEGMENT_STEPS
 from coop.common.errors import UsageError
 from coop.common.settings.config import NETWORK_KINDS, RunConfig
 from coop.common.settings.environment import EnvSettings
@@ -49,15 +49,9 @@ def _problems(config: RunConfig) -> Iterator[str]:
 
 
 def _replay_problems(config: RunConfig) -> Iterator[str]:
-    replay, learner = config.replay, config.learner
+    replay = config.replay
     if not replay.replacement and not SAMPLERS.get(replay.sampling).without_replacement:
         able = ", ".join(repr(name) for name in SAMPLERS.names() if SAMPLERS.get(name).without_replacement)
         yield f"replay.sampling = {replay.sampling!r}: allowed: {able} with replay.replacement = False"
     if replay.journal_keep and not replay.journal:
         yield "replay.journal_keep = True: needs replay.journal = True"
-    if replay.prioritized and learner.batch_size * learner.prefetch > MAX_PRIORITIES:
-        most = MAX_PRIORITIES // learner.prefetch
-        yield (
-            f"learner.batch_size = {learner.batch_size}: allowed: at most {most} "
-            f"with learner.prefetch = {learner.prefetch} and a prioritized table"
-        )

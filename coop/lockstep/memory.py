@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from coop.actors.player import Turn
 from coop.actors.segments import SegmentAssembler
 from coop.common.errors import UsageError
-from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.registry import loaded
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
-from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.common.transitions import IN_BATCH, Batch, DrawRequest, Segment, filled
+from coop.common.types import Array, EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.methods.stream_q import StreamAgent, Transition
 from coop.learner.protocol import AnyAgent
@@ -142,7 +142,6 @@ class LatestTransition:
         self._turn: Turn
         stack = np.arange(self._spec.stack, dtype=np.int32)[None]
         self._index = stack, stack + self._spec.stack
-        self._ones = np.ones(1, np.float32), np.ones(1, np.int32), np.ones(1, np.uint8)
 
     def begin(self, obs: Array) -> None:
         """See `Experience`."""
@@ -162,13 +161,13 @@ class LatestTransition:
         turn, steps = self._turn, self._turn.steps
         frames = np.concatenate((self._obs, steps.next_obs)).reshape(-1, *self._spec.frame_shape)
         self._obs = steps.obs
-        weights, reuse, span = self._ones
-        yield Transition(
-            frames, *self._index, turn.actions, steps.rewards, steps.terminated, weights,
-            ids=np.array([step - 1]), param_version=np.array([turn.version]), age=np.zeros(1, np.int64), reuse=reuse,
-            span=span,
-            restart=steps.obs[0] if steps.restarted[0] else None,
-        )  # fmt: skip
+        obs_index, next_index = self._index
+        given = {
+            "obs_index": obs_index, "next_index": next_index, "actions": turn.actions, "rewards": steps.rewards,
+            "terminated": steps.terminated, "ids": np.array([step - 1]), "param_version": np.array([turn.version]),
+        }  # fmt: skip
+        restart = steps.obs[0] if steps.restarted[0] else None
+        yield Transition(frames=frames, restart=restart, **filled(IN_BATCH, 1, given))
 
     def counters(self) -> dict[str, int]:
         """See `Experience`."""

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from coop.common.errors import UsageError
 from coop.common.process.randomness import generator_state, set_generator_state
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
-from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.common.transitions import Batch, Segment
+from coop.common.types import Array, EnvSpec
 from coop.replay.table.columns import Columns
 from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
 from coop.replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, TableView, make_policies
@@ -93,7 +94,7 @@ class Table:
         self._columns = seen = Columns(capacity, spec.stack, prioritized=self._prioritized)
         self._max_priority = 1.0
         self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
-        arrays = seen.ids, seen.reuse, seen.rewards, seen.terminated, seen.priorities
+        arrays = seen.ids, seen.reuse, seen.named["rewards"], seen.named["terminated"], seen.priorities
         view = TableView(rng, *arrays, priority_exponent, importance_exponent, replacement)
         self._eviction, self._sampling = make_policies(evicts, draws, view)
         self._tails = StreamTails(self._frames, spec.stack)
@@ -125,9 +126,10 @@ class Table:
 
     def repeated(self) -> int:
         """Count the transitions held that equal another one in their frames, action, reward, end and span."""
-        held = self._columns
-        slots = held.slots[: len(self)].astype(np.intp)
-        values = zip(slots, held.actions, held.rewards, held.terminated, held.span, strict=False)
+        own = ("ids", "reuse", "param_version", "priorities")  # these differ where a transition has come in twice
+        slots = self._columns.slots[: len(self)].astype(np.intp)
+        columns = (column for name, column in self._columns.named.items() if name not in own)
+        values = zip(slots, *columns, strict=False)
         return len(self) - len({hash((self._frames.read(each).tobytes(), *rest)) for each, *rest in values})
 
     def insert(self, segment: Segment) -> None:
