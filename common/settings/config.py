@@ -26,7 +26,16 @@ from coop.common.errors import UsageError
 from coop.common.numbers import updates_due
 from coop.common.process.untrusted import RUN
 from coop.common.settings.environment import EnvSettings
-from coop.common.settings.fields import Count, Decay, NonNegative, Positive, PositiveFloat, PositiveShare, Share, Steps
+from coop.common.settings.fields import (
+    Counter,
+    Decay,
+    NonNegative,
+    Positive,
+    PositiveFloat,
+    PositiveShare,
+    Share,
+    Steps,
+)
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import EvictionName, MethodName, SamplingName
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
@@ -206,23 +215,23 @@ class RunConfig:
     """Name of the run: roles with the same name find each other."""
     method: MethodName = "coop"
     """Training method."""
-    seed: Count = 0
+    seed: Counter = 0
     """Seed of all random numbers."""
     total_steps: Steps = 50_000
     """Environment steps of the run."""
-    total_updates: Count = 0
+    total_updates: Counter = 0
     """Stop after this many updates; 0: no limit."""
-    total_episodes: Count = 0
+    total_episodes: Counter = 0
     """Stop after this many finished episodes; 0: no limit."""
     target_return: Annotated[float, Field(allow_inf_nan=False)] | None = None
     """Stop once the mean return of the last 100 episodes reaches this."""
-    checkpoint_every: Count = 10_000
+    checkpoint_every: Counter = 10_000
     """Updates between epochs, the checkpoints of the whole system; 0: only at the end."""
-    eval_every: Count = 0
+    eval_every: Counter = 0
     """Environment steps between evaluations: the acting network plays full episodes greedily; 0: none."""
     eval_episodes: Annotated[int, Field(gt=0, le=MAX_EVALUATED)] = 10
     """Episodes of each evaluation."""
-    video_every: Count = 0
+    video_every: Counter = 0
     """Environment steps between videos of an episode that the acting network plays greedily; 0: none."""
     env: EnvSettings = field(default_factory=EnvSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
