@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from coop.actors.frame_block import FrameBlock
 from coop.actors.returns import n_step_returns
 from coop.common.envs.protocol import Steps
-from coop.common.types import Array, EnvSpec, EpisodeEnd, Segment
+from coop.common.transitions import Segment
+from coop.common.types import Array, EnvSpec, EpisodeEnd
 
 
 class SegmentAssembler:

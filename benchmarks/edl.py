@@ -23,7 +23,8 @@ from coop.common.networks.network import build_network
 from coop.common.process.limits import use_threads
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import validated
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.edl.arrays import AnyArray, convert_like
 from coop.learner.edl.backprop import Tape

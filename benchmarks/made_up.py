@@ -8,7 +8,8 @@ from itertools import count
 import msgspec
 import numpy as np
 
-from coop.common.types import Batch, EnvSpec, Segment
+from coop.common.transitions import Batch, Segment
+from coop.common.types import EnvSpec
 
 ATARI = EnvSpec("Atari", (84, 84), "uint8", 4, 4)
 

@@ -27,12 +27,13 @@ from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Limit, LimitsQuestion, Snapshot, Written
 from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRow, Video
 from coop.common.messaging.messages.insert import SegmentReader, encode_segment
-from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.sample import encode_request, read_request
 from coop.common.messaging.messages.status import StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message
-from coop.common.types import EnvSpec, EpisodeEnd, Segment
+from coop.common.transitions import DrawRequest, Segment
+from coop.common.types import EnvSpec, EpisodeEnd
 
 RUN = "fuzz"
 
@@ -58,7 +59,7 @@ def targets(node: Node, reply: JoinReply) -> list[Target]:
     segment = _segment(spec)
 
     def sample(message: Message) -> None:
-        if DrawRequest.decode(message).batch_size != batch_size:
+        if read_request(message).batch_size != batch_size:
             raise BadMessage("fields.batch_size", "not this run's")
 
     def snapshot(message: Message) -> None:
@@ -82,8 +83,8 @@ def targets(node: Node, reply: JoinReply) -> list[Target]:
     mirrored = msgspec.structs.replace(draw, mirror=1, mirror_slots=1000, draws=2)
     made: list[tuple[str, bytearray, str, Callable[[Message], Any]]] = [
         (replay_key(node, "insert"), encode_segment(RUN, segment), "replay", SegmentReader(spec)),
-        (replay_key(node, "sample"), draw.encode(RUN), "replay", sample),
-        (replay_key(node, "sample"), mirrored.encode(RUN), "replay", sample),
+        (replay_key(node, "sample"), encode_request(RUN, draw), "replay", sample),
+        (replay_key(node, "sample"), encode_request(RUN, mirrored), "replay", sample),
         (replay_key(node, "limits"), Limit(1.0, 64.0).encode(RUN), "replay", limiting),
         (replay_key(node, "limits"), LimitsQuestion().encode(RUN), "replay", limiting),
         (replay_key(node, "stats"), StatsQuestion().encode(RUN), "replay", StatsQuestion.decode),

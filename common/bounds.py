@@ -5,7 +5,6 @@ from __future__ import annotations
 MAX_SEGMENT_STEPS = 4096  # steps of one emulator that travel together
 MAX_N_STEP = 100  # steps that a transition spans
 MAX_BATCH = 65_536  # transitions of a batch
-MAX_PRIORITIES = 50_000  # priority updates in one request for a batch; its header has room for so many
 MAX_AHEAD = 1024  # draws by which a learner may be ahead of its base
 MAX_STREAMS = 65_536  # emulators of one actor process
 MAX_GAPS = 1024  # segments of a stream that may be missing while later ones have arrived

@@ -1,4 +1,4 @@
-"""Numbers: running means of returns, exact text, strict JSON, the speed of a count, states of random generators.
+"""Numbers: updates due, means of returns, exact text, strict JSON, the speed of a count, states of random generators.
 
 The running mean over the last 100 episodes is the paper's measure.
 """
@@ -16,6 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 RETURN_WINDOW = 100  # episodes
 METRICS_EVERY = 200  # updates from one row of metrics to the next
+
+
+def updates_due(ratio: float, steps: int) -> int:
+    """Updates due after so many steps of a replay ratio: the nearest whole number, of two the larger; at least 0."""
+    return max(0, math.floor(ratio * steps + 0.5))
 
 
 def exact(value: float) -> str:

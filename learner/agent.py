@@ -32,7 +32,8 @@ from coop.common.registry import loaded
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
-from coop.common.types import Array, Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import Array, EnvSpec
 from coop.learner.edl.arrays import chosen, convert_like
 from coop.learner.edl.branches import Branches
 from coop.learner.given import Given

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from coop.common.networks.forward import preprocess
-from coop.common.types import Batch
+from coop.common.transitions import Batch
 from coop.learner.losses import columns, td_errors
 from coop.learner.protocol import AnyAgent
 from coop.learner.qnetwork import on_host
@@ -182,6 +182,6 @@ def _first(batch: Batch, count: int) -> Batch:
 def _joined(one: Batch, other: Batch) -> Batch:
     """The transitions of two batches, as one."""
     shift = len(one.frames)
-    other = replace(other, obs_index=other.obs_index + shift, next_index=other.next_index + shift)
+    other = msgspec.structs.replace(other, obs_index=other.obs_index + shift, next_index=other.next_index + shift)
     columns = {name: np.concatenate((column, getattr(other, name))) for name, column in one.columns().items()}
     return Batch(frames=np.concatenate((one.frames, other.frames)), **columns)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from coop.common.types import Batch
+from coop.common.transitions import Batch
 from coop.learner.losses import BatchColumns, columns
 
 

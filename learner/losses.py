@@ -8,7 +8,7 @@ from typing import Any, Generic, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.types import Batch
+from coop.common.transitions import Batch
 from coop.learner.edl.arrays import ArrayT, chosen, namespace, placed
 
 Values = NDArray[np.float32]

@@ -9,7 +9,8 @@ import torch
 
 from coop.common.networks.network import FlatNetwork
 from coop.common.settings.config import RunConfig
-from coop.common.types import Array, Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import Array, EnvSpec
 from coop.learner.agent import Update
 from coop.learner.losses import Loss, Values
 from coop.learner.methods.rule import UpdateRule

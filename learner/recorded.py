@@ -20,7 +20,8 @@ from torch import Tensor
 from coop.common.errors import first_line
 from coop.common.process.output import warn
 from coop.common.settings.config import RunConfig
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.edl.branches import branching
 from coop.learner.given import Given, indices
 from coop.learner.losses import BatchColumns, Values, columns

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from coop.common.bounds import MAX_POINTS
 from coop.common.errors import UsageError
-from coop.common.messaging.messages.sample import Drawn
 from coop.common.metrics import COLUMNS
 from coop.common.numbers import RETURN_WINDOW
-from coop.common.types import Array, Batch
+from coop.common.transitions import Batch, Drawn
+from coop.common.types import Array
 from coop.learner.diagnostics import Diagnostics
 from coop.learner.losses import Values
 from coop.learner.protocol import AnyAgent

@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.messaging.messages.sample import Drawn
 from coop.common.numbers import METRICS_EVERY
-from coop.common.types import Batch, EpisodeRow
+from coop.common.transitions import Batch, Drawn
+from coop.common.types import EpisodeRow
 from coop.learner.agent import Update
 from coop.learner.protocol import AnyAgent
 from coop.learner.telemetry import Telemetry

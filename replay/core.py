@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 
 from coop.common.errors import RunError
-from coop.common.messaging.messages.sample import MAX_EPISODES, Drawn, DrawRequest
 from coop.common.settings.capacity import check_memory
 from coop.common.settings.config import RunConfig
-from coop.common.types import Array, Batch, EnvSpec, EpisodeRecord, Segment
+from coop.common.transitions import MAX_EPISODES, NO_IDS, NO_PRIORITIES, Batch, Drawn, DrawRequest, Segment
+from coop.common.types import Array, EnvSpec, EpisodeRecord
 from coop.replay.dedup import DuplicateFilter
 from coop.replay.episodes import EpisodeLog
 from coop.replay.limiter import RateLimiter
@@ -160,7 +160,8 @@ class ReplayCore:
         for sequence in range(request.sequence, request.sequence + request.draws):
             one = request
             if replies:
-                one = msgspec.structs.replace(request, sequence=sequence, episodes_from=episodes_from, priorities=())
+                none = {"ids": NO_IDS, "priorities": NO_PRIORITIES}
+                one = msgspec.structs.replace(request, sequence=sequence, episodes_from=episodes_from, **none)
             reply = self.draw(one)
             if isinstance(reply, RetryLater):
                 return replies or reply
@@ -197,9 +198,8 @@ class ReplayCore:
         """Apply an admitted draw, a new one or one from a journal, of the first of its batches; raises as `draw`."""
         self._follow(request)
         table = self.table
-        if request.priorities:
-            numbers, priorities = zip(*request.priorities, strict=True)
-            table.update_priorities(np.array(numbers, np.int64), np.array(priorities))
+        if len(request.ids):
+            table.update_priorities(request.ids, request.priorities)
         batch = table.sample_pinned(request.batch_size)
         self.drawn = max(self.drawn, request.sequence + 1)
         self._next_episode = request.episodes_from

@@ -8,6 +8,7 @@ from math import ceil, floor, isfinite
 from typing import Any
 
 from coop.common.errors import UsageError
+from coop.common.numbers import updates_due
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +19,7 @@ class RateLimiter:
     start: transitions inserted before the first sample.
     tolerance: environment steps by which inserts may be ahead of updates, or updates ahead of inserts. At least half an
         update's worth (1 / ratio steps) is always allowed; with less, neither could proceed.
-    total: transitions after which no more are admitted; updates end at round(ratio * (total - start)).
+    total: transitions after which no more are admitted; updates end at `due(total)`.
     capacity: of the table, to be checked against the other settings if given.
     origin: (inserted, drawn) from which the ratio holds; `(start, 0)` if None, see `changed`.
 
@@ -56,10 +57,12 @@ class RateLimiter:
     @property
     def draws_total(self) -> int | None:
         """Draws of a complete run; None for a run without an end."""
-        if self.total is None:
-            return None
-        inserted, drawn = self.origin or (self.start, 0)
-        return drawn + max(0, round(self.ratio * (self.total - inserted)))
+        return None if self.total is None else self.due(self.total)
+
+    def due(self, inserted: int) -> int:
+        """Draws due once so many transitions are inserted: with tolerance 0, all that are admitted."""
+        origin_inserted, origin_drawn = self.origin or (self.start, 0)
+        return origin_drawn + updates_due(self.ratio, inserted - origin_inserted)
 
     def why_not_insert(self, inserted: int, drawn: int) -> str | None:
         """None if an insert is admitted, otherwise the reason for refusing it."""

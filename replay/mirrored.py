@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.transitions import DrawRequest
 from coop.replay.table.frames import Slots
 
 

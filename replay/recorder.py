@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.transitions import DrawRequest
 from coop.replay.limiter import RateLimiter
 
 

@@ -21,12 +21,13 @@ from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack, Retry
 from coop.common.messaging.messages.control import Limit, Limits, LimitsQuestion, Snapshot, Written
 from coop.common.messaging.messages.insert import SegmentReader
-from coop.common.messaging.messages.sample import DrawRequest, Draws, Memory, encode_batch, encode_named
+from coop.common.messaging.messages.sample import Draws, Memory, encode_batch, encode_named, read_request
 from coop.common.messaging.messages.status import Ratio, ReplayStats, ReplayStatus, StatsQuestion
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.messaging.wire import Message
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
+from coop.common.transitions import DrawRequest
 from coop.replay.core import ReplayCore, Reply, RetryLater
 from coop.replay.gate import HOLD, Gate
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
@@ -170,7 +171,7 @@ class ReplayService:
         return max(1, IN_FLIGHT // max(1, there.get(ROUTE, 0), there.get("actor", 0)))
 
     def _sample(self, message: Message) -> bytearray:
-        request = DrawRequest.decode(message)
+        request = read_request(message)
         if request.batch_size != self._core.batch_size:
             raise BadMessage("fields.batch_size", f"{request.batch_size}; this run draws {self._core.batch_size}")
         shared = self._core.table.shared_memory

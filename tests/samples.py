@@ -10,7 +10,8 @@ from coop.common.envs.make import make_vector_env
 from coop.common.envs.protocol import Steps
 from coop.common.messaging.transport import Node
 from coop.common.settings.environment import EnvSettings
-from coop.common.types import Array, EnvSpec, EpisodeEnd, Segment
+from coop.common.transitions import Segment
+from coop.common.types import Array, EnvSpec, EpisodeEnd
 
 INCARNATION = 77
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.common.transitions import Batch, Segment
+from coop.common.types import Array, EnvSpec
 from coop.replay.table.table import Table, _reuse_histogram
 
 

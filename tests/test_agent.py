@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -9,7 +10,8 @@ from samples import make_segment
 
 from coop.common.errors import UsageError
 from coop.common.settings.config import EdlSettings, LearnerSettings, NetworkSettings, RunConfig
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.agent import Agent, _decay_vector
 from coop.learner.qnetwork import make_network
 from coop.replay.table.table import Table
@@ -89,7 +91,9 @@ def test_an_update_by_autograd(double: bool, bound: float | None, loss: str) -> 
         _config("g-coop", optimizer="sgd", double=double, loss=loss, gamma=0.9, reward_bound=bound and bound / 10), SPEC
     )
     batch = batches(1)[0]
-    batch = replace(batch, rewards=batch.rewards * 3, weights=np.linspace(0.5, 1.5, 32, dtype=np.float32))
+    batch = msgspec.structs.replace(
+        batch, rewards=batch.rewards * 3, weights=np.linspace(0.5, 1.5, 32, dtype=np.float32)
+    )
     online, target = agent.networks
     obs, next_obs = (torch.tensor(batch.frames[i[:, 0]]) for i in (batch.obs_index, batch.next_index))
     actions = torch.tensor(batch.actions).long()[:, None]

@@ -12,8 +12,8 @@ from samples import make_segment
 from table_reference import check_references
 
 from coop.common.errors import RunError
-from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+from coop.common.transitions import DrawRequest
 from coop.common.types import EnvSpec, EpisodeRecord
 from coop.records.checkpoints import DONE, checkpoint_numbers
 from coop.records.learner_checkpoints import load_learner, newest_checkpoint, save_checkpoint

@@ -12,7 +12,8 @@ from commands import run_command
 from samples import make_segment
 
 from coop.common.settings.tables import resolve
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.device_table import DeviceTable
 from coop.learner.edl import kernels

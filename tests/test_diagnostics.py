@@ -4,13 +4,15 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
 from coop.common.settings.config import LearnerSettings, NetworkSettings, RunConfig
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.diagnostics import Diagnostics, dormant, effective_ranks, hidden_layers
 from coop.learner.losses import Values
@@ -260,7 +262,7 @@ def test_channels_are_units_of_pictures_stored_with_their_channels_last() -> Non
     views["conv1.weight"].fill_(0)
     views["conv1.bias"].copy_(torch.tensor([1.0] * 4 + [-1.0] * 12))
     diagnostics = Diagnostics()
-    diagnostics.add(replace(batch(3), frames=np.zeros((4, 10, 10, 4), np.bool_)))
+    diagnostics.add(msgspec.structs.replace(batch(3), frames=np.zeros((4, 10, 10, 4), np.bool_)))
     views["fc1.weight"].fill_(0)
     views["fc1.bias"].fill_(1)
     assert diagnostics.row(agent)["dormant_share"] == 12 / 144

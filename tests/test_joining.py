@@ -14,12 +14,13 @@ from coop.common.messaging.joining import difference, join, leave_run
 from coop.common.messaging.keys import join_key, replay_key
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Leave, Limit, Limits, LimitsQuestion
-from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.sample import encode_request
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, Refused
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import RunConfig
+from coop.common.transitions import DrawRequest
 from coop.common.types import EnvSpec
 from coop.deploy.supervisor import HEALTHY, RESTARTS, RestartPolicy
 from coop.learner.join_service import JoinService
@@ -151,7 +152,7 @@ def test_the_limiter_changes_while_the_run_goes_on(nodes: tuple[Node, Node], spe
     for sequence in range(125):
         core.insert(make_segment(spec, sequence))
     request = DrawRequest(1, 0, 0, config.learner.batch_size, 0)
-    drawn = client.ask(replay_key(client, "sample"), request.encode("test"))
+    drawn = client.ask(replay_key(client, "sample"), encode_request("test", request))
     assert drawn.fields["planned"] == 500
     now = Limits.decode(client.ask(key, Limit(0.5, 16).encode("test")))
     assert (now.ratio, now.tolerance, now.inserted, now.drawn, now.planned) == (0.5, 16, 500, 1, 251)

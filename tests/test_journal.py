@@ -17,11 +17,11 @@ from test_checkpoints import CONFIG, save
 from coop.common.errors import RunError
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
+from coop.common.transitions import NO_IDS, NO_PRIORITIES, DrawRequest
 from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
@@ -129,11 +129,15 @@ def test_priorities_are_carried_out_again(spec: EnvSpec, tmp_path: Path) -> None
     replay = replace(CONFIG.replay, sampling="prioritized", eviction="prioritized")
     config = replace(CONFIG, replay=replay)
     core = ReplayCore(config, spec, Journal(tmp_path, 5, 1, keep=False))
-    priorities: tuple[tuple[int, float], ...] = ()
+    ids, priorities = NO_IDS, NO_PRIORITIES
     for sequence in range(20):
         assert not isinstance(_insert(core, spec, sequence), RetryLater)
-        while not isinstance(got := core.draw(DrawRequest(1, core.drawn, core.drawn, 4, 0, priorities)), RetryLater):
-            priorities = tuple((number, 0.1 + number % 7) for number in got.batch.columns["ids"].tolist())
+        while True:
+            request = DrawRequest(1, core.drawn, core.drawn, 4, 0, ids=ids, priorities=priorities)
+            if isinstance(got := core.draw(request), RetryLater):
+                break
+            ids = got.batch.columns["ids"]
+            priorities = (0.1 + ids % 7).astype(np.float32)
     assert len(set(core.table.snapshot().arrays["priorities"].tolist())) > 3
     twin = ReplayCore(config, spec)
     recover(twin, tmp_path, 1, 5)

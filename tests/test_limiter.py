@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from math import floor
 from random import Random
 
 import msgpack
@@ -11,6 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coop.common.errors import UsageError
+from coop.lockstep.lockstep import Lockstep
+from coop.records.run_options import base_config
+from coop.replay.core import ReplayCore
 from coop.replay.limiter import RateLimiter
 
 THOUSAND = RateLimiter(ratio=1.0, start=1000, tolerance=40, total=50_000)
@@ -135,7 +139,7 @@ def test_any_run_completes_within_tolerance(limiter: RateLimiter, steps: list[in
             drawn += 1
         check_kept(limiter, inserted, drawn, max(steps))
     assert inserted >= limiter.total
-    assert drawn == limiter.draws_total == round(limiter.ratio * (limiter.total - limiter.start))
+    assert drawn == limiter.draws_total == floor(limiter.ratio * (limiter.total - limiter.start) + 0.5)
     assert "run complete" in (limiter.why_not_insert(inserted, drawn) or "")
     assert inserted == 0 or "run complete" in (limiter.why_not_sample(inserted, drawn, inserted) or "")
 
@@ -214,3 +218,28 @@ def test_bad_settings_are_refused(settings: dict[str, float], words: str) -> Non
     good = RateLimiter(ratio=1.0, start=10, tolerance=5, total=100)
     with pytest.raises(UsageError, match=words):
         replace(good, **settings)  # type: ignore[arg-type]
+
+
+@given(ratio=st.floats(0.01, 8), start=st.integers(0, 50), steps=st.integers(1, 400))
+def test_draws_are_due_when_they_are_admitted_with_tolerance_0(ratio: float, start: int, steps: int) -> None:
+    """Lockstep draws what is due, processes what is admitted: as many, up to rounding where two numbers are as near."""
+    limiter = RateLimiter(ratio=ratio, start=start, tolerance=0)
+    drawn = 0
+    for inserted in range(1, start + steps + 1):
+        assert limiter.why_not_insert(inserted - 1, drawn) is None
+        while limiter.why_not_sample(inserted, drawn, inserted) is None:
+            drawn += 1
+        exact = ratio * max(0, inserted - start) + 0.5
+        assert drawn == limiter.due(inserted) or abs(exact - round(exact)) < 1e-9
+
+
+def test_a_run_has_as_many_updates_in_lockstep_as_in_processes() -> None:
+    config = base_config([])
+    config = replace(config, total_steps=30, replay=replace(config.replay, ratio=0.25, learning_starts=7))
+    run = Lockstep(config)
+    while not run.trainer.outcome():
+        for _ in run.play():
+            pass
+    run.env.close()
+    limiter = ReplayCore(config, run.env.spec).limiter
+    assert run.agent.updates == limiter.draws_total == config.planned_updates == 6

@@ -190,7 +190,7 @@ def test_steps_are_stored_some_at_a_time_before_each_batch(n_step: int) -> None:
             if run.agent.updates > updates:
                 assert run.step - n_step < table.inserted <= run.step, "all whose return is complete"
     run.env.close()
-    assert run.agent.updates == 39
+    assert run.agent.updates == 40
     assert sum(call.args[0].steps for call in insert.call_args_list) == table.inserted
     assert insert.call_count < 60
 

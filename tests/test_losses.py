@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from coop.common.settings.config import LearnerSettings
-from coop.common.types import Batch
+from coop.common.transitions import Batch
 from coop.learner.losses import LOSSES, columns, output_error, td_errors
 
 ERRORS = np.array([-3.0, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5], np.float32)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,8 @@ from test_agent import SPEC, batches
 from coop.common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
 from coop.common.settings.medqn import MedqnSettings
 from coop.common.settings.tables import preset_names
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.methods.medqn import Consolidation
 from coop.records.run_options import base_config
@@ -96,7 +98,7 @@ def test_uniform_states_lie_between_the_bounds_of_all_that_was_seen() -> None:
     near = 0.25 * np.array([*(gaps * states).sum(1), *gaps.sum(1)])
     td = np.array([0, 0.75, 0, 0.25])  # TD errors: 1 - 1 and 0.5 - 0
     np.testing.assert_allclose(agent.networks[0].snapshot(), np.array([1, 0, 0, 0.5]) - 0.1 * (td + near), rtol=1e-5)
-    agent.update(replace(batch, frames=np.array([[1], [2], [10], [0]], np.float32)))
+    agent.update(msgspec.structs.replace(batch, frames=np.array([[1], [2], [10], [0]], np.float32)))
     agent.update(batch)
     assert isinstance(agent.rule, Consolidation)
     assert (agent.rule.low.tolist(), agent.rule.high.tolist()) == ([-1.0], [10.0])
@@ -110,7 +112,7 @@ def test_autograd_agrees(states: str, monkeypatch: pytest.MonkeyPatch) -> None:
     (first, batch) = batches(2)
     for one in (agent, plain):
         one.networks[0].load(plain.networks[0].snapshot() * 1.1)
-    batch = replace(batch, frames=batch.frames * 0 + 0.25) if states == "uniform" else batch
+    batch = msgspec.structs.replace(batch, frames=batch.frames * 0 + 0.25) if states == "uniform" else batch
     online, target = agent.networks
     obs = torch.tensor(batch.frames[batch.obs_index[:, 0]])
     cost = 0.3 * ((online.module(obs) - target.module(obs).detach()) ** 2).sum(1).mean()
@@ -127,7 +129,7 @@ def test_a_restored_agent_goes_on_to_the_bit(dtype: Any) -> None:
     settings = replace(config(MedqnSettings(epochs=2)), network=NetworkSettings(hidden=(8, 8), dtype=dtype))
     seen = batches(12)
     first, second = Agent(settings, SPEC), Agent(settings, SPEC)
-    wide = replace(seen[0], frames=seen[0].frames * 3)  # its bounds are wider than those of all others
+    wide = msgspec.structs.replace(seen[0], frames=seen[0].frames * 3)  # its bounds are wider than those of all others
     for batch in [wide, *seen[1:6]]:
         first.update(batch)
     second.load_state(first.state())
@@ -142,7 +144,7 @@ def test_pictures_are_drawn_too() -> None:
     agent = Agent(replace(config(MedqnSettings()), network=NetworkSettings(hidden=(4,))), spec)
     frames = np.random.default_rng(0).integers(0, 200, (4, 10, 10), np.uint8)
     index = np.array([[0, 1], [1, 2]], np.int32)
-    agent.update(replace(batch_of_two(), frames=frames, obs_index=index, next_index=index + 1))
+    agent.update(msgspec.structs.replace(batch_of_two(), frames=frames, obs_index=index, next_index=index + 1))
     assert isinstance(agent.rule, Consolidation)
     np.testing.assert_allclose(agent.rule.high, frames[[[0, 1], [1, 2], [2, 3]]].max(0) / 255, rtol=1e-6)
 

@@ -35,18 +35,19 @@ from coop.common.messaging.messages.evaluate import GIF, Evaluated, EvaluationRo
 from coop.common.messaging.messages.insert import SegmentReader, encode_segment
 from coop.common.messaging.messages.sample import (
     BatchReader,
-    Drawn,
-    DrawRequest,
     Draws,
     NamedBatchReader,
     encode_batch,
     encode_named,
+    encode_request,
+    read_request,
 )
 from coop.common.messaging.messages.status import ReplayStats
 from coop.common.messaging.messages.weights import Current, Role, Weights
 from coop.common.messaging.wire import Message
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import to_tables
+from coop.common.transitions import Drawn, DrawRequest
 from coop.common.types import EnvSpec, EpisodeEnd, EpisodeRecord
 from coop.replay.table.table import PinnedBatch, Table
 
@@ -91,6 +92,7 @@ def _encoded_batches() -> bytearray:
     )
 
 
+REQUEST = DrawRequest(1, 3, 2, 4, 5, ids=np.array([7]), priorities=np.array([0.5], np.float32))
 READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "join": (JOIN.encode("r"), Join.decode),
     "join-reply": (JOIN_REPLY.encode("r"), JoinReply.decode),
@@ -99,7 +101,7 @@ READERS: dict[str, tuple[bytearray, Callable[[Message], Any]]] = {
     "ack": (Ack(9).encode("r"), Ack.decode),
     "retry": (Retry("later").encode("r"), Retry.decode),
     "error": (Error.of(BadMessage("f", "wrong")).encode("r"), Error.decode),
-    "sample": (DrawRequest(1, 3, 2, 4, 5, ((7, 0.5),)).encode("r"), DrawRequest.decode),
+    "sample": (encode_request("r", REQUEST), read_request),
     "batch": (_encoded_batch(), BatchReader(SPEC)),
     "batches": (_encoded_batches(), NamedBatchReader(SPEC)),
     "weights": (Weights(2, 8, FLAT).encode("r"), partial(Weights.decode, parameters=3)),
@@ -134,7 +136,6 @@ def _sent(message: Message, arrays: dict[str, Any]) -> Message:
         ("ack", Ack(9)),
         ("retry", Retry("later")),
         ("error", Error("f", "f: wrong")),
-        ("sample", DrawRequest(1, 3, 2, 4, 5, ((7, 0.5),))),
         ("role", Role(2, (4, 5), 6)),
         ("evaluated", EVALUATED),
         ("stats", STATS),
@@ -156,6 +157,8 @@ def test_an_error_that_is_not_about_a_field_comes_back() -> None:
 
 
 def test_arrays_come_back() -> None:
+    request = read_request(_valid("sample"))
+    assert (request.sequence, request.ids.tolist(), request.priorities.tolist()) == (3, [7], [0.5])
     weights = READERS["weights"][1](_valid("weights"))
     assert (weights.network, weights.version, weights.flat.tolist()) == (2, 8, FLAT.tolist())
     segment, back = make_segment(SPEC), READERS["insert"][1](_valid("insert"))
@@ -238,10 +241,6 @@ FIELDS = [
     ("sample", "batch_size", 65_537),
     ("sample", "sequence", -1),
     ("sample", "episodes_from", -1),
-    ("sample", "priorities", [[3]]),
-    ("sample", "priorities", [[3, -0.5]]),
-    ("sample", "priorities", [[3, float("inf")]]),
-    ("sample", "priorities", [[3, 1e300]]),
     ("sample", "base", MAX_UPDATES + 1),
     ("sample", "episodes_from", MAX_COUNT + 1),
     ("batch", "sequence", -1),
@@ -387,6 +386,15 @@ ARRAYS = [
     ("batches", "actions", np.full(16, 2, np.int32), "actions"),
     ("batches", "actions", np.zeros(15, np.int32), "actions"),
     ("batches", "weights", np.full(16, np.inf, np.float32), "weights"),
+    ("batch", "ids", np.full(8, -1), "ids"),
+    ("batch", "age", np.full(8, -1), "age"),
+    ("batch", "reuse", np.full(8, -1, np.int32), "reuse"),
+    ("sample", "ids", np.array([-1]), "ids"),
+    ("sample", "ids", np.array([1, 2]), "priorities"),
+    ("sample", "priorities", np.full(1, -0.5, np.float32), "priorities"),
+    ("sample", "priorities", np.full(1, np.inf, np.float32), "priorities"),
+    ("sample", "priorities", np.full(1, np.nan, np.float32), "priorities"),
+    ("sample", "priorities", np.zeros(1), "priorities"),
     ("weights", "flat", np.zeros(4, np.float32), "flat"),
     ("weights", "flat", np.zeros(3), "flat"),
 ]

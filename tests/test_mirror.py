@@ -21,7 +21,7 @@ from coop.common.messaging import wire
 from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.links import locators
-from coop.common.messaging.messages.sample import NAMED, DrawRequest, NamedBatch, NamedBatchReader
+from coop.common.messaging.messages.sample import NAMED, NamedBatch, NamedBatchReader, encode_request
 from coop.common.messaging.mirror import FIRST_SLOTS, FrameMirror
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.session import open_session
@@ -34,7 +34,8 @@ from coop.common.settings.capacity import MIRROR_SHARE, estimated_bytes, mirror_
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.effects import without_effect
 from coop.common.settings.resuming import check_resumed
-from coop.common.types import Batch, EnvSpec, Segment
+from coop.common.transitions import Batch, DrawRequest, Segment
+from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore, Reply
 from coop.replay.mirrored import MirroredFrames
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
@@ -243,7 +244,7 @@ def test_a_draw_that_is_answered_again_brings_all_its_frames() -> None:
     for sequence in range(3):
         _insert(core, sequence)
     network = _Network([_make_service(core)])
-    request = bytes(DrawRequest(1, 0, 0, 4, 0, (), None, 1, 1000, 3).encode("test"))
+    request = bytes(encode_request("test", DrawRequest(1, 0, 0, 4, 0, None, 1, 1000, 3)))
     read = NamedBatchReader(NUMBERS)
     first, again = (read(network.answer(request))[1] for _ in range(2))
     assert [len(batch.carried) for batch in again] == [len(batch.slots) for batch in again]
@@ -335,7 +336,7 @@ def test_a_frame_is_read_only_by_its_number() -> None:
 
 def test_frames_in_slots_beyond_the_mirror_come_with_each_batch() -> None:
     mirror, mirrored = FrameMirror(PICTURES, 2), MirroredFrames()
-    request = DrawRequest(1, 0, 0, 4, 0, (), None, mirror.number, mirror.slots)
+    request = DrawRequest(1, 0, 0, 4, 0, None, mirror.number, mirror.slots)
     slots, numbers = np.array([0, 5, 1]), np.array([21, 22, 23])
     for sequence, expected in enumerate(([0, 1, 2], [1], [1])):
         carried = mirrored.missing(request, sequence, slots, numbers)

@@ -12,7 +12,8 @@ from coop.actors.segments import SegmentAssembler
 from coop.common.envs.protocol import Steps
 from coop.common.messaging import wire
 from coop.common.messaging.messages.insert import SegmentReader, encode_segment
-from coop.common.types import EnvSpec, EpisodeEnd, Segment
+from coop.common.transitions import Segment
+from coop.common.types import EnvSpec, EpisodeEnd
 from coop.replay.table.table import Table
 
 GAMMA = 0.5

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 from commands import run_command
-from coop.common.messaging.messages.join import JoinReply
 from test_agent import SPEC, batches
 
 import coop
 from coop.common.errors import JoinError, UsageError
 from coop.common.imports import permit
 from coop.common.messaging import wire
+from coop.common.messaging.messages.control import JoinReply
 from coop.common.settings.tables import resolve
-from coop.common.types import Batch
+from coop.common.transitions import Batch
 from coop.learner.agent import Agent
 from coop.learner.methods.rule import UpdateRule
 

@@ -10,7 +10,8 @@ import torch
 from coop.common.errors import UsageError
 from coop.common.networks.network import build_network
 from coop.common.settings.config import EdlSettings, NetworkSettings, RunConfig
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.edl.arrays import AnyArray
 from coop.learner.edl.feedback import edl_gradients
 from coop.learner.given import Given
@@ -86,7 +87,7 @@ def _batch(spec: EnvSpec) -> Batch:
     ones = np.ones(2, np.int64)
     return Batch(
         frames, index[:, : spec.stack], after[:, : spec.stack], ones.astype(np.int32), ones.astype(np.float32),
-        np.zeros(2, np.bool_), ones.astype(np.float32), ones, ones, ones, ones.astype(np.int32), ones.astype(np.uint8),
+        np.zeros(2, np.bool_), ones, ones.astype(np.uint8), ones.astype(np.float32), ones, ones, ones.astype(np.int32),
     )  # fmt: skip
 
 

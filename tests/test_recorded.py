@@ -12,7 +12,8 @@ from samples import make_segment
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from coop.common.settings.tables import resolve
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.recorded import _WARM_UPS
 from coop.replay.table.table import Table

@@ -19,13 +19,14 @@ from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack, Retry
 from coop.common.messaging.messages.control import Snapshot, Written
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.sample import encode_request
 from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
+from coop.common.transitions import DrawRequest
 from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
@@ -54,7 +55,7 @@ def test_receipts_duplicates_and_reasons(nodes: tuple[Node, Node], spec: EnvSpec
     service = _serve(server, core, tmp_path, client)
     key = replay_key(client, "insert")
 
-    sample = DrawRequest(1, 0, 0, 4, 0).encode("test")
+    sample = encode_request("test", DrawRequest(1, 0, 0, 4, 0))
     began = time.monotonic()
     reply = client.ask(replay_key(client, "sample"), sample)
     assert 0.5 < time.monotonic() - began < 4
@@ -90,7 +91,7 @@ def test_a_waiting_insert_goes_in_when_updates_catch_up(
     payload = encode_segment("test", make_segment(spec, 5))
     pending = client.begin(replay_key(client, "insert"), payload)
     for number in range(4):
-        client.ask(replay_key(client, "sample"), DrawRequest(1, number, 0, 4, 0).encode("test"))
+        client.ask(replay_key(client, "sample"), encode_request("test", DrawRequest(1, number, 0, 4, 0)))
     assert Ack.decode(pending.wait()).inserted == 24
 
 
@@ -209,7 +210,7 @@ def test_segments_wait_behind_their_window_without_being_sent_again(
     waiter.start()
     began = time.monotonic()
     for number in range(44):
-        client.ask(replay_key(client, "sample"), DrawRequest(1, number, 0, 4, 0).encode("test"))
+        client.ask(replay_key(client, "sample"), encode_request("test", DrawRequest(1, number, 0, 4, 0)))
         time.sleep(0.14)
     waiter.join(5)
     assert time.monotonic() - began > ASK_TIMEOUT, "the last one waited longer than an ordinary question may"

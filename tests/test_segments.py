@@ -11,7 +11,8 @@ from samples import INCARNATION, cut, record
 from coop.actors.segments import SegmentAssembler
 from coop.common.envs.protocol import Steps
 from coop.common.settings.environment import EnvSettings
-from coop.common.types import Array, EnvSpec, EpisodeEnd, Segment
+from coop.common.transitions import Segment
+from coop.common.types import Array, EnvSpec, EpisodeEnd
 
 
 def rebuilt(segments: list[Segment], spec: EnvSpec) -> dict[int, list[Array]]:

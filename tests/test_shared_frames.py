@@ -16,7 +16,7 @@ from samples import await_service, make_segment
 from coop.common.errors import BadMessage
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.messages.sample import BatchReader, DrawRequest, Memory, NamedBatchReader
+from coop.common.messaging.messages.sample import BatchReader, Memory, NamedBatchReader, encode_request
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.session import open_session
 from coop.common.messaging.shared_frames import SharedFrames
@@ -25,7 +25,8 @@ from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
 from coop.common.process.shared_memory import SharedMemory, SharedMemoryReader
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch, DrawRequest
+from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore, Reply
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import Journal
@@ -67,8 +68,8 @@ def _next(sampler: SampleClient) -> Batch:
 
 
 def _draw(asker: Node, sequence: int, memory: str | None, base: int = 0) -> Message:
-    request = DrawRequest(1, sequence, base, 4, 0, (), memory)
-    return asker.ask(replay_key(asker, "sample"), request.encode("test"))
+    request = DrawRequest(1, sequence, base, 4, 0, memory)
+    return asker.ask(replay_key(asker, "sample"), encode_request("test", request))
 
 
 def _draw_here(core: ReplayCore) -> Batch:
@@ -218,7 +219,7 @@ def test_the_journal_does_not_know_the_memory(tmp_path: Path) -> None:
     address = core.table.shared_memory
     _insert(core, *range(20))
     for sequence in range(3):
-        assert isinstance(core.draw(DrawRequest(1, sequence, 0, 4, 0, (), address)), Reply)
+        assert isinstance(core.draw(DrawRequest(1, sequence, 0, 4, 0, address)), Reply)
     assert not any(address.encode() in path.read_bytes() for path in tmp_path.iterdir())
     twin = ReplayCore(CONFIG, SPEC)
     recover(twin, tmp_path, 1, 5)

@@ -17,7 +17,8 @@ from coop.common.settings.config import (
     RunConfig,
 )
 from coop.common.settings.environment import EnvSettings
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.edl.feedback import feedback_matrices
 from coop.studies.stacked import networks
@@ -109,12 +110,12 @@ class Reference:
             actions,
             ones,
             terminated,
+            zeros,
+            np.ones(size, np.uint8),
             ones,
             zeros,
             zeros,
-            zeros,
             zeros.astype(np.int32),
-            np.ones(size, np.uint8),
         )
         self.agent.update(Batch(frames, *columns))
 

@@ -1,9 +1,9 @@
 """Stream Q(lambda) against numbers derived by hand and against autograd."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -270,7 +270,7 @@ def test_stacked_pictures_are_shown_oldest_first() -> None:
     )
     one = transition(0, 2, 1, 0, terminated=True)
     index = {"obs_index": np.array([[0, 1]], np.int32), "next_index": np.array([[1, 2]], np.int32)}
-    found = agent.update(replace(one, frames=frames, **index))
+    found = agent.update(msgspec.structs.replace(one, frames=frames, **index))
     assert found.td_errors == pytest.approx([1 - values[0, 2]], rel=1e-4)
     assert (found.td_errors.dtype, found.s, found.swapped) == (np.float32, 0.0, False)
 

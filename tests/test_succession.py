@@ -18,7 +18,7 @@ from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.keys import replay_key, status_key
 from coop.common.messaging.messages.answers import Ack, Retry
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.sample import encode_request
 from coop.common.messaging.messages.status import LearnerStatus
 from coop.common.messaging.route import ReplayRoute
 from coop.common.messaging.session import open_session
@@ -26,6 +26,7 @@ from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import free_endpoint
 from coop.common.settings.config import RunConfig
+from coop.common.transitions import DrawRequest
 from coop.common.types import EnvSpec
 from coop.records.learner_checkpoints import newest_checkpoint
 from coop.replay.core import ReplayCore
@@ -44,7 +45,7 @@ def test_a_service_that_is_not_confirmed_neither_acknowledges_nor_draws(
     service.start()
     await_service(client, replay_key(client, "snapshot"))  # the last one that it declares
     segment = encode_segment("test", make_segment(spec))
-    draw = DrawRequest(1, 0, 0, core.batch_size, 0).encode("test")
+    draw = encode_request("test", DrawRequest(1, 0, 0, core.batch_size, 0))
     for question, payload in (("insert", segment), ("sample", draw)):
         answer = client.ask(replay_key(client, question), payload)
         assert Retry.decode(answer).reason == "the learner has not confirmed this replay service lately"

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from table_reference import Copies, Stream, check_references, held_ids, make_spec, table_stats, whole_state
 
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
-from coop.common.types import Batch
+from coop.common.transitions import Batch
 from coop.replay.table.table import Table
 
 
 def assert_same(one: Batch, other: Batch) -> None:
-    for name in Batch.__slots__:
+    for name in Batch.__struct_fields__:
         a, b = getattr(one, name), getattr(other, name)
         assert a.dtype == b.dtype, name
         np.testing.assert_array_equal(a, b, err_msg=name)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from samples import make_segment
 
-from coop.common.messaging.messages.sample import Drawn
 from coop.common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
-from coop.common.types import Batch, EnvSpec, EpisodeEnd, EpisodeRecord
+from coop.common.transitions import Batch, Drawn
+from coop.common.types import EnvSpec, EpisodeEnd, EpisodeRecord
 from coop.learner.agent import Agent
 from coop.learner.trainer import Effects, Trainer
 from coop.replay.table.table import Table

@@ -18,12 +18,13 @@ from coop.common.messaging.keys import evaluations_key, join_key, replay_key
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.control import EndOfRun, Join, Leave, Limit, Snapshot
 from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow
-from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.messaging.messages.sample import encode_request
 from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.common.transitions import DrawRequest
 
 MAKE_KEYS = Path(__file__).parents[1] / "deploy" / "zenoh" / "make_keys.sh"
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="the script that makes keys needs openssl")
@@ -131,7 +132,7 @@ def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, s
         before = stats(inside)
         assert actor.ask(actor.key("weights", "1"), Current().encode(RUN)).kind == "weights"
         for key, payload in (
-            (replay_key(actor, "sample"), DrawRequest(1, 0, 0, 32, 0).encode(RUN)),
+            (replay_key(actor, "sample"), encode_request(RUN, DrawRequest(1, 0, 0, 32, 0))),
             (replay_key(actor, "stats"), StatsQuestion().encode(RUN)),
             (replay_key(actor, "limits"), Limit(1.0, 64.0).encode(RUN)),
             (replay_key(actor, "snapshot"), Snapshot(1, []).encode(RUN)),
@@ -169,7 +170,7 @@ def test_an_evaluator_s_certificate_reads_weights_and_reports(run: tuple[str, st
         assert evaluator.ask(evaluations_key(evaluator), report).kind == "ack"
         for node, key, payload in (
             (actor, evaluations_key(actor), report),
-            (evaluator, replay_key(evaluator, "insert"), DrawRequest(1, 0, 0, 32, 0).encode(RUN)),
+            (evaluator, replay_key(evaluator, "insert"), encode_request(RUN, DrawRequest(1, 0, 0, 32, 0))),
             (evaluator, replay_key(evaluator, "stats"), StatsQuestion().encode(RUN)),
         ):
             with pytest.raises(NoAnswer):
@@ -287,7 +288,7 @@ def test_malformed_messages_of_an_actor_are_refused_counted_and_named(run: tuple
     folder = keys.parent
     with joined(run, keys / "replay.json5", "watch") as inside, joined(run, keys / "actor.json5") as actor:
         before = stats(inside).bad_messages
-        for payload in (b"", b"\x00" * 64, bytes(DrawRequest(1, 0, 0, 32, 0).encode(RUN)), bytes(1 << 22)):
+        for payload in (b"", b"\x00" * 64, bytes(encode_request(RUN, DrawRequest(1, 0, 0, 32, 0))), bytes(1 << 22)):
             with pytest.raises(Refused):
                 actor.ask(replay_key(actor, "insert"), bytearray(payload))
         assert stats(inside).bad_messages == before + 4

@@ -20,7 +20,7 @@ from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.transport import NoAnswer, Pending
 from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
-from coop.common.types import Segment
+from coop.common.transitions import Segment
 
 # Seconds. A segment may wait behind its whole window while the limiter admits segments one by one; a lost peer is
 # noticed sooner, by its link.

@@ -20,11 +20,10 @@ from coop.common.messaging.messages.answers import Retry
 from coop.common.messaging.messages.sample import (
     NAMED,
     BatchReader,
-    Drawn,
-    DrawRequest,
     Memory,
     NamedBatch,
     NamedBatchReader,
+    encode_request,
 )
 from coop.common.messaging.mirror import FrameMirror
 from coop.common.messaging.shared_frames import SharedFrames
@@ -32,10 +31,14 @@ from coop.common.messaging.transport import NoAnswer, Node, Pending
 from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.capacity import frame_bytes
-from coop.common.types import Batch, EnvSpec
+from coop.common.transitions import Batch, Drawn, DrawRequest
+from coop.common.types import EnvSpec
 
 MANY = 4  # batches are asked for one by one if more than one of so many frames came with the last answer
 TOGETHER = 1 << 24  # bytes of batches that are asked for in one request, unless it is a single one
+
+
+_Priorities = tuple[NDArray[np.int64], NDArray[np.float32]]  # as in a `DrawRequest`
 
 
 class _Asked(NamedTuple):
@@ -96,8 +99,8 @@ class SampleClient:
         self._next = first
         self._done = first
         self._pinned: int | None = None
-        self._trained: list[tuple[int, float]] = []  # priorities that no request contains yet
-        self._carried: dict[int, tuple[tuple[int, float], ...]] = {}  # by first number of the request with them
+        self._trained: list[_Priorities] = []  # those that no request contains yet
+        self._carried: dict[int, _Priorities] = {}  # by first number of the request with them
         self._backoff = Backoff()
 
     def pin(self) -> int:
@@ -111,7 +114,7 @@ class SampleClient:
 
     def prioritise(self, ids: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Set the priorities, float32 [n], of the transitions numbered ids, int64 [n], with the next request."""
-        self._trained.extend(zip(ids.tolist(), priorities.tolist(), strict=True))
+        self._trained.append((ids, priorities))
 
     def next(self) -> tuple[Batch, Drawn] | None:
         """The next batch and the episodes that ended since the last one; None if no batch is available yet.
@@ -149,7 +152,9 @@ class SampleClient:
             if count > room and (self._outstanding or self._arrived):
                 return
             count = min(count, room)
-            self._carried[self._next], self._trained = tuple(self._trained), []
+            if self._trained:
+                ids, priorities = zip(*self._trained, strict=True)
+                self._carried[self._next], self._trained = (np.concatenate(ids), np.concatenate(priorities)), []
             self._outstanding.append(self._request(self._next, count))
             self._next += count
 
@@ -162,13 +167,13 @@ class SampleClient:
             self._base,
             self._batch_size,
             self.episodes,
-            self._carried.get(first, ()),
             memory,
             0 if mirror is None else mirror.number,
             0 if mirror is None else mirror.slots,
             count,
+            *self._carried.get(first, ()),
         )
-        return _Asked(first, count, self._node.begin(self._key, request.encode(self._node.run)))
+        return _Asked(first, count, self._node.begin(self._key, encode_request(self._node.run, request)))
 
     def _ask_again(self) -> None:
         """Ask again for the batches that have arrived, or else for those that were to arrive first."""

@@ -12,9 +12,9 @@ from coop.common.errors import UsageError
 from coop.common.process.limits import memory_limit
 from coop.common.settings.config import RunConfig
 from coop.common.settings.policies import EVICTIONS
+from coop.common.transitions import IN_BATCH, IN_SEGMENT, KEPT, row_bytes
 from coop.common.types import EnvSpec
 
-ROW_BYTES = 4 + 4 + 1 + 1 + 8 + 8 + 4  # actions, rewards, terminated, span, param_version, ids, reuse
 SLOT_BYTES = 3 * 4 + 8  # counters of a frame's slot, and its number
 HEADER_BYTES = 1 << 20  # of a message, including the alignment of its arrays
 NAME_BYTES = 4 + 8 + 4  # slot, number and place of a frame in an answer to a draw
@@ -28,7 +28,7 @@ def frame_bytes(spec: EnvSpec) -> int:
 
 def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
     """Bytes of a full table with one frame per transition, including the frames' counters; uniform sampling."""
-    return capacity * (frame_bytes(spec) + SLOT_BYTES + ROW_BYTES + 2 * 4 * spec.stack)
+    return capacity * (frame_bytes(spec) + SLOT_BYTES + row_bytes(KEPT, spec.stack) + 2 * 4 * spec.stack)
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
@@ -57,10 +57,10 @@ def check_messages(config: RunConfig, spec: EnvSpec) -> None:
     A batch may hold stack + 1 different frames per transition. A step adds one frame to its segment, or two if an
     episode ends with it; a segment may also contain n_step - 1 steps that waited for it.
     """
-    row = ROW_BYTES + 2 * 4 * spec.stack
     room = MAX_PAYLOAD - HEADER_BYTES
-    batch = room // ((spec.stack + 1) * (frame_bytes(spec) + NAME_BYTES) + row)
-    segment = (room - spec.stack * frame_bytes(spec)) // (2 * frame_bytes(spec) + row) - (config.replay.n_step - 1)
+    batch = room // ((spec.stack + 1) * (frame_bytes(spec) + NAME_BYTES) + row_bytes(IN_BATCH, spec.stack))
+    step = 2 * frame_bytes(spec) + row_bytes(IN_SEGMENT, spec.stack)
+    segment = (room - spec.stack * frame_bytes(spec)) // step - (config.replay.n_step - 1)
     allowed = {
         "learner.batch_size": (config.learner.batch_size, batch),
         "actor.segment_steps": (config.actor.segment_steps, segment),

@@ -23,11 +23,12 @@ from coop.common.bounds import (
     MAX_TOLERANCE,
 )
 from coop.common.errors import UsageError
+from coop.common.numbers import updates_due
 from coop.common.process.untrusted import RUN
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.fields import (
     NONE,
-    Count,
+    Counter,
     Decay,
     NonNegative,
     Positive,
@@ -222,23 +223,23 @@ class RunConfig:
     """Name of the run: roles with the same name find each other."""
     method: MethodName = "coop"
     """Training method."""
-    seed: Count = 0
+    seed: Counter = 0
     """Seed of all random numbers."""
     total_steps: Steps = 50_000
     """Environment steps of the run."""
-    total_updates: Count = 0
+    total_updates: Counter = 0
     """Stop after this many updates; 0: no limit."""
-    total_episodes: Count = 0
+    total_episodes: Counter = 0
     """Stop after this many finished episodes; 0: no limit."""
     target_return: Annotated[Annotated[float, Field(allow_inf_nan=False)] | None, NONE] = None
     """Stop once the mean return of the last 100 episodes reaches this."""
-    checkpoint_every: Count = 10_000
+    checkpoint_every: Counter = 10_000
     """Updates between checkpoints of the whole system; 0: only at the end."""
-    eval_every: Count = 0
+    eval_every: Counter = 0
     """Environment steps between evaluations: the acting network plays full episodes greedily; 0: none."""
     eval_episodes: Annotated[int, Field(gt=0, le=MAX_EVALUATED)] = 10
     """Episodes of each evaluation."""
-    video_every: Count = 0
+    video_every: Counter = 0
     """Environment steps between videos of an episode that the acting network plays greedily; 0: none."""
     env: EnvSettings = field(default_factory=EnvSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
@@ -262,7 +263,7 @@ class RunConfig:
     @cached_property
     def planned_updates(self) -> int:
         """Updates of a run of all `total_steps`: the ratio applies from `learning_starts` on."""
-        return round(self.replay.ratio * (self.total_steps - self.replay.learning_starts))
+        return updates_due(self.replay.ratio, self.total_steps - self.replay.learning_starts)
 
     @cached_property
     def two_networks(self) -> bool:

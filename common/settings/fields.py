@@ -15,7 +15,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from coop.common.bounds import MAX_INTEGER, MAX_KWARGS, MAX_STEPS
 
 Positive = Annotated[int, Field(gt=0, le=MAX_INTEGER)]
-Count = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
+Counter = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
 Steps = Annotated[int, Field(gt=0, le=MAX_STEPS)]
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import TypeVar
 
-from coop.common.bounds import MAX_PRIORITIES, MAX_SEGMENT_STEPS
+from coop.common.bounds import MAX_SEGMENT_STEPS
 from coop.common.errors import UsageError
 from coop.common.settings.config import NETWORK_KINDS, RunConfig
 from coop.common.settings.environment import EnvSettings
@@ -52,7 +52,7 @@ def _problems(config: RunConfig) -> Iterator[str]:
         asked = f"actor.segment_steps = {config.actor.segment_steps}"
         yield f"{asked}: allowed: at most {most} with replay.n_step = {replay.n_step}"
     if config.planned_updates < 1:
-        least = replay.learning_starts + math.floor(0.5 / replay.ratio) + 1
+        least = replay.learning_starts + math.ceil(0.5 / replay.ratio)
         yield (
             f"total_steps = {config.total_steps}: plans no update; allowed: at least {least} "
             f"with replay.learning_starts = {replay.learning_starts} and replay.ratio = {replay.ratio:g}"
@@ -70,15 +70,9 @@ def _problems(config: RunConfig) -> Iterator[str]:
 
 
 def _replay_problems(config: RunConfig) -> Iterator[str]:
-    replay, learner = config.replay, config.learner
+    replay = config.replay
     if not replay.replacement and not SAMPLERS.get(replay.sampling).without_replacement:
         able = ", ".join(repr(name) for name in SAMPLERS.names() if SAMPLERS.get(name).without_replacement)
         yield f"replay.sampling = {replay.sampling!r}: allowed: {able} with replay.replacement = False"
     if replay.journal_keep and replay.journal == "off":
         yield "replay.journal_keep = True: needs replay.journal = 'async' or 'sync'"
-    if replay.prioritized and learner.batch_size * learner.prefetch > MAX_PRIORITIES:
-        most = MAX_PRIORITIES // learner.prefetch
-        yield (
-            f"learner.batch_size = {learner.batch_size}: allowed: at most {most} "
-            f"with learner.prefetch = {learner.prefetch} and a prioritized table"
-        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,8 @@ from coop.common.errors import RunError, UsageError
 from coop.common.registry import loaded
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
-from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.common.transitions import IN_BATCH, Batch, DrawRequest, Segment, filled
+from coop.common.types import Array, EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.methods.stream_q import StreamAgent, Transition
 from coop.learner.protocol import AnyAgent
@@ -71,12 +71,12 @@ class TableMemory:
     """
 
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
-        self._config = config
         self._segments = SegmentAssembler(
             spec, 1, 0, config.actor.segment_steps, n_step=config.replay.n_step, gamma=config.learner.gamma
         )
         self._core = ReplayCore(config, spec)
         self.table = self._core.table
+        self._eviction = config.replay.eviction
         self.update_priorities = self.table.update_priorities
         self.begin = self._segments.begin
 
@@ -88,34 +88,31 @@ class TableMemory:
     def add(self, turn: Turn, step: int) -> None:
         """See `Experience`."""
         for segment in self._cut(turn, turn.version, step):
-            self.table.insert(segment)
+            self._core.apply_insert(segment)
 
     def follow(self, turn: Turn, step: int) -> None:
         """See `Experience`: the table is restored from its snapshot."""
-        self._cut(turn, self._updates_by(step - 1), step)
+        self._cut(turn, self.due(step - 1), step)
 
     def _cut(self, turn: Turn, version: int, step: int) -> list[Segment]:
         """Add a step; return the segments that it completes."""
         segments = self._segments.add(turn.actions, turn.steps, version, turn.ended)
-        if self._due(step):
+        if self.due(step) > self.due(step - 1):
             segments += self._segments.flush()
         return segments
 
     def batches(self, step: int) -> Iterator[Batch]:
         """See `Experience`."""
-        if self._due(step) and not len(self.table):
-            raise RunError(f"replay.eviction = {self._config.replay.eviction!r}: keeps none of {step:,} transitions")
-        for _ in range(self._due(step)):
-            yield self.table.sample(self._config.learner.batch_size)
+        first, due = self.due(step - 1), self.due(step)
+        if due > first and not len(self.table):
+            raise RunError(f"replay.eviction = {self._eviction!r}: keeps none of {step:,} transitions")
+        for number in range(first, due):
+            request = DrawRequest(0, number, number, self._core.batch_size, self._core.episodes_total)
+            yield self._core.apply_draw(request).batch.read()
 
-    def _due(self, step: int) -> int:
-        """Number of updates between the first `step` steps and the next one."""
-        return self._updates_by(step) - self._updates_by(step - 1)
-
-    def _updates_by(self, step: int) -> int:
-        """Number of updates after the first `step` steps."""
-        settings = self._config.replay
-        return math.floor(settings.ratio * max(0, step - settings.learning_starts))
+    def due(self, step: int) -> int:
+        """Number of updates due after the first `step` steps."""
+        return self._core.limiter.due(step)
 
     def counters(self) -> dict[str, int]:
         """See `Experience`."""
@@ -129,7 +126,7 @@ class TableMemory:
 
     def save(self, folder: Path, mark: Mark) -> None:
         """See `Experience`."""
-        save_snapshot(self._core.snapshot(mark.number), threading.Condition(), folder, mark)
+        save_snapshot(self._core.snapshot(mark.number, (mark.number,)), threading.Condition(), folder, mark)
 
     def load(self, folder: Path, mark: Mark) -> None:
         """See `Experience`."""
@@ -149,7 +146,6 @@ class LatestTransition:
         self._turn: Turn
         stack = np.arange(self._spec.stack, dtype=np.int32)[None]
         self._index = stack, stack + self._spec.stack
-        self._ones = np.ones(1, np.float32), np.ones(1, np.int32), np.ones(1, np.uint8)
 
     def begin(self, obs: Array) -> None:
         """See `Experience`."""
@@ -169,13 +165,13 @@ class LatestTransition:
         turn, steps = self._turn, self._turn.steps
         frames = np.concatenate((self._obs, steps.next_obs)).reshape(-1, *self._spec.frame_shape)
         self._obs = steps.obs
-        weights, reuse, span = self._ones
-        yield Transition(
-            frames, *self._index, turn.actions, steps.rewards, steps.terminated, weights,
-            ids=np.array([step - 1]), param_version=np.array([turn.version]), age=np.zeros(1, np.int64), reuse=reuse,
-            span=span,
-            restart=steps.obs[0] if steps.restarted[0] else None,
-        )  # fmt: skip
+        obs_index, next_index = self._index
+        given = {
+            "obs_index": obs_index, "next_index": next_index, "actions": turn.actions, "rewards": steps.rewards,
+            "terminated": steps.terminated, "ids": np.array([step - 1]), "param_version": np.array([turn.version]),
+        }  # fmt: skip
+        restart = steps.obs[0] if steps.restarted[0] else None
+        yield Transition(frames=frames, restart=restart, **filled(IN_BATCH, 1, given))
 
     def counters(self) -> dict[str, int]:
         """See `Experience`."""

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coop.common.types import Batch
+from coop.common.transitions import Batch
 from coop.learner.given import Given
 from coop.learner.qnetwork import QNetwork, as_float32
 

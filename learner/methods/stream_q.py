@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,8 @@ from coop.common.networks.normalised import NormalisedNetwork
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
 from coop.common.settings.stream_q import StreamQSettings
-from coop.common.types import Array, Batch, EnvSpec
+from coop.common.transitions import Batch
+from coop.common.types import Array, EnvSpec
 from coop.learner.agent import Update
 from coop.learner.losses import LOSSES, Values
 from coop.learner.methods.moments import RewardScale, RunningMoments
@@ -23,8 +23,7 @@ from coop.learner.methods.traces import Traces, bounded_step
 from coop.learner.qnetwork import make_network
 
 
-@dataclass(frozen=True, slots=True)
-class Transition(Batch):
+class Transition(Batch, frozen=True):
     """A batch of one transition, the newest one.
 
     restart: <frame_dtype>[*obs_shape], the first observation of the next episode if the emulator was reset behind it.

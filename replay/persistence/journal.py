@@ -26,18 +26,17 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import msgpack
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import RunError, UsageError
-from coop.common.messaging.messages.sample import DrawRequest
 from coop.common.process.files import check_guards, make_folder, sync_file, sync_folder
+from coop.common.transitions import DrawRequest
 from coop.records.run_ids import check_owner
 from coop.replay.limiter import RateLimiter
 
-FORMAT = 2
+FORMAT = 3
 BEGIN, SEGMENT, DRAW, LIMITER, END = range(5)
 KINDS = ("the one that names it", "a segment", "a batch", "settings of the limiter", "the last one")
 BEGIN_BYTES = 64  # more than the record that names a file
@@ -49,7 +48,7 @@ _MARK = b"\xc6coop\xf0rj"
 _FIELDS = struct.Struct("<IIIQQQ")  # of a Header
 HEADER_BYTES = len(_MARK) + 4 + _FIELDS.size
 _LANES = 1024  # 64-bit columns that a checksum adds up
-_RECORDED = DrawRequest.__struct_fields__.index("memory")  # fields of a request that say what is drawn
+_RECORDED = DrawRequest.__struct_fields__[:5]  # of a request, the numbers that say what is drawn
 _SPARE = "spare"  # a file to be overwritten
 _NAME = re.compile(r"[0-9]{8}\.log")
 
@@ -114,7 +113,9 @@ class Journal:
 
     def draw(self, request: DrawRequest, ids: NDArray[np.int64]) -> None:
         """Record a draw. If there is no space, it is kept and written before the next record."""
-        self._late.append((DRAW, msgpack.packb([*msgspec.structs.astuple(request)[:_RECORDED], ids.tobytes()])))
+        numbers = [getattr(request, name) for name in _RECORDED]
+        arrays = [array.tobytes() for array in (request.ids, request.priorities, ids)]
+        self._late.append((DRAW, msgpack.packb([numbers, *arrays])))
         with contextlib.suppress(OSError):
             self._append_late()
 
@@ -354,8 +355,10 @@ def _check_begin(path: Path, payload: bytes, run_id: int) -> None:
 
 def read_draw(payload: bytes) -> tuple[DrawRequest, NDArray[np.int64]]:
     """Read a recorded draw: the request, and the ids of the transitions drawn, int64 [batch]."""
-    *request, ids = msgpack.unpackb(payload)
-    return DrawRequest(*request), np.frombuffer(ids, np.int64)
+    numbers, prioritised, priorities, ids = msgpack.unpackb(payload)
+    fields = dict(zip(_RECORDED, numbers, strict=True))
+    fields |= {"ids": np.frombuffer(prioritised, np.int64), "priorities": np.frombuffer(priorities, np.float32)}
+    return DrawRequest(**fields), np.frombuffer(ids, np.int64)
 
 
 def read_limiter(payload: bytes) -> RateLimiter:

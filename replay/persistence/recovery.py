@@ -13,7 +13,7 @@ import numpy as np
 from coop.common.errors import RunError
 from coop.common.messaging import wire
 from coop.common.messaging.messages.insert import SegmentReader
-from coop.common.messaging.messages.sample import DrawRequest
+from coop.common.transitions import DrawRequest
 from coop.replay.core import ReplayCore
 from coop.replay.persistence.journal import (
     DRAW,

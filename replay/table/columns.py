@@ -3,68 +3,59 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from coop.common.types import Array, Segment
+from coop.common.transitions import IN_BATCH, IN_SEGMENT, KEPT, Segment
+from coop.common.types import Array
 from coop.replay.table.frames import Slots
 
-_NAMES = ("actions", "rewards", "terminated", "span", "param_version", "ids", "reuse", "priorities")
+_WRITTEN = [name for name in IN_SEGMENT if name in KEPT]
+_READ = [name for name in IN_BATCH if name in KEPT]
 
 
 class Columns:
     """The fields of `capacity` transitions; callers may read the arrays, and write `reuse` and `priorities`.
 
+    named: what `coop.common.transitions` says that a table keeps, and `priorities`: float64, of length 0 unless
+        `prioritized`.
     slots: int32 [capacity, 2 * stack], the frames of obs, then of next_obs, as slots of a `FrameStore`.
     ids: int64, the transition's number in order of insertion. reuse: int32, how often it has been drawn.
-    priorities: float64, of length 0 unless `prioritized`. terminal: rows whose next state is terminal.
+    terminal: rows whose next state is terminal.
     """
 
     def __init__(self, capacity: int, stack: int, *, prioritized: bool) -> None:
         self.slots = np.zeros((capacity, 2 * stack), np.int32)
-        self.actions = np.zeros(capacity, np.int32)
-        self.rewards = np.zeros(capacity, np.float32)
-        self.terminated = np.zeros(capacity, np.bool_)
-        self.span = np.ones(capacity, np.uint8)
-        self.param_version = np.zeros(capacity, np.int64)
-        self.ids = np.zeros(capacity, np.int64)
-        self.reuse = np.zeros(capacity, np.int32)
-        self.priorities = np.zeros(capacity if prioritized else 0)
+        self.named: dict[str, Array] = {name: np.zeros(capacity, field.dtype) for name, field in KEPT.items()}
+        self.ids, self.reuse, self._terminated = (self.named[name] for name in ("ids", "reuse", "terminated"))
+        self.priorities = self.named["priorities"] = np.zeros(capacity if prioritized else 0)
         self.terminal = 0
 
     @property
     def row_bytes(self) -> int:
         """Bytes of memory a transition takes here, without its frames."""
-        return (self.slots.nbytes + sum(column.nbytes for column in self._named().values())) // len(self.ids)
+        return (self.slots.nbytes + sum(column.nbytes for column in self.named.values())) // len(self.ids)
 
     def write(self, rows: Slots, segment: Segment, kept: slice | Slots, first: int, slots: Array) -> None:
         """Put transitions `kept` of a segment, whose first one has the number `first`, into `rows`, never drawn yet."""
-        terminated = segment.terminated[kept]
-        self.terminal += int(np.count_nonzero(terminated)) - int(np.count_nonzero(self.terminated[rows]))
+        self.terminal -= int(np.count_nonzero(self._terminated[rows]))
         self.slots[rows] = slots
-        self.actions[rows] = segment.actions[kept]
-        self.rewards[rows] = segment.rewards[kept]
-        self.terminated[rows] = terminated
-        self.span[rows] = segment.span[kept]
-        self.param_version[rows] = segment.param_version[kept]
+        for name in _WRITTEN:
+            self.named[name][rows] = getattr(segment, name)[kept]
+        self.terminal += int(np.count_nonzero(segment.terminated[kept]))
         self.ids[rows] = np.arange(first, first + segment.steps)[kept]
         self.reuse[rows] = 0
 
     def read(self, rows: Slots) -> dict[str, Array]:
         """Copy the fields of `rows` that a batch carries, by name."""
-        names = ("actions", "rewards", "terminated", "span", "ids", "param_version", "reuse")
-        return {name: getattr(self, name)[rows] for name in names}
+        return {name: self.named[name][rows] for name in _READ}
 
     def state(self, size: int) -> dict[str, Array]:
         """Copy the first `size` rows of each column, without the slots."""
-        return {name: column[:size].copy() for name, column in self._named().items()}
+        return {name: column[:size].copy() for name, column in self.named.items()}
 
     def load_state(self, arrays: dict[str, Array], slots: Slots) -> None:
         """Restore what `state` gave, with the slots intp [size, 2 * stack] that the frames have now."""
         size = len(slots)
         self.slots[:size] = slots
-        for name, column in self._named().items():
+        for name, column in self.named.items():
             column[:size] = arrays[name]
-        self.terminal = int(np.count_nonzero(self.terminated[:size]))
-
-    def _named(self) -> dict[str, NDArray[np.generic]]:
-        return {name: getattr(self, name) for name in _NAMES}
+        self.terminal = int(np.count_nonzero(self._terminated[:size]))

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.types import Array, Segment
+from coop.common.transitions import Segment
+from coop.common.types import Array
 from coop.replay.table.frames import Slots
 from coop.replay.table.streams import MAX_STREAMS
 

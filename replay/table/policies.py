@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from coop.common.errors import UsageError
 from coop.common.registry import loaded
 from coop.common.settings.policies import EVICTIONS, SAMPLERS, EvictionPolicy, SamplingPolicy
-from coop.common.types import Array, EnvSpec, Segment
+from coop.common.transitions import Segment
+from coop.common.types import Array, EnvSpec
 
 Rows = NDArray[np.intp]
 Floats = NDArray[np.float64]

@@ -7,7 +7,7 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.types import Segment
+from coop.common.transitions import Segment
 from coop.replay.table.frames import FrameStore, Slots, as_slice
 
 MAX_STREAMS = 4096

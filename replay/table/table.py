@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from coop.common.errors import UsageError
 from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
-from coop.common.types import Array, Batch, EnvSpec, Segment
+from coop.common.transitions import Batch, Segment
+from coop.common.types import Array, EnvSpec
 from coop.replay.table.columns import Columns
 from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
 from coop.replay.table.numbering import EPISODES, EpisodeNumbers
@@ -104,10 +105,12 @@ class Table:
         self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
         self._held = 0
         self._episodes = EpisodeNumbers(capacity) if evicts.episodes or draws.episodes else None
-        arrays = seen.ids, seen.reuse, seen.rewards, seen.terminated, seen.priorities
+        arrays = seen.ids, seen.reuse, seen.named["rewards"], seen.named["terminated"], seen.priorities
         numbers = np.empty(0, np.int64) if self._episodes is None else self._episodes.of_rows
         exponents = priority_exponent, importance_exponent
-        view = TableView(rng, *arrays, *exponents, replacement, seen.actions, numbers, self._observations, self.__len__)
+        view = TableView(
+            rng, *arrays, *exponents, replacement, seen.named["actions"], numbers, self._observations, self.__len__
+        )
         self._eviction, self._sampling = make_policies(evicts, draws, view)
         # Users' own policies see what comes, and what they answer is checked.
         self._checked = [not type(each).__module__.startswith("coop.") for each in (self._eviction, self._sampling)]
@@ -140,9 +143,10 @@ class Table:
 
     def repeated(self) -> int:
         """Count the transitions held that equal another one in their frames, action, reward, end and span."""
-        held = self._columns
-        slots = held.slots[: len(self)].astype(np.intp)
-        values = zip(slots, held.actions, held.rewards, held.terminated, held.span, strict=False)
+        own = ("ids", "reuse", "param_version", "priorities")  # these differ where a transition has come in twice
+        slots = self._columns.slots[: len(self)].astype(np.intp)
+        columns = (column for name, column in self._columns.named.items() if name not in own)
+        values = zip(slots, *columns, strict=False)
         return len(self) - len({hash((self._frames.read(each).tobytes(), *rest)) for each, *rest in values})
 
     def insert(self, segment: Segment) -> None:

@@ -6,15 +6,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from coop.common.bounds import MAX_MAGNITUDE, MAX_N_STEP, MAX_SEGMENT_STEPS, MAX_UPDATES
+from coop.common.bounds import MAX_MAGNITUDE, MAX_SEGMENT_STEPS
 from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.messages.body import Layout, check_kind, to_struct
 from coop.common.messaging.wire import Message
-from coop.common.types import Array, EnvSpec, Segment
+from coop.common.transitions import FIELDS, IN_SEGMENT, Segment, layout
+from coop.common.types import Array, EnvSpec
 
 KIND = "insert"
-_ARRAYS = ("frames", "obs_index", "next_index", "actions", "rewards", "terminated", "param_version", "span")
+_ARRAYS = ("frames", *IN_SEGMENT)
 _FIELDS = tuple(name for name in Segment.__struct_fields__ if name not in _ARRAYS)
 
 
@@ -24,20 +25,6 @@ def encode_segment(run: str, segment: Segment, into: bytearray | None = None) ->
     return wire.encode(KIND, run, fields, {name: getattr(segment, name) for name in _ARRAYS}, into)
 
 
-def transitions(spec: EnvSpec, rows: str) -> dict[str, tuple[str, tuple[int | str, ...]]]:
-    """The arrays that segments and batches share, one row per transition, as a `Layout` has them."""
-    return {
-        "frames": (spec.frame_dtype, ("frames", *spec.frame_shape)),
-        "obs_index": ("int32", (rows, spec.stack)),
-        "next_index": ("int32", (rows, spec.stack)),
-        "actions": ("int32", (rows,)),
-        "rewards": ("float32", (rows,)),
-        "terminated": ("bool", (rows,)),
-        "param_version": ("int64", (rows,)),
-        "span": ("uint8", (rows,)),
-    }
-
-
 def check_indices(arrays: Mapping[str, Array], frames: int) -> None:
     """Check that a segment or a batch, of at least one row, refers to `frames` frames; raises BadMessage."""
     for name in ("obs_index", "next_index"):
@@ -45,18 +32,15 @@ def check_indices(arrays: Mapping[str, Array], frames: int) -> None:
 
 
 def check_values(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
-    """Check the values of the arrays that segments and batches share; raises BadMessage."""
-    check_range("arrays.actions", arrays["actions"], 0, spec.num_actions - 1)
-    check_range("arrays.span", arrays["span"], 1, MAX_N_STEP)
-    most = MAX_MAGNITUDE * int(arrays["span"].max())  # rewards that a transition sums
-    check_range("arrays.rewards", arrays["rewards"], -most, most)
+    """Check the values of a segment's or a batch's arrays, of at least one row; raises BadMessage."""
     frames = arrays["frames"]
     if frames.dtype == np.bool_:
         check_range("arrays.frames", frames.view(np.uint8), 0, 1)
     elif frames.dtype == np.float32:
         check_range("arrays.frames", frames, -MAX_MAGNITUDE, MAX_MAGNITUDE)
-    check_range("arrays.terminated", arrays["terminated"].view(np.uint8), 0, 1)
-    check_range("arrays.param_version", arrays["param_version"], 0, MAX_UPDATES)
+    for name, array in arrays.items():
+        if name in FIELDS and (bounds := FIELDS[name].bounds(spec, arrays)) is not None:
+            check_range(f"arrays.{name}", array.view(np.uint8) if array.dtype == np.bool_ else array, *bounds)
 
 
 def check_range(field: str, array: Array, low: float, high: float) -> None:
@@ -73,7 +57,7 @@ class SegmentReader:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        self._layout = Layout(transitions(spec, "steps"))
+        self._layout = Layout(layout(IN_SEGMENT, spec, "steps"))
 
     def __call__(self, message: Message) -> Segment:
         """Read one; raises BadMessage for anything that the table could not store."""

@@ -4,81 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar
 
 import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from coop.common.bounded import Count, Counter, Incarnation, Updates
-from coop.common.bounds import MAX_AHEAD, MAX_BATCH, MAX_FLOAT32, MAX_INTEGER, MAX_PRIORITIES, MAX_UPDATES
+from coop.common.bounded import Counter, Incarnation
+from coop.common.bounds import MAX_AHEAD, MAX_FLOAT32, MAX_INTEGER
 from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.messages.body import Body, Layout, check_kind, to_struct
-from coop.common.messaging.messages.insert import check_indices, check_range, check_values, transitions
+from coop.common.messaging.messages.insert import check_indices, check_range, check_values
 from coop.common.messaging.wire import Message, Source
 from coop.common.process.shared_memory import ADDRESS
-from coop.common.types import Array, Batch, EnvSpec, EpisodeRecord
+from coop.common.transitions import IN_BATCH, Batch, Drawn, DrawRequest, layout
+from coop.common.types import Array, EnvSpec
 
-MAX_EPISODES = 1000  # in one answer; the next answer carries the rest
 KIND = "batch"
 NAMED = "batches"  # whose frames are named
+REQUEST = "sample"
 
-Priority = Annotated[float, Meta(ge=0, le=MAX_FLOAT32)]
-
-
-class Drawn(Struct, frozen=True):
-    """The data that accompany a batch: the table's counters, and the episodes from number `first_episode` on.
-
-    planned: draws of the complete run. terminal: transitions held that end in a terminal state.
-    """
-
-    sequence: Counter
-    inserted: Counter
-    size: Counter
-    evicted: Counter
-    evicted_unsampled: Counter
-    first_episode: Counter
-    episodes: Annotated[tuple[EpisodeRecord, ...], Meta(max_length=MAX_EPISODES)]
-    planned: Counter = 0
-    terminal: Counter = 0
+_PRIORITIES = Layout({"ids": ("int64", ("prioritised",)), "priorities": ("float32", ("prioritised",))})
+_FIELDS = tuple(name for name in DrawRequest.__struct_fields__ if name not in _PRIORITIES.arrays)
 
 
-class DrawRequest(Body, frozen=True):
-    """A request for the batches of `draws` updates from number `sequence` on; a repeated request gets the same batches.
+def encode_request(run: str, request: DrawRequest) -> bytearray:
+    """Build a request for batches."""
+    fields = {name: getattr(request, name) for name in _FIELDS}
+    return wire.encode(REQUEST, run, fields, {"ids": request.ids, "priorities": request.priorities})
 
-    base: updates that the learner will not repeat: it never asks again for a batch below. A replay service that
-        has drawn fewer, or that served another incarnation, sets its own count of draws to it.
-    episodes_from: number of the first episode that the learner has not received.
-    priorities: new priorities (id of a transition, |TD error|), set before the draw.
-    memory: the memory of the table's frames if the learner reads them there; "" if it could, but doesn't know where.
-    mirror, mirror_slots: the number of the learner's mirror of the table's frames, and its size; 0 if it has none.
-        Without memory or mirror, a request is for one batch, and the answer carries all its frames.
-    """
 
-    kind: ClassVar[str] = "sample"
-
-    incarnation: Incarnation
-    sequence: Annotated[int, Meta(ge=0, lt=MAX_UPDATES + MAX_AHEAD)]
-    base: Updates
-    batch_size: Annotated[int, Meta(ge=1, le=MAX_BATCH)]
-    episodes_from: Count
-    priorities: Annotated[tuple[tuple[Counter, Priority], ...], Meta(max_length=MAX_PRIORITIES)] = ()
-    memory: Annotated[str, Meta(pattern=f"{ADDRESS}|^$")] | None = None
-    mirror: Counter = 0
-    mirror_slots: Annotated[int, Meta(ge=0, lt=2**31)] = 0
-    draws: Annotated[int, Meta(ge=1, le=MAX_AHEAD)] = 1
-
-    @classmethod
-    def decode(cls, message: Message) -> Self:
-        """Read it; raises BadMessage."""
-        request = super().decode(message)
-        if not request.base <= request.sequence <= request.base + MAX_AHEAD - request.draws:
-            allowed = f"{request.base} to {request.base + MAX_AHEAD - request.draws}"
-            raise BadMessage("fields.sequence", f"{request.sequence}; with base {request.base}: {allowed}")
-        if request.draws > 1 and not (request.memory or request.mirror):
-            raise BadMessage("fields.draws", f"{request.draws}; allowed without memory or mirror: 1")
-        return request
+def read_request(message: Message) -> DrawRequest:
+    """Read a request for batches; raises BadMessage."""
+    check_kind(message, REQUEST)
+    _PRIORITIES.lengths(message.table)
+    request = to_struct(message, DrawRequest, _PRIORITIES)
+    check_range("arrays.ids", request.ids, 0, MAX_INTEGER)
+    check_range("arrays.priorities", request.priorities, 0, MAX_FLOAT32)
+    if not request.base <= request.sequence <= request.base + MAX_AHEAD - request.draws:
+        allowed = f"{request.base} to {request.base + MAX_AHEAD - request.draws}"
+        raise BadMessage("fields.sequence", f"{request.sequence}; with base {request.base}: {allowed}")
+    if request.draws > 1 and not (request.memory or request.mirror):
+        raise BadMessage("fields.draws", f"{request.draws}; allowed without memory or mirror: 1")
+    return request
 
 
 class Memory(Body, frozen=True):
@@ -149,23 +118,12 @@ def encode_named(
     return wire.encode(NAMED, run, draws, {"frames": frames, **named, **joined}, into)
 
 
-def _columns(spec: EnvSpec) -> dict[str, tuple[str, tuple[int | str, ...]]]:
-    """The arrays of batches, as a `Layout` has them."""
-    return {
-        **transitions(spec, "batch"),
-        "weights": ("float32", ("batch",)),
-        "ids": ("int64", ("batch",)),
-        "age": ("int64", ("batch",)),
-        "reuse": ("int32", ("batch",)),
-    }
-
-
 class BatchReader:
     """Reads batches of one environment, with their frames."""
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        self._layout = Layout(_columns(spec))
+        self._layout = Layout(layout(IN_BATCH, spec, "batch"))
 
     def __call__(self, message: Message) -> tuple[Batch, Drawn]:
         """Read one; raises BadMessage."""
@@ -175,7 +133,6 @@ class BatchReader:
             raise BadMessage("arrays.actions", "an empty batch")
         check_indices(message.arrays, lengths["frames"])
         check_values(self._spec, message.arrays)
-        check_range("arrays.weights", message.arrays["weights"], 0.0, MAX_FLOAT32)
         return Batch(**message.arrays), to_struct(message, Drawn)
 
 
@@ -189,9 +146,7 @@ class NamedBatchReader:
             "numbers": ("int64", ("named",)),
             "carried": ("int32", ("frames",)),
         }
-        self._columns = _columns(spec)
-        self._layout = Layout({**self._columns, **named})
-        del self._columns["frames"]
+        self._layout = Layout({**layout(IN_BATCH, spec, "batch"), **named})
 
     def __call__(self, message: Message) -> tuple[Draws, list[NamedBatch]]:
         """Read those of one answer, at least one; raises BadMessage."""
@@ -205,7 +160,6 @@ class NamedBatchReader:
         if len(draws.frames) != count or sum(draws.frames) != named:
             raise BadMessage("fields.frames", f"{draws.frames}; {named} in {count} batches")
         check_values(self._spec, arrays)
-        check_range("arrays.weights", arrays["weights"], 0.0, MAX_FLOAT32)
         check_range("arrays.slots", arrays["slots"], 0, MAX_INTEGER)
         check_range("arrays.numbers", arrays["numbers"], 1, MAX_INTEGER)
         carried = arrays["carried"].astype(np.intp)
@@ -217,7 +171,7 @@ class NamedBatchReader:
             stop = start + frames
             low, high = (0, len(carried)) if count == 1 else carried.searchsorted((start, stop))
             rows = slice(place * size, (place + 1) * size)
-            columns = {name: arrays[name][rows] for name in self._columns}
+            columns = {name: arrays[name][rows] for name in IN_BATCH}
             check_indices(columns, frames)
             batches.append(
                 NamedBatch(

@@ -86,7 +86,8 @@ class Seeds:
         carts, limits = zip(*(cart_of(run.env) for run in runs), strict=True)
         self._carts = Carts(carts, [int(run._player._lengths[0]) for run in runs], limits[0])
         memories = [run.memory for run in runs]
-        self._tables = Tables.of([memory for memory in memories if isinstance(memory, TableMemory)], self.config)
+        tables = [memory for memory in memories if isinstance(memory, TableMemory)]
+        self._tables, self._due = Tables.of(tables, self.config), tables[0].due
         self._nets = Networks(self.config, len(runs))
         for k, agent in enumerate(self._agents):
             for number, network in enumerate(agent.networks):
@@ -119,10 +120,6 @@ class Seeds:
             return
         self._carts, self._tables, self._nets = self._carts.kept(runs), self._tables.kept(runs), self._nets.kept(runs)
 
-    def _updates_by(self, step: int) -> int:
-        """As `TableMemory` has it."""
-        return math.floor(self.config.replay.ratio * max(0, step - self.config.replay.learning_starts))
-
     def _length(self, most: int) -> int:
         """Steps of the next block."""
         every, last = self.config.checkpoint_every or math.inf, min(self.step + MOST, self.config.total_steps)
@@ -130,8 +127,8 @@ class Seeds:
         while True:
             step += 1
             waiting = (waiting + 1) % self.config.actor.segment_steps
-            updates = self._updates_by(step)
-            new = updates > self._updates_by(step - 1)
+            updates = self._due(step)
+            new = updates > self._due(step - 1)
             waiting *= not new
             ends = new and (updates % METRICS_EVERY == 0 or updates % every == 0)
             if step == self.config.total_steps or (not waiting and (ends or step >= min(last, self.step + most))):
@@ -141,7 +138,7 @@ class Seeds:
         """Draw what chance decides for some steps, in the order in which the runs would."""
         config, agent = self.config, self._agents[0]
         steps = range(self.step + 1, self.step + count + 1)
-        due = [self._updates_by(step) > self._updates_by(step - 1) for step in steps]
+        due = [self._due(step) > self._due(step - 1) for step in steps]
         cut, lengths, waiting = [], [], 0
         for one in due:
             waiting += 1

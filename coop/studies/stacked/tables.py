@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.config import RunConfig
-from coop.common.types import Array, Batch, EnvSpec
+from coop.common.transitions import IN_BATCH, KEPT, Batch, filled
+from coop.common.types import Array, EnvSpec
 from coop.lockstep.memory import TableMemory
 from coop.replay.table.table import REUSE_BUCKETS
 from coop.studies.stacked import compiled
@@ -65,8 +66,7 @@ class Tables:
         size = min(self.inserted, self.capacity)
         names = {name: column[k, :size] for name, column in self.columns.items()}
         given: dict[str, Array] = {
-            **names, "actions": names["actions"].astype(np.int32), "reuse": names["reuse"].astype(np.int32),
-            "rewards": np.ones(size, np.float32), "span": np.ones(size, np.uint8), "priorities": np.zeros(0),
+            **filled(KEPT, size, {**names, "rewards": np.ones(size)}), "priorities": np.zeros(0),
             "slots": np.arange(2 * size, dtype=np.int32).reshape(2, size).T.copy(),
             "frames": np.concatenate((self.obs[k, :size], self.next_obs[k, :size])),
             "tails": np.empty(0, np.int32),  # a segment's first frame is stored again
@@ -123,13 +123,13 @@ class Tables:
         """A batch of table k as lockstep has it; rows int64 [batch], seen int64 [5, batch] of `read`."""
         size = len(rows)
         here, there = np.arange(2 * size, dtype=np.int32).reshape(2, size, 1)
-        return Batch(
-            np.concatenate((self.obs[k, rows], self.next_obs[k, rows])), here, there,
-            self.columns["actions"][k, rows].astype(np.int32), np.ones(size, np.float32),
-            self.columns["terminated"][k, rows], np.ones(size, np.float32), ids=seen[0],
-            param_version=self.columns["param_version"][k, rows], age=seen[1], reuse=seen[2].astype(np.int32),
-            span=np.ones(size, np.uint8),
-        )  # fmt: skip
+        given = {
+            **{name: column[k, rows] for name, column in self.columns.items()},
+            "obs_index": here, "next_index": there, "rewards": np.ones(size), "ids": seen[0], "age": seen[1],
+            "reuse": seen[2],
+        }  # fmt: skip
+        frames = np.concatenate((self.obs[k, rows], self.next_obs[k, rows]))
+        return Batch(frames=frames, **filled(IN_BATCH, size, given))
 
     def kept(self, runs: NDArray[np.intp]) -> Tables:
         """The tables of these runs alone."""

@@ -21,7 +21,7 @@ from coop.common.errors import UsageError, closest, refusal
 from coop.common.process.untrusted import check_run_name
 from coop.common.settings.config import RunConfig, check_distributed
 from coop.common.settings.environment import EnvSettings
-from coop.common.settings.fields import Count, Positive
+from coop.common.settings.fields import Counter, Positive
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
@@ -37,7 +37,7 @@ class GridFile:
 
     __pydantic_config__ = ConfigDict(extra="forbid")
     methods: Annotated[tuple[MethodName, ...], Field(min_length=1)] = ("coop",)
-    seeds: Annotated[tuple[Count, ...], Field(min_length=1)] = (0,)
+    seeds: Annotated[tuple[Counter, ...], Field(min_length=1)] = (0,)
     title: str = ""
     """The grid's question, in one line."""
     preset: str = ""
