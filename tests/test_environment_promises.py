@@ -91,9 +91,8 @@ class Odd(gymnasium.Env[Any, Any]):
         return tuple(given)
 
     def render(self) -> Any:
-        return {"grey": np.zeros((20, 30), np.uint8), "no picture": None}.get(
-            self.wrong, np.zeros((20, 30, 3), np.uint8)
-        )
+        others = {"grey": np.zeros((20, 30), np.uint8), "no picture": None, "a picture of text": np.full((3, 3), "x")}
+        return others.get(self.wrong, np.zeros((20, 30, 3), np.uint8))
 
     def close(self) -> None:
         if self.wrong == "close raises":
@@ -299,14 +298,18 @@ def test_an_episode_without_end_is_cut_and_the_setting_named(
         ({"episodes": 0}, "episodes = 0: must be a whole number from 1"),
         ({"episodes": 2.5}, "episodes = 2.5"),
         ({"episodes": True}, "episodes = True"),
+        ({"episodes": 2**40}, "episodes = 1099511627776: must be a whole number from 1 to"),
         ({"seed": -1}, "seed = -1: must be a whole number from 0"),
         ({"seed": "1"}, "seed = '1'"),
         ({"at_once": 0}, "at_once = 0"),
         ({"epsilon": 1.5}, r"epsilon = 1\.5: must be from 0 to 1"),
         ({"epsilon": float("nan")}, "epsilon = nan"),
+        ({"epsilon": True}, "epsilon = True: must be from 0 to 1"),
+        ({"env": None}, "env: a policy that no run has trained needs one"),
         ({"env": 7}, "env = 7: must be an id, or a table"),
         ({"policy": "greedy"}, "policy: str is no function"),
         ({"policy": lambda obs: 2}, r"policy: gives 2 .*allowed: an int from 0 to 1"),
+        ({"policy": lambda obs: -1}, "policy: gives -1 "),
         ({"policy": lambda obs: 0.7}, r"policy: gives 0\.7"),
         ({"policy": lambda obs: None}, "policy: gives None"),
         ({"policy": lambda obs: [0, 1]}, r"policy: gives int64\[2\] for 1 of"),
@@ -362,10 +365,11 @@ def test_films_of_any_speed_and_of_grey_pictures(wrong: str) -> None:
 
 
 def test_a_film_of_no_picture_is_refused_and_one_that_stands_still_is_not_too_long() -> None:
-    env = make_filmed_env(odd("no picture"), 0)
-    env.reset()
-    with pytest.raises(UsageError, match="can't be filmed: it renders object"):
-        env.picture()
+    for wrong, found in (("no picture", "object"), ("a picture of text", r"<U1\[3, 3\]")):
+        env = make_filmed_env(odd(wrong), 0)
+        env.reset()
+        with pytest.raises(UsageError, match=f"can't be filmed: it renders {found}"):
+            env.picture()
     still = Film(lambda obs: 0, replace(odd("endless"), max_episode_steps=800), 0)
     still.pictures_per_s = 0.5  # 1,600 s of the same picture: a GIF's longest is 655
     assert short_gif(still).startswith(b"GIF89a")
