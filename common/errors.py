@@ -55,9 +55,17 @@ class BadMessage(CoopError):
         self.field = field
 
 
+def text_of(error: BaseException | None) -> str:
+    """What an exception says; empty if a user's own one fails at that too."""
+    try:
+        return str(error)
+    except Exception:
+        return ""
+
+
 def first_line(error: BaseException | None) -> str:
     """An exception's type and the first line of its text."""
-    lines = str(error).strip().splitlines()
+    lines = text_of(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 

@@ -21,7 +21,7 @@ from secrets import token_hex
 from types import ModuleType
 from typing import Any
 
-from coop.common.errors import JoinError, UsageError
+from coop.common.errors import JoinError, UsageError, text_of
 from coop.common.places import working_directory
 
 _handed_over: list[Path] = []  # folders of runs whose settings this process reads
@@ -178,7 +178,7 @@ def check_permitted(path: str, field: str) -> None:
 
 def describe(error: BaseException) -> str:
     """An exception of a user's code in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    return " ".join(f"{type(error).__name__}: {text_of(error)}".split()).removesuffix(":")
 
 
 def check_extra(flag: str, extra: str, module: str) -> None:

@@ -36,6 +36,13 @@ SHORT = {"total_steps": 60, "replay": {"capacity": 50, "learning_starts": 20}, "
 VECTOR = np.zeros(3, np.float32)
 
 
+class Wordless(Exception):  # noqa: N818 (as users name theirs)
+    """Says nothing of itself."""
+
+    def __str__(self) -> str:
+        raise AttributeError("no args")
+
+
 class Odd(gymnasium.Env[Any, Any]):
     """Right in all but what it is asked to do wrong, from step 3 on, or in the reset after step 5."""
 
@@ -78,6 +85,8 @@ class Odd(gymnasium.Env[Any, Any]):
                    "reward nan": float("nan"), "reward inf": np.float32("inf"), "reward large": 1.1e6}  # fmt: skip
         if wrong == "step raises":
             raise ValueError("no such move")
+        if wrong == "step raises in its words too":
+            raise Wordless
         if wrong == "step exits":
             sys.exit(0)
         if wrong == "four":
@@ -149,6 +158,7 @@ WRONG: list[tuple[str, dict[str, Any], type[CoopError], str]] = [
     ("ends", {}, UsageError, rf"{AT_3} terminated bool\[2\]; allowed: a single bool"),
     ("four", {}, UsageError, rf"{AT_3} 4 values; gymnasium's step gives \(observation, reward,"),
     ("step raises", {}, RunError, r"at step 3 raised ValueError: no such move \(test_environment_promises.py:\d+\)$"),
+    ("step raises in its words too", {}, RunError, r"at step 3 raised Wordless \(test_environment_promises.py:\d+\)$"),
     ("step exits", {}, RunError, r"at step 3 raised SystemExit: 0"),
     ("reset raises", {}, RunError, r"at the reset after step 5 raised ConnectionError: the simulator is gone"),
     ("reset gives", {}, UsageError, r"at the reset after step 5 gives observations float32\[7\]"),
