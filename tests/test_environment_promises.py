@@ -36,7 +36,7 @@ SHORT = {"total_steps": 60, "replay": {"capacity": 50, "learning_starts": 20}, "
 VECTOR = np.zeros(3, np.float32)
 
 
-class Wordless(Exception):  # noqa: N818 (as users name theirs)
+class Wordless(Exception):
     """Says nothing of itself."""
 
     def __str__(self) -> str:
