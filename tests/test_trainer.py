@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from samples import make_segment
 
-from coop.common.settings.config import LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
+from coop.common.settings.config import ActorSettings, LearnerSettings, NetworkSettings, ReplaySettings, RunConfig
 from coop.common.transitions import Batch, Drawn
 from coop.common.types import EnvSpec, EpisodeEnd, EpisodeRecord
 from coop.learner.agent import Agent
@@ -21,6 +21,7 @@ CONFIG = RunConfig(
     method="coop",
     learner=LearnerSettings(swap_every=10, publish_every=7),
     network=NetworkSettings(hidden=(8, 8)),
+    actor=ActorSettings(epsilon_decay="exponential"),
 )
 
 

@@ -28,6 +28,7 @@ from coop.common.process.untrusted import RUN
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.fields import (
     NONE,
+    SWITCH,
     Counter,
     Decay,
     NonNegative,
@@ -180,7 +181,7 @@ class ReplaySettings:
     """alpha of prioritized sampling; 0 draws uniformly."""
     importance_exponent: Share = 0.4
     """beta of the importance-sampling weights; 0 corrects nothing, 1 corrects fully."""
-    journal: Literal["off", "async", "sync"] = "off"
+    journal: Annotated[Literal["off", "async", "sync"], SWITCH] = "off"
     """Write each accepted segment and each draw to a file before answering, so that the kill of a process loses none.
     async (the flag alone): the death of the machine may lose those since the newest checkpoint; sync: none, since
     segments are on the disk before they are acknowledged."""

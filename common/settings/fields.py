@@ -22,6 +22,7 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 PositiveShare = Annotated[float, Field(gt=0, le=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
+SWITCH = BeforeValidator(lambda value: {True: "async", False: "off"}[value] if isinstance(value, bool) else value)
 NONE = BeforeValidator(lambda value: None if value in ("None", "none") else value)
 """Lets an optional field be unset in TOML too, which has no null: "None"."""
 

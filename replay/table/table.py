@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,9 +109,14 @@ class Table:
         arrays = seen.ids, seen.reuse, seen.named["rewards"], seen.named["terminated"], seen.priorities
         numbers = np.empty(0, np.int64) if self._episodes is None else self._episodes.of_rows
         exponents = priority_exponent, importance_exponent
-        view = TableView(
-            rng, *arrays, *exponents, replacement, seen.named["actions"], numbers, self._observations, self.__len__
-        )
+        table = weakref.proxy(self)  # no cycle: a table that is dropped frees its memory at once
+
+        def read(rows: Slots, following: bool) -> Array:
+            found: Array = table._observations(rows, following)
+            return found
+
+        actions = seen.named["actions"]
+        view = TableView(rng, *arrays, *exponents, replacement, actions, numbers, read, lambda: len(table))
         self._eviction, self._sampling = make_policies(evicts, draws, view)
         # Users' own policies see what comes, and what they answer is checked.
         self._checked = [not type(each).__module__.startswith("coop.") for each in (self._eviction, self._sampling)]
@@ -304,7 +310,7 @@ class Table:
         self._columns.load_state(arrays, slots[arrays["slots"]])
         self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
         self.inserted = meta["inserted"]
-        self._held = meta.get("held", min(self.inserted, self.capacity))  # an older state lacks it
+        self._held = meta["held"]
         if self._episodes is not None:
             self._episodes.load_state(meta["episodes"], arrays[EPISODES])
         self.batches = meta["batches"]

@@ -72,8 +72,8 @@ class Tables:
             "tails": np.empty(0, np.int32),  # a segment's first frame is stored again
         }  # fmt: skip
         meta: dict[str, Any] = {
-            **found.table.snapshot().meta, "inserted": self.inserted, "batches": self.batches,
-            "sampled": self.batches * self.config.learner.batch_size,
+            **found.table.snapshot().meta, "inserted": self.inserted, "held": size,
+            "batches": self.batches, "sampled": self.batches * self.config.learner.batch_size,
             "reuse_evicted": self.reuse_evicted[k].tolist(), "rng": generator_state(self.rngs[k]),
         }  # fmt: skip
         found.table.load_state(meta, given)
