@@ -217,7 +217,9 @@ def test_a_script_from_standard_input_waits_for_its_run(distributed: bool, tmp_p
     done = subprocess.run(
         [sys.executable, "-"], input=script, capture_output=True, text=True, timeout=100, check=True, cwd=tmp_path
     )
-    assert (done.stdout, done.stderr) == ("at once\n", "")
+    settings, *printed = done.stdout.splitlines()
+    assert settings.startswith("settings: preset cartpole; method: coop; gamma: 0.95; replay: capacity 5,000, ")
+    assert (printed, done.stderr) == (["at once"], "")
     summary = coop.load(tmp_path / "a").summary
     assert summary is not None
     assert summary["exit"] == "complete"

@@ -136,7 +136,8 @@ def test_a_diverged_run_is_counted_and_averaged_nowhere(folder: Path) -> None:
     (row, *_) = settings_table(study).rows
     assert row[:3] == ["dqn", 500, pytest.approx(101.0)]
     text = page(study, folder, tables(study), [], [])
-    assert "<p>18 of 19 runs finished, 1 diverged: dqn, coop on CartPole-v0, seeds 0-2. Settings with 3 runs: " in text
+    assert "<p>18 of 19 runs finished, 1 diverged: dqn, coop on CartPole-v0, seeds 0-2. Eviction: fifo. " in text
+    assert "Settings with 3 runs: " in text
     assert "<li>dqn-500-9: diverged: TD errors are not finite at update 2</li>" in text
     assert "dqn-500-9" not in {row[0] for row in runs_table(study).rows}
 

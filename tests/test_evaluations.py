@@ -243,7 +243,8 @@ def test_a_result_of_a_future_that_is_gone_is_refused(inbox: tuple[EvaluationInb
 def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -> None:
     endpoint, folder = free_endpoint(), tmp_path / "run"
     flags = ("--total-steps", "500", "--eval-every", "200", "--eval-episodes", "2", "--run-dir", str(folder))
-    flags += ("--method", "dqn", "--env.id", "coop/Catch-v0", "--network.hidden", "8", "--video-every", "200")
+    flags += ("--method", "dqn", "--env.id", "coop/Catch-v0", "--network.kind", "mlp")
+    flags += ("--network.hidden", "8", "--video-every", "200")
     mine = ("--connect", endpoint, "--every", "0.5", "--episodes", "3", "--epsilon", "0.5", "--envs", "2")
     with (
         running("coop-eval", "--run", "coop", *mine, "--join-timeout", "500") as second,

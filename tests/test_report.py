@@ -199,7 +199,7 @@ def test_one_run_alone(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("sys.argv", ["coop-report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
     cli.main()
     text = (tmp_path / "out" / "index.html").read_text()
-    assert "<p>1 of 1 runs finished: coop on CartPole-v0, seeds 1. Settings with 1 run: " in text
+    assert "<p>1 of 1 runs finished: coop on CartPole-v0, seeds 1. Eviction: reservoir. Settings with 1 run: " in text
     assert "Return against buffer size, breaking points: replay.capacity is the same in all finished runs" in text
     assert re.findall("<h2>(.*?)</h2>", text)[0] == "Return of the last 100 episodes"
     assert "1 row<" in text
