@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import coop
+from coop.common.errors import RunError, UsageError
 from coop.common.settings.tables import resolve
+from coop.evaluation import export_cli
+from coop.evaluation.dataset import export_dataset
 from coop.lockstep.lockstep import Lockstep
 from coop.records.run_directory import RunDirectory
 
@@ -80,3 +86,38 @@ def test_a_run_without_a_whole_table_is_refused(tmp_path: Path) -> None:
     saved(tmp_path / "b", method="stream-q")
     with pytest.raises(coop.UsageError, match="has no buffer: method 'stream-q' learns from each transition once"):
         coop.load(tmp_path / "b").buffer()
+
+
+@pytest.mark.parametrize("env", [{"id": "coop/Catch-v0"}, {"id": "CartPole-v0", "stack": 2}])
+def test_a_parquet_file_gives_the_same_arrays(
+    env: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("coop.evaluation.dataset.ROWS_AT_ONCE", 16)  # several groups, the last one smaller
+    run, file = tmp_path / "run", tmp_path / "new" / "buffer.parquet"
+    saved(run, env=env, replay={**SMALL, "sampling": "prioritized"})
+    monkeypatch.setattr("sys.argv", ["coop-export", str(run), "--dataset", str(file)])
+    export_cli.main()
+    assert capsys.readouterr() == (f"checkpoint 50 in {run}: 40 transitions in {file}\n", "")
+    assert [path.name for path in file.parent.iterdir()] == ["buffer.parquet"]
+    buffer, table = coop.load(run).buffer(), pq.read_table(file)
+    assert table.column_names == list(buffer.columns())
+    assert table.schema.metadata[b"env_id"].decode() == env["id"]
+    for name, array in buffer.columns().items():
+        shape = json.loads(table.schema.field(name).metadata[b"shape"])
+        read = np.array(table[name].to_pylist(), array.dtype).reshape(-1, *shape)
+        np.testing.assert_array_equal(read, array, name, strict=True)
+
+
+def test_a_data_set_replaces_nothing_and_is_whole_or_absent(tmp_path: Path, small_disk: Path) -> None:
+    saved(tmp_path / "run", env={"id": "coop/Catch-v0"}, replay=SMALL)
+    file = tmp_path / "mine"
+    file.write_text("notes")
+    with pytest.raises(UsageError, match="exists already"):
+        export_dataset(tmp_path / "run", file)
+    assert file.read_text() == "notes"
+    with pytest.raises(UsageError, match="holds no run"):
+        export_dataset(tmp_path, tmp_path / "a")
+    (small_disk / "filler").write_bytes(bytes(shutil.disk_usage(small_disk).free - 4096))
+    with pytest.raises(RunError, match=r"buffer\.parquet: No space left on device"):
+        export_dataset(tmp_path / "run", small_disk / "buffer.parquet")
+    assert [path.name for path in small_disk.iterdir()] == ["filler"]
