@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from coop.common.settings.config import RunConfig as RunConfig
     from coop.common.settings.methods import Method as Method
     from coop.common.settings.methods import register_method as register_method
+    from coop.evaluation.buffer import Buffer as Buffer
     from coop.evaluation.evaluate import Evaluation as Evaluation
     from coop.evaluation.evaluate import evaluate as evaluate
     from coop.evaluation.saved import SavedPolicy as SavedPolicy
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from coop.training import train as train
 
 _MODULES = {
+    "Buffer": "coop.evaluation.buffer",
     "CoopError": "coop.common.errors",
     "Evaluation": "coop.evaluation.evaluate",
     "Method": "coop.common.settings.methods",

@@ -99,6 +99,10 @@ def test_a_distributed_run(tmp_path: Path) -> None:
     assert run.summary is not None
     assert (run.summary["exit"], run.summary["transitions_lost"]) == ("complete", 0)
     assert sorted(path.name for path in (tmp_path / "a" / "logs").glob("actor-*")) == ["actor-1.log", "actor-2.log"]
+    buffer = coop.load(tmp_path / "a").buffer()
+    assert 0 < len(buffer) <= run.config.replay.capacity
+    assert (np.abs(buffer.observations[:, 0]) < 2.5).all()  # metres, of CartPole's track
+    assert not np.array_equal(buffer.observations, buffer.next_observations)
 
 
 def test_a_distributed_run_that_can_t_start_says_why(tmp_path: Path) -> None:

@@ -220,7 +220,7 @@ def test_bad_input_gets_one_line(
     (tmp_path / "taken" / "notes.txt").write_text("mine")
     for flags, status, words in (
         ((tmp_path, "--out", tmp_path / "a"), 2, "holds no run"),
-        ((tmp_path / "run",), 2, "missing: --out"),
+        ((tmp_path / "run",), 2, "missing: --out for the networks, or --dataset for the buffer"),
         ((tmp_path / "run", "--out", tmp_path / "file"), 2, "is no folder"),
         ((tmp_path / "run", "--out", tmp_path / "taken"), 2, "has other files, such as notes.txt"),
         ((tmp_path / "run", "--out", tmp_path / "file" / "a"), 1, "file/a: Not a directory"),

@@ -1,4 +1,4 @@
-"""`coop-export`: writes a run's networks to files that need nothing of this package."""
+"""`coop-export`: writes a run's networks, or its buffer, to files that need nothing of this package."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from coop.common.errors import UsageError
 from coop.common.imports import permit
 from coop.common.places import shown
 from coop.common.process.cli import parse
@@ -22,8 +23,10 @@ class ExportOptions:
 
     run_dir: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN_DIR")]
     """Folder of a run, with its config.toml and checkpoints."""
-    out: Path
-    """Folder for the files: new, empty, or with an earlier export, which is replaced."""
+    out: Path | None = None
+    """Folder for the networks' files: new, empty, or with an earlier export, which is replaced."""
+    dataset: Path | None = None
+    """New Parquet file for the transitions of the replay table, one row each."""
     allow_import: tuple[str, ...] = ()
     """Modules, such as my_envs, that may be imported even if they lie in the run's folder or beside it."""
 
@@ -35,13 +38,25 @@ def main() -> None:
 
 
 def _run() -> None:
-    about = "Write both networks of a run's newest checkpoint as safetensors and ONNX, with a card that describes them."
+    about = (
+        "Write both networks of a run's newest checkpoint as safetensors and ONNX, with a card that describes them, or "
+        "the transitions of its replay table as Parquet."
+    )
     options = parse(ExportOptions, "coop-export", about)
-    from coop.evaluation.export import export  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+    if options.out is None and options.dataset is None:
+        raise UsageError("missing: --out for the networks, or --dataset for the buffer")
+    from coop.evaluation.dataset import export_dataset  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+    from coop.evaluation.export import export  # noqa: PLC0415
 
     permit(options.allow_import)
-    done = export(options.run_dir, options.out)
-    where = f"checkpoint {done.checkpoint} in {shown(options.run_dir)}"
-    print(f"{where}, network {done.acting} acts: {', '.join(done.names)}", file=out())
-    if done.without_onnx:
-        print(f"no ONNX files: {done.without_onnx}", file=out())
+    place = shown(options.run_dir)
+    if options.out is not None:
+        done = export(options.run_dir, options.out)
+        where = f"checkpoint {done.checkpoint} in {place}"
+        print(f"{where}, network {done.acting} acts: {', '.join(done.names)}", file=out())
+        if done.without_onnx:
+            print(f"no ONNX files: {done.without_onnx}", file=out())
+    if options.dataset is not None:
+        buffer = export_dataset(options.run_dir, options.dataset)
+        rows = f"{len(buffer):,} transitions in {shown(options.dataset)}"
+        print(f"checkpoint {buffer.checkpoint} in {place}: {rows}", file=out())

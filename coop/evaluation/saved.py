@@ -23,6 +23,7 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.resuming import settings_digest
 from coop.common.types import Array, EnvSpec
+from coop.evaluation.buffer import Buffer, read_buffer
 from coop.learner.qnetwork import make_network
 from coop.records.checkpoints import EVALUATIONS, RECORDS
 from coop.records.learner_checkpoints import fitting, newest_checkpoint
@@ -164,6 +165,14 @@ class SavedRun:
                 network.load(flat)
             steps, returns = state["drawn"]["inserted"], state["telemetry"]["returns"]
             return Checkpoint(checkpoint.number, spec, (first, second), state["agent"]["acting"], steps, returns)
+
+    def buffer(self) -> Buffer:
+        """The transitions that the replay table held at the newest whole checkpoint; env and network are not needed.
+
+        Raises:
+            UsageError: the run keeps no table, or has no checkpoint here that holds one.
+        """
+        return read_buffer(self.path, self.config)
 
     def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
         """The greedy policy of the newest checkpoint.

@@ -54,15 +54,15 @@ def save_checkpoint(
     return path
 
 
-def newest_checkpoint(run_dir: Path, settings: str = "") -> Whole | None:
+def newest_checkpoint(run_dir: Path, settings: str = "", *, replay: bool = False) -> Whole | None:
     """The newest whole checkpoint of a run, with the learner's state, for readers; None if there is none.
 
-    A warning names those that were passed over. settings: see `survey`.
+    A warning names those that were passed over. settings, replay: see `survey`.
 
     Raises:
         UsageError: there are checkpoints, but none is whole.
     """
-    found = survey(run_dir, settings=settings, load=load_learner)
+    found = survey(run_dir, replay=replay, settings=settings, load=load_learner)
     if found.newest is None and found.problems:
         raise UsageError(f"{run_dir}: has no complete checkpoint: {found.passed_over}")
     if found.fallback:

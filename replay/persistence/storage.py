@@ -5,8 +5,10 @@ The folder gets its name once everything in it is on the disk. `DONE` seals size
 
 from __future__ import annotations
 
+import contextlib
 import io
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,10 +21,12 @@ from coop.common.messaging import wire
 from coop.common.messaging.messages.sample import BatchReader, encode_batch
 from coop.common.process.files import PIECE, FileDigest, SyncedFile, make_folder, sync_folder
 from coop.common.process.untrusted import load_array, read_bytes
-from coop.common.types import Array, EpisodeEnd, EpisodeRecord
+from coop.common.transitions import KEPT
+from coop.common.types import Array, EnvSpec, EpisodeEnd, EpisodeRecord
 from coop.records.checkpoints import Damaged, Manifest, check_part, read_manifest, remove, write_manifest
 from coop.records.run_ids import check_owner
 from coop.replay.core import CoreSnapshot, ReplayCore
+from coop.replay.table.numbering import EPISODES
 
 FRAMES_AT_ONCE = 256
 STATE = "state.msgpack"
@@ -100,24 +104,58 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int, number: int) -> Mar
         UsageError: the snapshot's table has other settings.
     """
     check_owner(path, read_manifest(path).run, run_id)
-    manifest = check_part(path, number, run_id)
     read = BatchReader(core.table.spec)
-    try:
-        state: dict[str, Any] = msgpack.unpackb(read_bytes(path / STATE), strict_map_key=False)
-        names = [name for name in manifest.files if name != STATE]
-        arrays = {name.removesuffix(".npy"): _read_array(path / name) for name in names}
+    with _of_a_table():
+        manifest, state, arrays = _read(path, number, run_id)
         replies = [read(wire.decode(payload)) for payload in state["replies"]]
         episodes = [
             EpisodeRecord(step, actor, stream, EpisodeEnd(*end)) for step, actor, stream, end in state["episodes"]
         ]
         core.restore(state["state"], episodes, state["table"], arrays, replies)
+    return Mark(manifest.run, manifest.number, manifest.journal)
+
+
+def read_transitions(path: Path, number: int) -> tuple[EnvSpec, dict[str, Array]]:
+    """The environment's spec and the transitions of a snapshot of checkpoint `number`, in order of insertion.
+
+    By name: what a table keeps of each, `obs` and `next_obs`: <frame_dtype>[n, *obs_shape], `age`: int64 [n], and
+    `priorities` and `episodes` if the table has them.
+
+    Raises Damaged: the folder is not an intact snapshot.
+    """
+    with _of_a_table():
+        _, state, arrays = _read(path, number, None)
+        meta = state["table"]
+        env_id, frame_shape, *rest = meta["settings"]["spec"]
+        spec = EnvSpec(env_id, tuple(frame_shape), *rest)
+        order = np.argsort(arrays["ids"])
+        names = [name for name in (*KEPT, "priorities", EPISODES) if len(arrays.get(name, ())) == len(order)]
+        found = {name: arrays[name][order] for name in names}
+        slots, frames = arrays["slots"][order], arrays["frames"]  # mapped: each is read from the disk as it is copied
+        for name, index in (("obs", slots[:, : spec.stack]), ("next_obs", slots[:, spec.stack :])):
+            found[name] = frames[index].reshape(-1, *spec.obs_shape)
+        return spec, {**found, "age": meta["inserted"] - 1 - found["ids"]}
+
+
+def _read(path: Path, number: int, run_id: int | None) -> tuple[Manifest, dict[str, Any], dict[str, Array]]:
+    """Read a snapshot after a check of all its bytes: what seals it, its state, and its arrays."""
+    manifest = check_part(path, number, run_id)
+    state = msgpack.unpackb(read_bytes(path / STATE), strict_map_key=False)
+    names = [name for name in manifest.files if name != STATE]
+    return manifest, state, {name.removesuffix(".npy"): _read_array(path / name) for name in names}
+
+
+@contextlib.contextmanager
+def _of_a_table() -> Iterator[None]:
+    """Raise Damaged in place of what fails because files, though sealed, are not those of a table."""
+    try:
+        yield
     except BadMessage as error:
         raise Damaged(f"{STATE}: {error}") from error
     except CoopError:
         raise
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:  # sealed, so not by chance
         raise Damaged(f"{STATE}: not a table of this run: {error!r}") from error
-    return Mark(manifest.run, manifest.number, manifest.journal)
 
 
 def _read_array(path: Path) -> Array:
