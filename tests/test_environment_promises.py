@@ -442,7 +442,7 @@ def test_paths_and_files_as_users_write_them(tmp_path: Path) -> None:
     ):
         done = run_command(command, flag, "", cwd=tmp_path)
         assert done.returncode == 2
-        assert done.stderr.splitlines() == [f"{command}: error: {flag}: an empty value; allowed: PATH"]
+        assert done.stderr.splitlines() == [f"{command}: error: {flag}: an empty value; allowed: PATH, or None"]
     flags = ["--total-steps=60", "--replay.capacity=50", "--replay.learning-starts=20", "--network.hidden=8"]
     home = {**os.environ, "HOME": str(tmp_path / "home")}
     run_command("coop-lockstep", *flags, "--run-dir=~/x", cwd=tmp_path, environment=home, check=True)
