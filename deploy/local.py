@@ -10,9 +10,9 @@ from coop.common.envs.make import check_filmed, env_spec
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.transport import new_incarnation
 from coop.common.places import shown
-from coop.common.process.cli import HttpAddress
 from coop.common.process.console import say, stamped
 from coop.common.process.files import make_folder, write_atomic
+from coop.common.process.flags import HttpAddress
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.ports import check_can_listen, check_loopback
 from coop.common.process.processes import ChildProcess, command, free_endpoint

@@ -221,6 +221,9 @@ def test_bad_input_gets_one_line(
     for flags, status, words in (
         ((tmp_path, "--out", tmp_path / "a"), 2, "holds no run"),
         ((tmp_path / "run",), 2, "missing: --out for the networks, or --dataset for the buffer"),
+        ((), 2, "missing: RUN_DIR"),
+        (("", "--out", tmp_path / "a"), 2, "RUN_DIR: an empty value"),
+        ((tmp_path / "run", "--otu", tmp_path / "a"), 2, "--otu: unknown; did you mean --out? "),
         ((tmp_path / "run", "--out", tmp_path / "file"), 2, "is no folder"),
         ((tmp_path / "run", "--out", tmp_path / "taken"), 2, "has other files, such as notes.txt"),
         ((tmp_path / "run", "--out", tmp_path / "file" / "a"), 1, "file/a: Not a directory"),

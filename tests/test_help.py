@@ -184,7 +184,7 @@ def test_the_version_is_the_packages(name: str, pages: dict[str, Any]) -> None:
     [
         ("--replay.cap", "--replay.capacity"),
         ("--preset minatar-s", "minatar-seaquest minatar-space-invaders"),
-        ("--replay.eviction r", "reservoir"),
+        ("--replay.journal s", "sync"),
         ("--learner.loss h", "huber"),
     ],
 )

@@ -11,7 +11,7 @@ import pydantic
 from coop.actors.cli import ActorOptions
 from coop.common.bounds import MAX_INTEGER
 from coop.common.metrics import METRICS
-from coop.common.process.cli import Flag, sections
+from coop.common.process.flags import Flag, sections
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS, table_of
 from coop.common.settings.tables import load_tables, preset_names, resolve

@@ -2,139 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import redirect_stderr, suppress
+from dataclasses import fields, replace
+from functools import partial
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import tyro
-from tyro import _arguments as tyro_arguments  # private, as the two below; pyproject.toml pins the version
-from tyro import _errors as tyro_errors  # private; pyproject.toml pins the version
-from tyro import _parsers as tyro_parsers
-from tyro import _strings as tyro_strings
-from tyro._backends import _tyro_backend as tyro_backend
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+from tyro.constructors import PrimitiveConstructorSpec
 
 from coop.common.errors import UsageError, closest, not_among, refusal
-from coop.common.places import absolute, user_path
+from coop.common.places import absolute
+from coop.common.process.flags import READERS, Flag, Section, sections
 from coop.common.process.lifecycle import ProcessExit
 
 SHELLS = ("bash", "zsh", "fish")
-
-HttpAddress = Annotated[str, tyro.conf.arg(metavar="[HOST:]PORT")]
-"""Where to serve HTTP; see `coop.common.process.ports.http_address`."""
-
-
-@dataclass(frozen=True)
-class Flag:
-    """A flag or a positional argument.
-
-    name: "--learner.swap-every"; of a positional argument its placeholder, "RUN_DIR".
-    value: placeholder of the value, "INT"; empty for a switch, which `negative` ("--learner.no-double") turns off.
-    choices: the allowed values, where they are names. text: what it sets. default: empty if there is none, or of
-    a switch that is off.
-    """
-
-    name: str
-    value: str
-    choices: tuple[str, ...]
-    text: str
-    default: str
-    required: bool
-    negative: str = ""
-
-
-@dataclass(frozen=True)
-class Section:
-    """The flags of one dataclass; name and text are empty for those of the command itself."""
-
-    name: str
-    text: str
-    flags: tuple[Flag, ...]
-
-
-def sections(kind: type[Any], default: object = None) -> list[Section]:
-    """The flags of a dataclass, positional arguments first, then of each one nested in it.
-
-    default: an instance with the values to show.
-    """
-    with tyro_strings.delimiter_context("-"):
-        return list(_sections(_specification(kind, default)))
-
-
-def completion(kind: type[Any], default: object, program: str, shell: str) -> str:
-    """A script that completes a command's flags and their values in one of `SHELLS`."""
-    with tyro_strings.delimiter_context("-"):
-        specification = _specification(kind, default)
-        for each in specification.get_args_including_children():
-            lowered = each.arg.lowered
-            lowered.choices, lowered.metavar = _choices(each.arg) or None, placeholder(each.arg)
-        backend = tyro_backend.TyroBackend()
-        prefix = f"tyro_{program.replace('-', '_')}"
-        return backend.generate_completion(specification, program, shell, prefix)  # type: ignore[arg-type]
-
-
-def _specification(kind: type[Any], default: object) -> tyro_parsers.ParserSpecification:
-    return tyro_parsers.ParserSpecification.from_callable_or_type(
-        kind,
-        markers=set(),
-        description=None,
-        parent_classes=set(),
-        default_instance=tyro.MISSING_NONPROP if default is None else default,
-        intern_prefix="",
-        extern_prefix="",
-        subcommand_prefix="",
-        support_single_arg_types=False,
-        prog_suffix="",
-    )
-
-
-def _sections(parser: tyro_parsers.ParserSpecification, name: str = "", text: str = "") -> Iterator[Section]:
-    flags = [_flag(arg) for arg in parser.args if not arg.is_suppressed()]
-    yield Section(name, text, tuple(sorted(flags, key=lambda flag: flag.name.startswith("-"))))
-    for prefix, nested in parser.child_from_prefix.items():
-        yield from _sections(nested, prefix, nested.description)
-
-
-def _flag(arg: tyro_arguments.ArgumentDefinition) -> Flag:
-    lowered, given = arg.lowered, arg.field.helptext
-    text = (given() if callable(given) else given) or ""
-    name = placeholder(arg) if arg.is_positional() else lowered.name_or_flags[-1]
-    if lowered.action == "boolean_optional_action":
-        default = "on" if arg.field.default else ""
-        return Flag(name, "", (), text, default, False, tyro_arguments.flag_to_inverse(name) or "")
-    return Flag(name, placeholder(arg), _choices(arg), text, _shown(arg), bool(lowered.required))
-
-
-def placeholder(arg: tyro_arguments.ArgumentDefinition) -> str:
-    """What stands for the value in the help: "INT", "INT ..." for several, "{fifo,reservoir}" for one of several."""
-    metavar = (arg.lowered.metavar or "").removeprefix("{None}|")
-    short = re.sub(r"\[(\w+|\{[^ {}]+\}) \[\1 \.\.\.\]\]", r"\1 ...", metavar)
-    return short.strip("{}") if short == metavar and not _choices(arg) else short
-
-
-def _choices(arg: tyro_arguments.ArgumentDefinition) -> tuple[str, ...]:
-    """The names in a placeholder such as "{fifo,reservoir}"."""
-    found = re.fullmatch(r"\{([^ {}]+)\}", (arg.lowered.metavar or "").removeprefix("{None}|"))
-    return tuple(found[1].split(",")) if found else ()
-
-
-def _shown(arg: tyro_arguments.ArgumentDefinition) -> str:
-    """The default as the command line would have it."""
-    default, write = arg.field.default, arg.lowered.str_from_instance
-    if default is None or arg.lowered.required or write is None:
-        return ""
-    words = write(default)
-    return words if isinstance(words, str) else " ".join(words)
-
-
 EXIT_STATUSES = (
     ("0", "It has done what it was asked to do."),
     ("1", "It could not start or finish, or lost a process that it needs; the last line on stderr says why."),
@@ -239,47 +129,6 @@ ANSWERS = ("--help", "--help-all", "--version", "--completion")
 
 T = TypeVar("T")
 
-_PATHS = ConstructorRegistry()
-
-
-@_PATHS.primitive_rule
-def _path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
-    """Reads every flag that is a path as `user_path` does."""
-    if info.type is not Path:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="PATH",
-        instance_from_str=lambda words: user_path(words[0]),
-        is_instance=lambda value: isinstance(value, Path),
-        str_from_instance=lambda value: [str(value)],
-    )
-
-
-@_PATHS.primitive_rule
-def _int(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
-    """Reads every flag that is a whole number as `whole_number` does."""
-    if info.type is not int:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="INT",
-        instance_from_str=lambda words: whole_number(words[0]),
-        is_instance=lambda value: isinstance(value, int) and not isinstance(value, bool),
-        str_from_instance=lambda value: [str(value)],
-    )
-
-
-def whole_number(text: str) -> int:
-    """Read a whole number: 1000000, 1_000_000 or 1e6."""
-    try:
-        return int(text)
-    except ValueError:
-        with suppress(ValueError):
-            if (number := float(text)).is_integer():
-                return int(number)
-        raise
-
 
 def parse(
     kind: type[T],
@@ -297,24 +146,31 @@ def parse(
         UsageError: an unknown flag or a value of the wrong type.
         ProcessExit: the flags asked for help, the version or a completion script; it has been printed.
     """
-    args = _separated(_with_values(sys.argv[1:] if args is None else args), kind, default)
+    parts = sections(kind, default)
+    flags = [flag for part in parts for flag in part.flags]
+    args = _separated(_with_values(sys.argv[1:] if args is None else args), flags)
     asked = {token.partition("=")[0].replace("_", "-") for token in args}
     if "--help-all" in asked:
-        _answer(full_help(program, description, sections(kind, default)))
+        _answer(full_help(program, description, parts))
     if asked & {"-h", "--help"}:
-        _answer(short_help(program, description, sections(kind, default), common))
+        _answer(short_help(program, description, parts, common))
     if "--version" in asked:
         _answer(f"{program} {version(PACKAGE)}")
+    read: Callable[..., tuple[T, list[str]]] = partial(
+        tyro.cli, kind, prog=program, default=tyro.MISSING_NONPROP if default is None else default
+    )
     if "--completion" in asked:
-        _answer(completion(kind, default, program, _shell(args)))
-
-    def refuse(event: tyro_errors.ParseErrorEvent) -> NoReturn:
-        raise UsageError(_problem(event, kind))
-
-    with _PATHS, tyro_errors.on_parse_error(refuse):
-        if default is None:
-            return _with_absolute_paths(tyro.cli(kind, prog=program, args=args, add_help=False))
-        return _with_absolute_paths(tyro.cli(kind, prog=program, args=args, add_help=False, default=default))
+        with suppress(SystemExit):
+            read(args=["--tyro-write-completion", _shell(args), "-"], registry=READERS)
+        raise ProcessExit(0)
+    try:
+        with redirect_stderr(io.StringIO()):
+            options, unknown = read(args=args, registry=READERS, add_help=False, return_unknown_args=True)
+    except SystemExit:
+        raise UsageError(_problem(args, flags)) from None
+    if unknown:
+        raise UsageError(f"{unknown[0]}: {_unknown(unknown[0], flags)}")
+    return _with_absolute_paths(options)
 
 
 def _with_values(args: Sequence[str]) -> list[str]:
@@ -327,11 +183,9 @@ def _with_values(args: Sequence[str]) -> list[str]:
     return words
 
 
-def _separated(args: Sequence[str], kind: type[Any], default: object) -> list[str]:
+def _separated(args: Sequence[str], flags: Iterable[Flag]) -> list[str]:
     """The command line, in which numbers joined by commas are given one by one to flags that take several."""
-    if not any(_JOINED.fullmatch(token) for token in args):
-        return list(args)
-    several = {flag.name for part in sections(kind, default) for flag in part.flags if flag.value.endswith("...")}
+    several = {flag.name for flag in flags if flag.value.endswith("...")}
     words: list[str] = []
     flag = ""
     for token in args:
@@ -378,41 +232,64 @@ def _shell(args: Sequence[str]) -> str:
     return shell
 
 
-def _problem(event: tyro_errors.ParseErrorEvent, kind: type[Any]) -> str:
-    """Describe a parse error in one line."""
-    match event:
-        case tyro_errors.UnrecognizedArgs(tokens=[first, *_]):
-            return f"{first}: {_unknown(first, kind)}"
-        case tyro_errors.InvalidChoice(argument=argument, value=value, choices=choices):
-            return f"{argument.display_name()} {value}: {not_among(choices, value)}"
-        case tyro_errors.MissingArgs(missing_arguments=missing):
-            args = [one.arg for one in missing]
-            names = [placeholder(arg) if arg.is_positional() else arg.display_name() for arg in args]
-            return f"missing: {', '.join(names)}"
-        case tyro_errors.BadValue(argument=argument):
-            return f"{argument.display_name()}: needs a value"
-        case tyro_errors.InstantiationFailure(message=message, argument=argument) if argument:
-            unset = ", or None" if (argument.lowered.metavar or "").startswith("{None}|") else ""
-            return f"{argument.display_name()}: {_reason(message)}; allowed: {placeholder(argument)}{unset}"
-    return "the command line can't be read; --help-all lists every flag"
+def _problem(args: Sequence[str], flags: Sequence[Flag]) -> str:
+    """Why tyro has refused a command line, in one line."""
+    given = _assigned(args, flags)
+    for flag in flags:
+        if flag.reader and flag.name in given and (problem := _misread(flag, flag.reader, given[flag.name])):
+            return problem
+    if "" in given:
+        return f"{given[''][0]}: {_unknown(given[''][0], flags)}"
+    missing = ", ".join(flag.name for flag in flags if flag.required and flag.name not in given)
+    return f"missing: {missing}" if missing else "the command line can't be read; --help-all lists every flag"
 
 
-def _reason(message: str) -> str:
-    """Why a value cannot be read, in one line; tyro's own messages show types and have several."""
-    first = message.partition("\n")[0]
-    value = re.search(r"(?: from|arguments:|base 10:|to float:) (.+?)\.?$", first)
-    if value and value[1] in ("''", "['']"):
-        return "an empty value"
-    return f"can't read {value[1]}" if value else first
+def _assigned(args: Sequence[str], flags: Sequence[Flag]) -> dict[str, list[str]]:
+    """The words of each given flag and positional argument, by its name; those that belong to none by ""."""
+    known = {name: flag for flag in flags for name in (flag.name, flag.negative) if name.startswith("-")}
+    positional = [flag for flag in flags if not flag.name.startswith("-")]
+    given: dict[str, list[str]] = {}
+    current: Flag | None = None
+    for token in args:
+        name, joined, value = token.partition("=")
+        if flag := known.get(name.replace("_", "-")):
+            current, given[flag.name] = flag, [value] if joined else []
+            continue
+        count = current.reader.nargs if current and current.reader else 0
+        if token.startswith("--"):
+            current = None
+        elif current is None or (isinstance(count, int) and len(given[current.name]) >= count):
+            current = positional.pop(0) if positional else None
+        given.setdefault(current.name if current else "", []).append(token)
+    return given
 
 
-def _unknown(token: str, kind: type[Any]) -> str:
+def _misread(flag: Flag, reader: PrimitiveConstructorSpec[Any], words: list[str]) -> str | None:
+    """Why a flag's words are no value of it; None if they are one."""
+    if isinstance(reader.nargs, int) and len(words) < reader.nargs:
+        return f"{flag.name}: needs a value"
+    for word in words:
+        if reader.choices and word not in reader.choices:
+            return f"{flag.name} {word}: {not_among(reader.choices, word)}"
+    try:
+        with READERS:
+            reader.instance_from_str(words)
+    except ValueError as error:
+        quoted = " ".join(map(repr, words))
+        text, _, _ = str(error).partition("\n")
+        reason = text if text.startswith(quoted) else "an empty value" if words == [""] else f"can't read {quoted}"
+        unset = ", or None" if "{None}|" in reader.metavar else ""
+        return f"{flag.name}: {reason}; allowed: {flag.value}{unset}"
+    return None
+
+
+def _unknown(token: str, flags: Iterable[Flag]) -> str:
     """What to say of an unknown word; of a flag with the one that it resembles, with or without its section.
 
     Of the name of a section, with the section's first flag.
     """
     word = token.partition("=")[0].replace("_", "-")
-    known = {name: name for part in sections(kind) for each in part.flags for name in (each.name, each.negative)}
+    known = {name: name for flag in flags for name in (flag.name, flag.negative)}
     if not token.startswith("-"):
         return refusal("unknown", known.get(f"--{word}"), "it follows no flag that takes it")
     first = known.get(_ALSO_CALLED.get(word, "")) or next((name for name in known if name.startswith(f"{word}.")), None)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coop.common.imports import permit
-from coop.common.process.cli import HttpAddress
+from coop.common.process.flags import HttpAddress
 from coop.common.process.untrusted import check_run
 
 

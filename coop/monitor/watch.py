@@ -19,8 +19,9 @@ from coop.common.messaging.messages.status import LearnerStatus
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.numbers import strict_json
-from coop.common.process.cli import HttpAddress, parse
+from coop.common.process.cli import parse
 from coop.common.process.console import PeerMonitor, progress_line, stamped
+from coop.common.process.flags import HttpAddress
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.untrusted import check_run
 from coop.monitor.display import LiveDisplay

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
 from coop.common.errors import RunError, UsageError
 from coop.common.imports import check_extra, hand_over, permit
 from coop.common.places import absolute, shown
 from coop.common.process import cli
-from coop.common.process.cli import HttpAddress
+from coop.common.process.flags import HttpAddress, whole_number
 from coop.common.process.output import warn
 from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig
@@ -43,13 +44,21 @@ COMMON = (
 )
 
 _OF_RUNS = ("run-id", "checkpoints", "episodes.csv")  # beside a config.toml
+_PRESET: PrimitiveConstructorSpec[str | None] = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar=f"{{{','.join(preset_names())}}}",
+    instance_from_str=lambda words: words[0],
+    is_instance=lambda value: value is None or isinstance(value, str),
+    str_from_instance=lambda value: [str(value)],
+    choices=tuple(preset_names()),
+)
 
 
 @dataclass(frozen=True)
 class RunOptions(RunConfig):
     """The fields of a run's config, their source, and the run directory."""
 
-    preset: Annotated[str | None, tyro.conf.arg(metavar=f"{{{','.join(preset_names())}}}")] = None
+    preset: Annotated[str | None, _PRESET] = None
     """Settings that come with the package; that of env.id if neither --config nor a resumed run gives any."""
     config: Path | None = None
     """A TOML file with the fields of a run, for example the config.toml of another run."""
@@ -198,7 +207,7 @@ def base_config(args: Sequence[str] | None = None) -> RunConfig:
     early.add_argument("--config", type=_path)
     early.add_argument("--method")
     early.add_argument("--env.id", dest="env_id")
-    early.add_argument("--total-steps", "--total_steps", type=cli.whole_number)
+    early.add_argument("--total-steps", "--total_steps", type=whole_number)
     early.add_argument("--run-dir", "--run_dir", type=_path)
     early.add_argument("--allow-import", "--allow_import", nargs="*", default=[])
     early.add_argument("--resume", action="store_true")
