@@ -55,6 +55,8 @@ class Odd(CartPoleEnv):
     def step(self, action):
         if os.environ.get("ODD") == "exit":
             sys.exit("no licence")
+        if os.environ.get("ODD") == "closed window":
+            raise KeyboardInterrupt("window closed")
         obs, reward, *ends = super().step(action)
         return (obs, 123456.789 if os.environ.get("ODD") == "rewards" else reward, *ends)
 
@@ -297,6 +299,16 @@ def test_an_environment_that_exits_is_named(line: list[str], words: str, folder:
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith(words)
     assert "SystemExit: no licence" in done.stderr + done.stdout
+
+
+@pytest.mark.parametrize(
+    "line",
+    [["coop-local", *SMALL, "--env.id", "odd_envs:Odd-v0"], ["coop-lockstep", *SMALL, "--env.id", "odd_envs:Odd-v0"]],
+)
+def test_an_environment_that_interrupts_fails(line: list[str], folder: Path) -> None:
+    done = run_command(*line, "--run-dir", "anew", cwd=folder, environment=odd("closed window"), timeout=200)
+    assert done.returncode == 1
+    assert "at step 1 raised KeyboardInterrupt: window closed" in done.stderr
 
 
 # Limits of the job

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from coop.common.bounds import MAX_MAGNITUDE
 from coop.common.errors import RunError, UsageError
 from coop.common.imports import describe
+from coop.common.process.lifecycle import is_interrupt
 from coop.common.process.output import warn, warn_once
 from coop.common.types import Array
 
@@ -184,9 +185,9 @@ def raised(error: BaseException) -> str:
     """What a user's code has raised, in one line, with the last line of that code that it came through.
 
     It may be anything, such as SystemExit, which must not end a run, or an exception of a library that is no Exception;
-    KeyboardInterrupt alone is raised again.
+    an interrupt by a signal alone is raised again.
     """
-    if isinstance(error, KeyboardInterrupt):
+    if is_interrupt(error):
         raise error
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if frame.filename != __file__ and "site-packages" not in frame.filename:

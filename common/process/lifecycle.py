@@ -30,11 +30,17 @@ class ProcessExit(SystemExit):
 
 
 class Signalled(KeyboardInterrupt):
-    """A signal, in a command that needs no `Stop`; not an Exception, which users' code may swallow."""
+    """A signal, where no `Stop` takes it; not an Exception, which users' code may swallow."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
         self.exit_status = status_after(number)
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether a signal has raised an exception; a user's code may raise KeyboardInterrupt for reasons of its own."""
+    pythons = isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    return pythons or isinstance(error, Signalled)
 
 
 class Stop:
@@ -85,7 +91,7 @@ class Stop:
 
         def handle(number: int, frame: FrameType | None) -> None:
             if number == signal.SIGINT and number in received:
-                raise KeyboardInterrupt
+                raise Signalled(number)
             received.add(number)
             self.set("interrupted", exit_status=status_after(number))
 
