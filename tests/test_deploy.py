@@ -1,6 +1,7 @@
 """The container files agree with the commands: every service's command line is one that its role accepts."""
 
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +81,50 @@ def test_the_image_ends_without_root_and_without_build_tools() -> None:
     assert steps[users[-1]] != "USER root"
     assert not [line for line in steps[users[-1] :] if line.startswith("RUN ")]
     assert not [line for line in steps[last:] if "pip install" in line or "apt-get" in line]
+
+
+@pytest.mark.skipif(not Path("/etc/ssl/certs/ca-certificates.crt").exists(), reason="no certificates to pass on")
+@pytest.mark.parametrize(
+    ("listed", "kept"),
+    [
+        (
+            [
+                "global.constraint='{at}/constraints.txt'",
+                "global.extra-index-url='file:///no/index https://here.example/s'",
+            ],
+            ["extra-index-url = https://here.example/s"],
+        ),
+        (
+            [
+                "global.timeout='15'",
+                "install.timeout='60'",
+                ":env:.find-links='{at}/wheels /no/such'",
+                "install.require-hashes='1'",
+            ],
+            ["timeout = 60", "find-links = {at}/wheels"],
+        ),
+        (
+            ["global.cert='{at}/own.crt'", ":env:.constraint='/no/such.txt'"],
+            ["cert = /etc/ssl/certs/ca-certificates.crt"],
+        ),
+        ([], []),
+    ],
+)
+def test_the_image_to_build_in_has_what_the_host_s_pip_needs(
+    listed: list[str], kept: list[str], tmp_path: Path
+) -> None:
+    """And nothing that names a file which is not in the image, such as a constraint file of the host."""
+    (tmp_path / "wheels").mkdir()
+    for file in ("constraints.txt", "own.crt", "wheels/a.whl"):
+        (tmp_path / file).write_text(file)
+    settings = "".join(f"{line.format(at=tmp_path)}\n" for line in listed)
+    script = Path(__file__).parent.parent / "deploy" / "builder_image.sh"
+    subprocess.run([script, "base", tmp_path / "image"], input=settings, text=True, check=True)
+    root = tmp_path / "image" / "root"
+    assert (root / "etc/pip.conf").read_text().splitlines() == [
+        "[global]",
+        *(line.format(at=tmp_path) for line in kept),
+    ]
+    assert (root / f"{tmp_path}/wheels/a.whl".lstrip("/")).exists() == any("find-links" in line for line in listed)
+    certificates = root / "etc/ssl/certs/ca-certificates.crt"
+    assert (certificates.read_text() == "own.crt") == any("cert=" in line for line in listed)
