@@ -266,4 +266,4 @@ def test_no_card_stands_beside_networks_that_are_not_its_own(tmp_path: Path) -> 
 def test_the_command_is_installed() -> None:
     command = [Path(sysconfig.get_path("scripts")) / "coop-export", "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True).stdout
-    assert "Folder for the files: new, empty" in " ".join(shown.split()).replace("│ ", "")
+    assert "files: new, empty, or with" in " ".join(shown.split()).replace("│ ", "")
