@@ -7,8 +7,6 @@ is recovered. The table says how many transitions had been acknowledged before a
 
 from __future__ import annotations
 
-import argparse
-import os
 import random
 import statistics
 import subprocess
@@ -21,7 +19,7 @@ from pathlib import Path
 
 from journal import Service, settings
 from made_up import ATARI
-from power import mounted
+from power import mounted, options
 
 from coop.replay.core import ReplayCore
 from coop.replay.persistence.recovery import recover
@@ -31,21 +29,15 @@ FEW = 5  # cuts of one service, which fills its disk meanwhile
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cuts", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    if os.geteuid():
-        sys.exit("acked: loop mounts need root")
-    rng = random.Random(options.seed)
+    asked, rng = options(__doc__)
     print("| journal | cuts | acknowledged | of them lost: median (most) | cuts that lost any |")
     print("| --- | ---: | ---: | ---: | ---: |")
     found = {}
     for journal in ("sync", "async"):
         counts = []
-        while len(counts) < options.cuts:
+        while len(counts) < asked:
             with tempfile.TemporaryDirectory() as folder:
-                counts += cut(journal, Path(folder), min(FEW, options.cuts - len(counts)), rng)
+                counts += cut(journal, Path(folder), min(FEW, asked - len(counts)), rng)
         lost = found[journal] = [max(0, acked - there) for acked, there in counts]
         told = f"{statistics.median(lost):,.0f} ({max(lost):,}) | {sum(map(bool, lost))} |"
         print(f"| {journal} | {len(counts)} | {sum(acked for acked, _ in counts):,} | {told}", flush=True)

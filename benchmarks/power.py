@@ -34,15 +34,10 @@ RESUMED = 40.0  # seconds to go on, on a busy machine
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cuts", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    if os.geteuid():
-        sys.exit("power: loop mounts need root")
-    rng, failed = random.Random(options.seed), 0
-    shares = {"lockstep": options.cuts * 2 // 5, "local": options.cuts * 3 // 10}
-    shares["sweep"] = options.cuts - sum(shares.values())
+    asked, rng = options(__doc__)
+    failed = 0
+    shares = {"lockstep": asked * 2 // 5, "local": asked * 3 // 10}
+    shares["sweep"] = asked - sum(shares.values())
     print("| writes | cuts | resumed | falsely finished | steps lost: median (most) | checkpoint every |")
     print("| --- | ---: | ---: | ---: | ---: | ---: |")
     for kind, cuts in shares.items():
@@ -55,6 +50,17 @@ def main() -> None:
         for problem in problems:
             print(problem, flush=True)
     sys.exit(1 if failed else 0)
+
+
+def options(text: str | None) -> tuple[int, random.Random]:
+    """The number of cuts that the command line asks for, and the generator of their moments; exits without root."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cuts", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    if os.geteuid():
+        sys.exit(f"{parser.prog}: loop mounts need root")
+    return given.cuts, random.Random(given.seed)
 
 
 def cut(kind: str, folder: Path, cuts: int, rng: random.Random) -> tuple[list[str], list[int], int]:
