@@ -23,7 +23,7 @@ from coop.common.settings.config import MAY_NAME_MODULES, RunConfig, check_distr
 from coop.common.settings.effects import without_effect
 from coop.common.settings.overrides import leaves, merged
 from coop.common.settings.resuming import settings_digest
-from coop.common.settings.starting import stated
+from coop.common.settings.starting import env_id_of, stated
 from coop.common.settings.tables import to_tables, to_toml, validated
 from coop.lockstep.run import LockstepRun
 from coop.records.locks import RunLock
@@ -212,8 +212,7 @@ def _options(
     if preset is not None and file is not None:
         raise UsageError("preset and config: give one of them")
     directory = None if run_dir is None else absolute(run_dir, "run_dir")
-    steps, env = settings.get("total_steps"), settings.get("env")
-    env_id = env.get("id") if isinstance(env, Mapping) else None
+    steps = settings.get("total_steps")
     path = None if file is None else absolute(file, "config")
     base = chosen_config(
         preset,
@@ -221,7 +220,7 @@ def _options(
         method,
         steps if isinstance(steps, int) else None,
         directory if start.goes_on else None,
-        env_id if isinstance(env_id, str) else None,
+        env_id_of(settings),
     )
     chosen = validated(merged(to_tables(base), settings), given, lockstep=lockstep)
     values = {field.name: getattr(chosen, field.name) for field in fields(RunConfig)}

@@ -10,9 +10,8 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import redirect_stderr, suppress
 from dataclasses import fields, replace
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
-from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -52,7 +51,7 @@ def short_help(program: str, description: str, parts: Sequence[Section], common:
 
     It fits two screens of 80 x 24.
     """
-    flags = {flag.name: flag for flag in chain.from_iterable(part.flags for part in parts)}
+    flags = {flag.name: flag for flag in _flags(parts)}
     chosen = [flags[name] for name in common if name in flags]
     shown = [replace(flag, text=re.split("[;.]( |$)", flag.text)[0] + ".") for flag in chosen] or list(flags.values())
     rest = f"all {len(flags)} flags, " if len(shown) < len(flags) else ""
@@ -146,14 +145,13 @@ def parse(
         UsageError: an unknown flag or a value of the wrong type.
         ProcessExit: the flags asked for help, the version or a completion script; it has been printed.
     """
-    parts = sections(kind, default)
-    flags = [flag for part in parts for flag in part.flags]
-    args = _separated(_with_values(sys.argv[1:] if args is None else args), flags)
+    parts = cache(partial(sections, kind, default))  # takes a tenth of a second, which most command lines need not
+    args = _separated(_with_values(sys.argv[1:] if args is None else args), parts)
     asked = {token.partition("=")[0].replace("_", "-") for token in args}
     if "--help-all" in asked:
-        _answer(full_help(program, description, parts))
+        _answer(full_help(program, description, parts()))
     if asked & {"-h", "--help"}:
-        _answer(short_help(program, description, parts, common))
+        _answer(short_help(program, description, parts(), common))
     if "--version" in asked:
         _answer(f"{program} {version(PACKAGE)}")
     read: Callable[..., tuple[T, list[str]]] = partial(
@@ -167,10 +165,14 @@ def parse(
         with redirect_stderr(io.StringIO()):
             options, unknown = read(args=args, registry=READERS, add_help=False, return_unknown_args=True)
     except SystemExit:
-        raise UsageError(_problem(args, flags)) from None
+        raise UsageError(_problem(args, _flags(parts()))) from None
     if unknown:
-        raise UsageError(f"{unknown[0]}: {_unknown(unknown[0], flags)}")
+        raise UsageError(f"{unknown[0]}: {_unknown(unknown[0], _flags(parts()))}")
     return _with_absolute_paths(options)
+
+
+def _flags(parts: Iterable[Section]) -> list[Flag]:
+    return [flag for part in parts for flag in part.flags]
 
 
 def _with_values(args: Sequence[str]) -> list[str]:
@@ -183,9 +185,11 @@ def _with_values(args: Sequence[str]) -> list[str]:
     return words
 
 
-def _separated(args: Sequence[str], flags: Iterable[Flag]) -> list[str]:
+def _separated(args: Sequence[str], parts: Callable[[], list[Section]]) -> list[str]:
     """The command line, in which numbers joined by commas are given one by one to flags that take several."""
-    several = {flag.name for flag in flags if flag.value.endswith("...")}
+    if not any(map(_JOINED.fullmatch, args)):
+        return list(args)
+    several = {flag.name for flag in _flags(parts()) if flag.value.endswith("...")}
     words: list[str] = []
     flag = ""
     for token in args:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 from coop.common.settings.config import RunConfig
 from coop.common.settings.environment import EnvSettings
+from coop.common.settings.overrides import leaves
 from coop.common.settings.tables import base_tables, load_tables, preset_names
 
 
+@cache
 def preset_of(env_id: str) -> str | None:
     """The preset of an environment that comes with the package; None if there is none.
 
@@ -60,9 +63,13 @@ def settings_line(config: RunConfig, source: str) -> str:
     return "; ".join(f"{name}: {value}" for name, value in parts.items())
 
 
-def stated(tables: Mapping[str, Any], path: tuple[str, ...] = ()) -> set[str]:
+def stated(tables: Mapping[str, Any]) -> set[str]:
     """The dotted names of the settings in nested tables."""
-    names: set[str] = set()
-    for key, value in tables.items():
-        names |= stated(value, (*path, key)) if isinstance(value, Mapping) else {".".join((*path, key))}
-    return names
+    return {".".join(path) for path, _ in leaves(tables)}
+
+
+def env_id_of(tables: Mapping[str, Any]) -> str | None:
+    """The env.id of nested tables that are not checked yet; None if it is none."""
+    env = tables.get("env")
+    found = env.get("id") if isinstance(env, Mapping) else None
+    return found if isinstance(found, str) else None

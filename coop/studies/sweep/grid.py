@@ -25,7 +25,7 @@ from coop.common.settings.fields import Counter, Positive
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
-from coop.common.settings.starting import starting_tables, stated
+from coop.common.settings.starting import env_id_of, starting_tables, stated
 from coop.common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
@@ -178,9 +178,7 @@ def _cells(file: GridFile, choices: Iterable[Choice]) -> tuple[Cell, ...]:
         given = file.fixed
         for path, value in choice.values.items():
             given = merged(given, nested(path, value))
-        env = given.get("env")
-        env_id = env.get("id") if isinstance(env, Mapping) else None
-        start = base(choice.method, total_steps if fits else None, env_id if isinstance(env_id, str) else None)
+        start = base(choice.method, total_steps if fits else None, env_id_of(given))
         tables = {**of_method(merged(start, given), choice.method), "seed": choice.seed}
         cells.append(Cell(choice.name, validated(tables, stated(given), lockstep=file.mode == "lockstep")))
     for cell in cells:
