@@ -129,7 +129,7 @@ def _service(
     first, found = checkpoints.restore(core, reply.checkpoint)
     for line in filter(None, (aside, found)):
         console.event(line)
-    settings, journal = reply.config.replay, None
+    settings, synced = reply.config.replay, None
     if settings.journal != "off":
         number, notices = recover(core, folder.journal, first, folder.run_id)
         for line in notices:
@@ -139,6 +139,6 @@ def _service(
             journal = Journal(folder.journal, folder.run_id, number, keep=keep, sync=sync, accepted=accepted)
         except OSError as error:
             raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
-        core.recorder = journal
+        core.recorder, synced = journal, journal if sync else None
         checkpoints = ReplayCheckpoints(folder.path, folder.run_id, journal)
-    return ReplayService(node, core, checkpoints, confirmed=0.0, synced=journal if settings.journal == "sync" else None)
+    return ReplayService(node, core, checkpoints, confirmed=0.0, synced=synced)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coop.common.transitions import Batch
 from coop.learner.given import Given
-from coop.learner.qnetwork import QNetwork, as_float32
+from coop.learner.qnetwork import QNetwork, on_host
 
 
 class Step:
@@ -118,11 +118,8 @@ def slope_of(cost: Callable[[Step, Tensor], Tensor], step: Step, values: Any) ->
 
 def to_host(values: Any) -> Any:  # noqa: ANN401
     """An array of either library as numpy's."""
-    return (
-        as_float32(values).cpu().numpy()
-        if isinstance(values, Tensor) and values.is_floating_point()
-        else (values.cpu().numpy() if isinstance(values, Tensor) else values)
-    )
+    whole = isinstance(values, Tensor) and not values.is_floating_point()
+    return values.cpu().numpy() if whole else on_host(values)
 
 
 def _outside_inference(values: Any) -> Tensor:  # noqa: ANN401

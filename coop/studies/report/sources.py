@@ -49,13 +49,15 @@ class FolderSource:
         self._folder = folder.resolve().parent if single else folder
         check_links(folder)
         self.sweep = None if single else self._sweep()
-        names = [folder.resolve().name] if single else run_names(folder)
-        for run in names:
-            check_links(self._folder / run)
-        self.names = self._distinct(names)
+        self.names = [folder.resolve().name] if single else self._checked_names(run_names(folder))
 
-    def _distinct(self, names: list[str]) -> list[str]:
-        """The runs without a user's copies of them, which are no further runs; a warning names these."""
+    def _checked_names(self, names: list[str]) -> list[str]:
+        """The runs without a user's copies of them, which are no further runs; a warning names these.
+
+        Raises RunError if a link leads out of one.
+        """
+        for name in names:
+            check_links(self._folder / name)
         first: dict[tuple[str, str | None], str] = {}
         for name in names:
             # A packed run has no id; one that went on by itself has another summary.
