@@ -276,9 +276,9 @@ def part_pieces(options: argparse.Namespace) -> None:
                 return output_error(given.columns, agent.loss.slope(errors), next_values)
 
             error = loss()
-            chain, out = online._passes.chain, online._passes.gradients
+            chain, out = online._passes.backprop, online._passes.gradients
             transforms = Transforms(chain, head)
-            deltas = [(index, delta[:, 0].contiguous()) for index, delta in chain.walk(head, error[:, None])]
+            deltas = [(index, delta[:, 0].contiguous()) for index, delta in chain.cotangents(head, error[:, None])]
             sigmas = list(transforms.apply_feedback(error, s))
             pieces: dict[str, Callable[[], object]] = {
                 "sample": lambda: table.sample(batch, s, rate),
@@ -286,15 +286,15 @@ def part_pieces(options: argparse.Namespace) -> None:
                 "forward of obs and next_obs": lambda: online.forward(inputs),
                 "forward of the target": lambda: target.values(inputs[batch:]),
                 "loss": loss,
-                "backpropagation alone": lambda: list(chain.walk(head, error[:, None])),
-                "gradients of parameters": lambda: [chain.write(head, i, d, out) for i, d in deltas],
-                "gradients of parameters, EDL": lambda: [chain.write(head, i, d, out) for i, d in sigmas],
+                "backpropagation alone": lambda: list(chain.cotangents(head, error[:, None])),
+                "gradients of parameters": lambda: [chain.write_gradients(head, i, d, out) for i, d in deltas],
+                "gradients of parameters, EDL": lambda: [chain.write_gradients(head, i, d, out) for i, d in sigmas],
                 "transforms": lambda: Transforms(chain, head),
                 "feedback through transforms": lambda: list(transforms.apply_feedback(error, s)),
                 "optimizer": lambda: agent.optimizers[0].step(rate),
             }
             for index, delta in deltas:
-                pieces[f"gradient of layer {chain.names[index]}"] = lambda i=index, d=delta: chain.write(
+                pieces[f"gradient of layer {chain.names[index]}"] = lambda i=index, d=delta: chain.write_gradients(
                     head, i, d, out
                 )
             for name, piece in pieces.items():
