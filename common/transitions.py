@@ -143,9 +143,15 @@ def _fields(kind: type[Transitions]) -> dict[str, Field]:
         array, *extras = get_args(hint) or (hint,)
         for column in extras:
             if isinstance(column, Column):
-                dtype = np.dtype(get_args(get_args(array)[1])[0])
-                fields[name] = Field(dtype, column is FRAME_INDICES, column)
+                fields[name] = Field(_dtype(array), column is FRAME_INDICES, column)
     return fields
+
+
+def _dtype(hint: Any) -> np.dtype[Any]:  # noqa: ANN401
+    """The dtype of NDArray[...]: an alias of its own from numpy 2.5 on, before that ndarray[..., dtype[...]]."""
+    while parts := get_args(hint):
+        hint = parts[-1]
+    return np.dtype(hint)
 
 
 IN_SEGMENT, IN_BATCH = _fields(Segment), _fields(Batch)
