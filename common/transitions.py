@@ -151,7 +151,8 @@ def _dtype(hint: Any) -> np.dtype[Any]:  # noqa: ANN401
     """The dtype of NDArray[...]: an alias of its own from numpy 2.5 on, before that ndarray[..., dtype[...]]."""
     while parts := get_args(hint):
         hint = parts[-1]
-    return np.dtype(hint)
+    dtype: np.dtype[Any] = np.dtype(hint)
+    return dtype
 
 
 IN_SEGMENT, IN_BATCH = _fields(Segment), _fields(Batch)
