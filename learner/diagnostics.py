@@ -176,7 +176,8 @@ def _first(batch: Batch, count: int) -> Batch:
     shape = columns["obs_index"].shape
     places, index = np.unique(np.stack((columns["obs_index"], columns["next_index"])), return_inverse=True)
     columns["obs_index"], columns["next_index"] = index.reshape(2, *shape).astype(np.int32)
-    return Batch(frames=batch.frames[places], **columns)
+    frames: Any = batch.frames[places]
+    return Batch(frames=frames.cpu().numpy() if isinstance(frames, Tensor) else frames, **columns)
 
 
 def _joined(one: Batch, other: Batch) -> Batch:

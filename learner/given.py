@@ -30,8 +30,11 @@ class Given(NamedTuple):
         index, held = indices(batch), columns(batch, gamma)
         if device is None:
             return cls(batch.frames, index, held, s, rate)
+        frames: Any = batch.frames
         # Copies, because arrays from the wire are read-only and PyTorch warns about views of those.
-        frames, places, *parts = (torch.tensor(array, device=device) for array in (batch.frames, index, *held))
+        if not isinstance(frames, torch.Tensor):
+            frames = torch.tensor(frames, device=device)
+        places, *parts = (torch.tensor(array, device=device) for array in (index, *held))
         return cls(frames, places, BatchColumns(*parts), s, rate)
 
 

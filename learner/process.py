@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from contextlib import AbstractContextManager, nullcontext
 
+import torch
+
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.links import locators
 from coop.common.messaging.mirror import FrameMirror
@@ -14,13 +16,14 @@ from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.console import Console, say
 from coop.common.process.lifecycle import Stop
 from coop.common.process.limits import use_threads
-from coop.common.settings.capacity import mirror_slots
+from coop.common.settings.capacity import MIRROR_SHARE, frame_bytes, mirror_slots, table_slots
 from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest
 from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.checkpoints import Checkpoints
 from coop.learner.cli import LearnerOptions
+from coop.learner.device_mirror import DeviceMirror
 from coop.learner.initial_networks import load_initial_networks
 from coop.learner.join_service import JoinService
 from coop.learner.roster import Roster
@@ -100,7 +103,7 @@ def _train(
             agent.updates,
             episodes_received,
             shared_memory=options.shared_memory,
-            mirror=_mirror(config, spec, console),
+            mirror=_mirror(config, spec, agent.device, console),
         )
         steps = trainer.drawn.inserted
         with RunDirectory(path, config, found, number or None, steps, log=options.log) as directory:
@@ -117,10 +120,15 @@ def _train(
         stop.raise_for_status()
 
 
-def _mirror(config: RunConfig, spec: EnvSpec, console: Console) -> FrameMirror | None:
-    """The mirror of the table's frames in this host's memory; None if it is off or there is no room."""
+def _mirror(config: RunConfig, spec: EnvSpec, device: torch.device, console: Console) -> FrameMirror | None:
+    """The mirror of the table's frames on the GPU or in this host's memory; None if it is off or there is no room."""
     if config.learner.mirror == "off":
         return None
+    if device.type == "cuda":
+        slots, room = table_slots(config, spec), MIRROR_SHARE * torch.cuda.mem_get_info(device)[0] // frame_bytes(spec)
+        if slots <= room:
+            return DeviceMirror(spec, slots, device)
+        console.event(f"the mirror of the table is in the host's memory; the GPU has room for {room:,.0f} of {slots:,}")
     slots, most = mirror_slots(config, spec), min(config.replay.capacity, config.total_steps)
     if slots < most:
         console.event(f"the mirror of the table has room for {slots:,} of {most:,} frames")

@@ -29,7 +29,8 @@ from coop.learner.losses import BatchColumns, Values, columns
 Capture = Callable[[Callable[[], None], torch.device], Callable[[], None]]
 """Makes a function without arguments, of a device, repeatable; it may run before, but does not while it is recorded."""
 
-_LANES = 3  # batches on their way to the device
+_LANES = 3  # batches on their way to the device with their frames
+_SMALL_LANES = 32  # without
 _WARM_UPS = 3  # runs in which libraries choose their algorithms and allocate what stays
 _LATE = 64  # TD errors of so many updates are on their way to the host
 _ALIGNMENT = 64  # bytes
@@ -130,12 +131,12 @@ class Recorded:
     ) -> None:
         """learn: the update of a role with a batch; it returns the TD errors."""
         self._learn, self._device, self._capture, self._agent = learn, device, capture, agent
-        self._size, self._gamma, self._stack = config.learner.batch_size, config.learner.gamma, spec.stack
-        self._feed = Feed(spec, self._size, device)
+        self._size, self._gamma, self._spec = config.learner.batch_size, config.learner.gamma, spec
+        self._feeds: dict[int, Feed] = {}  # by address of a mirror on the device; 0 for batches with their frames
         self._errors = torch.zeros(self._size, device=device)
-        self._repeat: dict[int, Callable[[], None]] = {}
+        self._repeat: dict[tuple[Feed, int], Callable[[], None]] = {}
         self._on_gpu = device.type == "cuda"
-        self._slots = _pinned(torch.empty(_LATE, self._size), self._on_gpu)
+        self._slots = pinned(torch.empty(_LATE, self._size), self._on_gpu)
         self._late: deque[Late] = deque(maxlen=_LATE)
         self._count = 0
         if self._on_gpu:
@@ -143,36 +144,45 @@ class Recorded:
 
     def fits(self, batch: Batch) -> bool:
         """Whether a batch has the recorded sizes."""
-        return len(batch) == self._size and batch.obs_index.shape[1] == self._stack
+        return len(batch) == self._size and batch.obs_index.shape[1] == self._spec.stack
 
     def run(self, acting: int, batch: Batch, s: float, rate: float) -> Late:
         """Start the update of a role with a batch. Raises RuntimeError if it can't be recorded."""
-        self._feed.load(batch, columns(batch, self._gamma), s, rate)
-        if acting not in self._repeat:
-            self._record(acting)
-        self._repeat[acting]()
+        feed = self._feed_of(batch)
+        feed.load(batch, columns(batch, self._gamma), s, rate)
+        if (feed, acting) not in self._repeat:
+            self._record(feed, acting)
+        self._repeat[feed, acting]()
         self._agent.optimizers[acting].steps += 1
         if len(self._late) == _LATE:
             self._late[0].read()  # its slot is the next one
         slot = self._slots[self._count % _LATE]
         slot.copy_(self._errors, non_blocking=True)
-        late = Late(slot, _event() if self._on_gpu else None)
+        late = Late(slot, event() if self._on_gpu else None)
         self._late.append(late)
         self._count += 1
         return late
 
-    def _record(self, acting: int) -> None:
-        """Record the update of a role, and leave the agent as it was."""
+    def _feed_of(self, batch: Batch) -> Feed:
+        """What brings such batches to the device."""
+        frames = batch.frames if isinstance(batch.frames, Tensor) else None
+        address = 0 if frames is None else frames.data_ptr()
+        if address not in self._feeds:
+            self._feeds[address] = Feed(self._spec, self._size, self._device, frames)
+        return self._feeds[address]
+
+    def _record(self, feed: Feed, acting: int) -> None:
+        """Record the update of a role with what a feed brings, and leave the agent as it was."""
         state = self._agent.state()
 
         def update() -> None:
-            self._errors.copy_(self._learn(acting, self._feed.given))
+            self._errors.copy_(self._learn(acting, feed.given))
 
         try:
             repeat = self._capture(update, self._device)
             if not self._on_gpu:
                 repeat = self._uncounted(repeat, acting)
-            self._repeat[acting] = repeat
+            self._repeat[feed, acting] = repeat
         finally:
             self._agent.load_state(state)
 
@@ -194,17 +204,22 @@ class Feed:
     given: the arrays there, which an update reads.
     """
 
-    def __init__(self, spec: EnvSpec, size: int, device: torch.device) -> None:
-        self._layout = _Layout(spec, size)
-        self._on_gpu = device.type == "cuda"
+    def __init__(self, spec: EnvSpec, size: int, device: torch.device, frames: Tensor | None = None) -> None:
+        """frames: of a mirror on the device, <frame_dtype>[slots, *frame_shape]; None if batches bring their own."""
+        self._layout = _Layout(spec, size, with_frames=frames is None)
         self._place = torch.zeros(self._layout.bytes, dtype=torch.uint8, device=device)
-        self._lanes = deque(_Lane(self._layout, self._place, self._on_gpu) for _ in range(_LANES))
         self._copies: torch.cuda.Stream | None = None
-        if self._on_gpu:
+        if device.type == "cuda" and frames is None:  # a batch without takes less time than a way beside the updates
             self._copies = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        lanes = _LANES if frames is None else _SMALL_LANES
+        self._lanes = deque(_Lane(self._layout, self._place, self._copies) for _ in range(lanes))
         views = self._layout.views(self._place)
         held = BatchColumns(*(views[name] for name in BatchColumns._fields))
-        self.given = Given(views["frames"], views["index"], held, views["s"].view(()), views["rate"].view(()))
+        self._with_frames = frames is None
+        self.given = Given(
+            views["frames"] if frames is None else frames,
+            views["index"], held, views["s"].view(()), views["rate"].view(()),
+        )  # fmt: skip
 
     def load(self, batch: Batch, held: BatchColumns[NDArray[Any]], s: float, rate: float) -> None:
         """Begin to copy a batch; what the device does next sees it."""
@@ -216,19 +231,21 @@ class Feed:
         lane.arrays["index"][...] = indices(batch)
         lane.arrays["s"][...] = s
         lane.arrays["rate"][...] = rate
-        frames = lane.arrays["frames"]
-        frames[: len(batch.frames)] = batch.frames
-        used = self._layout.offsets["frames"] + batch.frames.nbytes
-        lane.send(used, self._copies)
+        used = self._layout.bytes
+        if self._with_frames:
+            lane.arrays["frames"][: len(batch.frames)] = batch.frames
+            used = self._layout.offsets["frames"] + batch.frames.nbytes
+        lane.send(used)
 
 
 class _Lane:
     """Pinned memory on the host, and memory on the device behind it."""
 
-    def __init__(self, layout: _Layout, place: Tensor, on_gpu: bool) -> None:
-        self._host = _pinned(torch.zeros(layout.bytes, dtype=torch.uint8), on_gpu)
-        self._behind = torch.empty_like(place) if on_gpu else None
-        self._place = place
+    def __init__(self, layout: _Layout, place: Tensor, copies: torch.cuda.Stream | None) -> None:
+        """copies: the stream that brings batches to the device beside the updates; None: that of the updates."""
+        self._host = pinned(torch.zeros(layout.bytes, dtype=torch.uint8), place.is_cuda)
+        self._behind = None if copies is None else torch.empty_like(place)
+        self._place, self._copies = place, copies
         self._sent: torch.cuda.Event | None = None
         self._taken: torch.cuda.Event | None = None
         self.arrays: dict[str, NDArray[Any]] = {name: view.numpy() for name, view in layout.views(self._host).items()}
@@ -238,29 +255,31 @@ class _Lane:
         if self._sent is not None:
             self._sent.synchronize()
 
-    def send(self, used: int, copies: torch.cuda.Stream | None) -> None:
-        """Copy the first bytes to their place, by way of the device's memory behind the lane."""
+    def send(self, used: int) -> None:
+        """Copy the first bytes to their place, with `copies` by way of the device's memory behind the lane."""
+        copies = self._copies
         if copies is None or self._behind is None:
-            self._place[:used].copy_(self._host[:used])
+            self._place[:used].copy_(self._host[:used], non_blocking=True)
+            self._sent = event() if self._place.is_cuda else None
             return
         main = torch.cuda.current_stream(self._place.device)
         if self._taken is not None:
             copies.wait_event(self._taken)
         with torch.cuda.stream(copies):
             self._behind[:used].copy_(self._host[:used], non_blocking=True)
-            self._sent = _event()
+            self._sent = event()
         main.wait_event(self._sent)
         self._place[:used].copy_(self._behind[:used], non_blocking=True)
-        self._taken = _event()
+        self._taken = event()
 
 
 class _Layout:
-    """Where a batch's arrays lie in one run of bytes; the frames, of which there may be fewer, come last.
+    """Where a batch's arrays lie in one run of bytes; frames, of which there may be fewer, come last.
 
     offsets: of each array. bytes: of all.
     """
 
-    def __init__(self, spec: EnvSpec, size: int) -> None:
+    def __init__(self, spec: EnvSpec, size: int, with_frames: bool) -> None:
         rows = 2 * size * spec.stack
         self._parts: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
             "actions": (torch.int64, (size,)),
@@ -270,8 +289,9 @@ class _Layout:
             "s": (torch.float32, (1,)),
             "rate": (torch.float32, (1,)),
             "index": (torch.int32, (rows,)),
-            "frames": (getattr(torch, spec.frame_dtype), (rows, *spec.frame_shape)),
         }
+        if with_frames:
+            self._parts["frames"] = (getattr(torch, spec.frame_dtype), (rows, *spec.frame_shape))
         self.offsets: dict[str, int] = {}
         self.bytes = 0
         for name, (dtype, shape) in self._parts.items():
@@ -289,11 +309,12 @@ class _Layout:
         return found
 
 
-def _pinned(memory: Tensor, on_gpu: bool) -> Tensor:
+def pinned(memory: Tensor, on_gpu: bool) -> Tensor:
+    """Memory of the host that a GPU reads by itself; on a CPU the memory as it is."""
     return memory.pin_memory() if on_gpu else memory
 
 
-def _event() -> torch.cuda.Event:
+def event() -> torch.cuda.Event:
     """What is reached once the present stream has done all that it has been given."""
     event = torch.cuda.Event()  # type: ignore[no-untyped-call]
     event.record()

@@ -83,7 +83,10 @@ class LearnerService:
             raise
         finally:
             self._checkpoints.wait()
-            summary = self._finish(outcome or "interrupted")  # by a second SIGINT
+            try:
+                summary = self._finish(outcome or "interrupted")  # by a second SIGINT
+            finally:
+                self._broadcaster.close()
         return summary
 
     def status(self) -> LearnerStatus | None:
@@ -104,6 +107,8 @@ class LearnerService:
                 trainer.checkpoint_begun()
         elif trainer.all_updates_done() and (stats := self._replay_stats()) is not None:
             self._apply(trainer.receive(msgspec.structs.replace(trainer.drawn, inserted=stats.inserted)))
+        if self._broadcaster.due:
+            self._broadcaster.publish(trainer.drawn.inserted)
         if got is None and self._join_service.departure.is_due:
             self._save_for_departure()
         self._record_evaluations()
@@ -194,7 +199,7 @@ class LearnerService:
         began, patience = time.monotonic(), {"replay": FAREWELL, "actor": FAREWELL, "evaluator": FAREWELL}
         if outcome.startswith("complete"):
             patience["evaluator"] = LAST_EVALUATION
-            self._broadcaster.publish(self._trainer.drawn.inserted)
+            self._broadcaster.publish(self._trainer.drawn.inserted, wait=True)
         while True:
             self._node.announce(stop_key(self._node), EndOfRun.because(outcome).encode(self._node.run))
             time.sleep(0.1)

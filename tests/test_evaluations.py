@@ -291,7 +291,7 @@ def test_an_evaluator_follows_a_learner_to_its_end(nodes: tuple[Node, Node]) -> 
     def learn(update: int, env_step: int) -> None:
         agent.acting, agent.updates = update % 2, update
         agent.versions[agent.acting] = update
-        broadcaster.publish(env_step)
+        broadcaster.publish(env_step, wait=True)
 
     def taken_all(count: int) -> bool:
         taken.extend(result for result in inbox.take() if isinstance(result, EvaluationRow))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import await_service, make_segment
@@ -34,8 +35,9 @@ from coop.common.settings.capacity import MIRROR_SHARE, estimated_bytes, mirror_
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.effects import without_effect
 from coop.common.settings.resuming import check_resumed
-from coop.common.transitions import Batch, DrawRequest, Segment
+from coop.common.transitions import IN_BATCH, Batch, DrawRequest, Segment
 from coop.common.types import EnvSpec
+from coop.learner.device_mirror import DeviceMirror
 from coop.replay.core import ReplayCore, Reply
 from coop.replay.mirrored import MirroredFrames
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
@@ -49,6 +51,10 @@ CONFIG = RunConfig(
     learner=LearnerSettings(batch_size=4),
     replay=ReplaySettings(capacity=CAPACITY, learning_starts=4, tolerance=1e9),
 )
+MIRRORS: dict[str, Callable[[EnvSpec, int], FrameMirror]] = {
+    "host": FrameMirror,
+    "device": lambda spec, slots: DeviceMirror(spec, slots, torch.device("cpu")),
+}
 TRIES = 8  # calls within which a batch must arrive once nothing fails
 
 
@@ -145,20 +151,27 @@ def _batch(client: SampleClient) -> Batch:
     raise AssertionError(f"no batch in {TRIES} tries: {client.waiting}")
 
 
-def _client(node: Any, number: int, first: int, prefetch: int, slots: int, spec: EnvSpec = NUMBERS) -> SampleClient:
-    mirror = FrameMirror(spec, slots)
+def _client(
+    node: Any, number: int, first: int, prefetch: int, slots: int, spec: EnvSpec = NUMBERS, place: str = "host"
+) -> SampleClient:
+    mirror = MIRRORS[place](spec, slots)
     return SampleClient(node, _ended(), number, spec, 4, prefetch, first, mirror=mirror)
 
 
 @settings(max_examples=100)
-@given(data=st.data(), prefetch=st.integers(1, 6), slots=st.sampled_from((1, 5, 1000)))
-def test_no_fault_makes_a_batch_wrong_or_loses_one(data: st.DataObject, prefetch: int, slots: int) -> None:
+@given(
+    data=st.data(),
+    prefetch=st.integers(1, 6),
+    slots=st.sampled_from((1, 5, 1000)),
+    place=st.sampled_from(("host", "device")),
+)
+def test_no_fault_makes_a_batch_wrong_or_loses_one(data: st.DataObject, prefetch: int, slots: int, place: str) -> None:
     core = ReplayCore(CONFIG, NUMBERS)
     for inserted in range(3):
         _insert(core, inserted)
     network = _Network([_make_service(core)])
     learner, done, inserted = 1, 0, 3
-    client = _client(network, learner, done, prefetch, slots)
+    client = _client(network, learner, done, prefetch, slots, place=place)
 
     def fault() -> str:
         earlier = EARLIER if len(network.services) > 1 else ()
@@ -175,7 +188,7 @@ def test_no_fault_makes_a_batch_wrong_or_loses_one(data: st.DataObject, prefetch
             network.services = [network.services[-1], _make_service(core)]  # the old one may yet answer
         elif event == "restart the learner":
             learner += 1
-            client = _client(network, learner, done, prefetch, slots)
+            client = _client(network, learner, done, prefetch, slots, place=place)
         elif (got := client.next()) is not None:
             batch, drawn = got
             assert drawn.sequence == done
@@ -306,9 +319,20 @@ PICTURES = EnvSpec("pictures", (3, 2), "uint8", 2, 2)
 
 
 def _named(slots: list[int], numbers: list[int], carried: list[int], frames: np.ndarray[Any, Any]) -> NamedBatch:
+    columns = {name: np.zeros(len(slots), column.dtype) for name, column in IN_BATCH.items()}
+    columns["obs_index"] = columns["next_index"] = np.arange(len(slots), dtype=np.int32)[:, None]
     return NamedBatch(
-        7, "", np.array(slots, np.int32), np.array(numbers, np.int64), np.array(carried, np.intp), frames, {}
+        7, "", np.array(slots, np.int32), np.array(numbers, np.int64), np.array(carried, np.intp), frames, columns
     )
+
+
+def _shown(batch: Batch | None) -> list[Any]:
+    """The frames of a batch from `_named`, in their order."""
+    assert batch is not None
+    frames = batch.frames[batch.obs_index[:, 0]]
+    assert str(frames.dtype).removeprefix("torch.") == "uint8"
+    shown: list[Any] = frames.tolist()
+    return shown
 
 
 def _pictures(*numbers: int) -> np.ndarray[Any, Any]:
@@ -319,23 +343,24 @@ def _write(mirror: FrameMirror, table: int, slots: list[int], numbers: list[int]
     mirror.write(table, np.array(slots, np.int32), np.array(numbers, np.int64), _pictures(*numbers))
 
 
-def test_a_frame_is_read_only_by_its_number() -> None:
-    mirror = FrameMirror(PICTURES, 10_000)
+@pytest.mark.parametrize("place", MIRRORS)
+def test_a_frame_is_read_only_by_its_number(place: str) -> None:
+    mirror = MIRRORS[place](PICTURES, 10_000)
     none = _pictures()
     assert mirror.read(_named([0], [1], [], none)) is None, "it holds nothing yet"
     _write(mirror, 7, [3], [11])
     _write(mirror, 7, [5 * FIRST_SLOTS], [12])
     read = mirror.read(_named([5 * FIRST_SLOTS, 3, 3], [12, 11, 11], [], none))
-    assert read is not None
-    assert (read.dtype, read.tolist()) == (np.uint8, _pictures(12, 11, 11).tolist())
+    assert _shown(read) == _pictures(12, 11, 11).tolist()
     for slots, numbers in (([3], [12]), ([4], [11]), ([3, 9999], [11, 12]), ([3, 2**31 - 1], [11, 13])):
         assert mirror.read(_named(slots, numbers, [], none)) is None
     _write(mirror, 7, [3], [13])
     assert mirror.read(_named([3], [11], [], none)) is None, "its slot has another frame now"
 
 
-def test_frames_in_slots_beyond_the_mirror_come_with_each_batch() -> None:
-    mirror, mirrored = FrameMirror(PICTURES, 2), MirroredFrames()
+@pytest.mark.parametrize("place", MIRRORS)
+def test_frames_in_slots_beyond_the_mirror_come_with_each_batch(place: str) -> None:
+    mirror, mirrored = MIRRORS[place](PICTURES, 2), MirroredFrames()
     request = DrawRequest(1, 0, 0, 4, 0, None, mirror.number, mirror.slots)
     slots, numbers = np.array([0, 5, 1]), np.array([21, 22, 23])
     for sequence, expected in enumerate(([0, 1, 2], [1], [1])):
@@ -344,13 +369,20 @@ def test_frames_in_slots_beyond_the_mirror_come_with_each_batch() -> None:
         frames = _pictures(*numbers[carried])
         mirror.write(7, slots[carried].astype(np.int32), numbers[carried], frames)
         read = mirror.read(_named(slots.tolist(), numbers.tolist(), carried.tolist(), frames))
-        assert read is not None
-        assert read.tolist() == _pictures(21, 22, 23).tolist()
+        assert _shown(read) == _pictures(21, 22, 23).tolist()
     assert mirror.read(_named([5], [22], [], _pictures())) is None
 
 
-def test_another_table_empties_the_mirror() -> None:
-    mirror = FrameMirror(PICTURES, 100)
+def test_more_frames_than_one_write_takes_arrive_on_a_device() -> None:
+    mirror, numbers = MIRRORS["device"](PICTURES, 200), list(range(1, 101))
+    _write(mirror, 7, [2 * number for number in numbers[:99]] + [1], numbers)
+    read = mirror.read(_named([2, 64, 198, 1], [1, 32, 99, 100], [], _pictures()))
+    assert _shown(read) == _pictures(1, 32, 99, 100).tolist()
+
+
+@pytest.mark.parametrize("place", MIRRORS)
+def test_another_table_empties_the_mirror(place: str) -> None:
+    mirror = MIRRORS[place](PICTURES, 100)
     _write(mirror, 7, [3], [11])
     assert mirror.number == 1
     _write(mirror, 8, [], [])
@@ -367,8 +399,7 @@ def test_a_mirror_that_cannot_grow_stays_as_it_is(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(GrowingRows, "grow", lambda rows, _: grow(rows, 1 << 60))
     _write(mirror, 7, [2, 5 * FIRST_SLOTS], [12, 13])
     read = mirror.read(_named([3, 2], [11, 12], [], _pictures()))
-    assert read is not None
-    assert read.tolist() == _pictures(11, 12).tolist()
+    assert _shown(read) == _pictures(11, 12).tolist()
     assert mirror.read(_named([5 * FIRST_SLOTS], [13], [], _pictures())) is None
     assert mirror.slots == FIRST_SLOTS, "which it says with its next request"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,7 @@ from coop.common.settings.tables import resolve
 from coop.common.transitions import Batch
 from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
+from coop.learner.diagnostics import Diagnostics
 from coop.learner.recorded import _WARM_UPS
 from coop.replay.table.table import Table
 
@@ -71,6 +73,37 @@ def test_recorded_updates_are_the_eager_ones(method: str, tables: dict[str, Any]
         assert (found.s, found.swapped) == (expected.s, expected.swapped)
     # s and the rate are float32 there
     assert_equal(recorded, eager, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["dqn", "coop"])
+@pytest.mark.parametrize("capture", [plain_call, None], ids=["recorded", "eager"])
+def test_updates_from_frames_on_the_device_are_those_from_frames_of_the_host(method: str, capture: Any) -> None:
+    """The rows of the mirror change between updates, and some batches bring their own frames."""
+    one, other = (make_agent(method, capture=capture) for _ in range(2))
+    mirror = torch.zeros(500, *PICTURES.frame_shape, dtype=torch.uint8)
+    rng = np.random.default_rng(3)
+    for number, batch in enumerate(make_batches(12)):
+        slots = rng.permutation(500)[: len(batch.frames)].astype(np.int32)
+        mirror[torch.from_numpy(slots).long()] = torch.tensor(batch.frames)
+        there = msgspec.structs.replace(
+            batch, frames=mirror, obs_index=slots[batch.obs_index], next_index=slots[batch.next_index]
+        )
+        expected, found = one.update(batch), other.update(there if number % 3 else batch)
+        np.testing.assert_array_equal(found.td_errors, expected.td_errors)
+    assert_equal(one, other)
+    assert other.eager == ""
+
+
+def test_the_archive_of_the_diagnostics_holds_frames_of_the_host() -> None:
+    (batch,) = make_batches(1)
+    there = msgspec.structs.replace(batch, frames=torch.tensor(batch.frames))
+    one, other = Diagnostics(), Diagnostics()
+    one.add(batch)
+    other.add(there)
+    assert one.archive is not None
+    assert other.archive is not None
+    np.testing.assert_array_equal(other.archive.frames, one.archive.frames)
+    assert isinstance(other.archive.frames, np.ndarray)
 
 
 @pytest.mark.parametrize("method", ["dqn", "coop"])
@@ -170,5 +203,5 @@ def test_an_update_asks_the_host_for_nothing(method: str, loss: str, feedback: s
     agent.update(batch)
     assert agent._recorded is not None
     with torch.inference_mode(), _Watch() as watch:
-        agent._learn(0, agent._recorded._feed.given)
+        agent._learn(0, agent._recorded._feed_of(batch).given)
     assert watch.seen == []

@@ -1,5 +1,6 @@
 """An actor's networks and acting role follow the learner's, over real sessions; a layout that differs is refused."""
 
+import threading
 import time
 from dataclasses import replace
 
@@ -66,7 +67,7 @@ def test_an_actor_follows_weights_and_role_through_swaps(nodes: tuple[Node, Node
         acting = version % 2
         change(agent, acting, version)
         agent.acting = acting
-        broadcaster.publish(env_step=10 * version)
+        broadcaster.publish(env_step=10 * version, wait=True)
         refresh_until(follower, version)
         assert policy.acting == acting
         assert follower.progress == (version, 10 * version)
@@ -82,13 +83,44 @@ def test_a_broadcast_that_was_lost_is_asked_for(nodes: tuple[Node, Node], spec: 
     refresh_until(follower, 0)
     change(agent, 0, 5)
     publish, learner.publish = learner.publish, lambda key, payload: None  # type: ignore[method-assign]
-    broadcaster.publish()
+    broadcaster.publish(wait=True)
     learner.publish = publish  # type: ignore[method-assign]
     began = time.monotonic()
     broadcaster.publish_role()  # says that there is a version 5
     refresh_until(follower, 5)
     assert time.monotonic() - began >= GRACE
     assert_equal(policy, agent)
+
+
+def test_broadcasts_that_take_long_hold_up_no_update(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
+    """What changes meanwhile follows in one broadcast, and no role names weights that have not been sent."""
+    learner, actor = nodes
+    agent = Agent(CONFIG, spec)
+    broadcaster = Broadcaster(learner, agent)
+    policy = own_policy(spec)
+    follower = WeightsFollower(actor, policy)
+    refresh_until(follower, 0)
+    publish, gate, sent = learner.publish, threading.Event(), []
+
+    def slow(key: str, payload: bytearray) -> None:
+        sent.append(key)
+        gate.wait(20)
+        publish(key, payload)
+
+    learner.publish = slow  # type: ignore[method-assign]
+    for version in (1, 2, 3):
+        change(agent, 0, version)
+        broadcaster.publish(env_step=version)
+        assert broadcaster.due == (version > 1)
+        broadcaster.publish_role()
+    gate.set()
+    while broadcaster.due:
+        broadcaster.publish(env_step=4)
+        time.sleep(0.001)
+    refresh_until(follower, 3)
+    assert sent == 2 * [weights_key(learner, 1), role_key(learner)]
+    assert_equal(policy, agent)
+    assert follower.progress == (3, 4)
 
 
 def test_an_actor_that_has_everything_asks_for_nothing(

@@ -5,7 +5,7 @@ draw names slots and numbers of its batch's frames, and carries those frames tha
 service knows (`coop.replay.mirrored`). The learner compares the numbers before it reads a slot, so it can't read a
 wrong frame; where it lacks one, it asks again, and a draw that is answered again carries all its frames.
 
-Nothing here does I/O. A mirror on another device needs the same attributes and the same two methods.
+Nothing here does I/O. `coop.learner.device_mirror` keeps the frames on a GPU.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from coop.common.messaging.messages.sample import NamedBatch
 from coop.common.process.memory import GrowingRows
+from coop.common.transitions import Batch
 from coop.common.types import Array, EnvSpec
 
 FIRST_SLOTS = 1024
@@ -40,9 +41,13 @@ class FrameMirror:
         self._shape = spec.frame_shape
         self._dtype = np.dtype(spec.frame_dtype)
         self._table: int | None = None
-        self._numbers = np.zeros(min(slots, FIRST_SLOTS), np.int64)  # of the frame in each slot; 0: none
-        row_bytes = math.prod(spec.frame_shape) * self._dtype.itemsize
-        self._rows = GrowingRows(row_bytes, max(1, len(self._numbers)))
+        self._numbers = np.zeros(self._allocate(slots), np.int64)  # of the frame in each slot; 0: none
+
+    def _allocate(self, slots: int) -> int:
+        """Make the rows of the first slots; returns how many."""
+        first = min(slots, FIRST_SLOTS)
+        self._rows = GrowingRows(math.prod(self._shape) * self._dtype.itemsize, max(1, first))
+        return first
 
     def write(self, table: int, slots: NDArray[np.int32], numbers: NDArray[np.int64], frames: Array) -> None:
         """Store frames [n, *frame_shape] of a table, with these numbers, int64 [n], in these slots, int32 [n].
@@ -61,20 +66,28 @@ class FrameMirror:
         if highest >= self.slots:
             inside = slots < self.slots
             slots, numbers, frames = slots[inside], numbers[inside], frames[inside]
-        self._rows.view[slots] = self._items(frames)
+        self._write(slots, frames)
         self._numbers[slots] = numbers
 
-    def read(self, batch: NamedBatch) -> Array | None:
-        """Copy the frames of a batch, [n, *frame_shape]; None if one of them is neither here nor in its answer."""
+    def read(self, batch: NamedBatch) -> Batch | None:
+        """The batch with its frames; None if one of them is neither here nor in its answer."""
+        held = self._numbers.take(batch.slots, mode="clip") == batch.numbers
+        held &= batch.slots < len(self._numbers)
+        here = bool(held.all())
+        held[batch.carried] = True
+        return self._read(batch, here) if batch.table == self._table and held.all() else None
+
+    def _write(self, slots: NDArray[np.int32], frames: Array) -> None:
+        """Store frames in slots that have rows."""
+        self._rows.view[slots] = self._items(frames)
+
+    def _read(self, batch: NamedBatch, here: bool) -> Batch:
+        """The batch with its frames; those that its answer does not carry are here, and if `here` these too."""
         found = np.empty(len(batch.slots), self._rows.dtype)
         self._rows.view.take(batch.slots, out=found, mode="clip")
-        known = self._numbers.take(batch.slots, mode="clip") == batch.numbers
-        known &= batch.slots < len(self._numbers)
-        known[batch.carried] = True
-        if batch.table != self._table or not known.all():
-            return None
-        found[batch.carried] = self._items(batch.frames)
-        return found.view(self._dtype).reshape(len(found), *self._shape)
+        if not here:
+            found[batch.carried] = self._items(batch.frames)
+        return Batch(frames=found.view(self._dtype).reshape(len(found), *self._shape), **batch.columns)
 
     def _items(self, frames: Array) -> NDArray[np.void]:
         """Frames [n, *frame_shape] as void [n]."""

@@ -230,12 +230,10 @@ class SampleClient:
         if isinstance(batch, Batch):
             return batch
         if not batch.memory:
-            frames = None if self._mirror is None else self._mirror.read(batch)
-        elif self._shared is None or self._shared.address != batch.memory:
+            return None if self._mirror is None else self._mirror.read(batch)
+        if self._shared is None or self._shared.address != batch.memory:
             raise BadMessage("fields.memory", f"{batch.memory!r}, which this process does not read")
-        else:
-            frames = self._shared.read(batch.slots)
-        return None if frames is None else Batch(frames=frames, **batch.columns)
+        return Batch(frames=self._shared.read(batch.slots), **batch.columns)
 
     def _share(self, address: str) -> None:
         """Read frames there from now on, or nowhere if this process does not reach them."""

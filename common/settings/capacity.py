@@ -18,7 +18,8 @@ from coop.common.types import EnvSpec
 SLOT_BYTES = 3 * 4 + 8  # counters of a frame's slot, and its number
 HEADER_BYTES = 1 << 20  # of a message, including the alignment of its arrays
 NAME_BYTES = 4 + 8 + 4  # slot, number and place of a frame in an answer to a draw
-MIRROR_SHARE = 0.25  # of the memory that the learner's job may use: the most for its mirror of the table's frames
+MIRROR_SHARE = 0.25  # of the learner's memory, or what is free of its GPU's: the most for its mirror of the frames
+SPARE_SLOTS = 4096
 
 
 def frame_bytes(spec: EnvSpec) -> int:
@@ -45,10 +46,19 @@ def mirror_slots(config: RunConfig, spec: EnvSpec) -> int:
     return max(0, min(2**31 - 1, int(room) // (frame_bytes(spec) + 8)))  # each with its number
 
 
+def table_slots(config: RunConfig, spec: EnvSpec) -> int:
+    """Slots that a run's full table may come to use, and some for frames of batches that are on their way."""
+    return int(1.25 * min(config.replay.capacity, config.total_steps) * _copies(config, spec)) + SPARE_SLOTS
+
+
 def _most_bytes(config: RunConfig, spec: EnvSpec) -> int:
-    """Bytes of a run's full table; policies that do not evict in order may keep stack + 1 frames per transition."""
-    copies = 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
-    return estimated_bytes(spec, min(config.replay.capacity, config.total_steps)) * copies
+    """Bytes of a run's full table."""
+    return estimated_bytes(spec, min(config.replay.capacity, config.total_steps)) * _copies(config, spec)
+
+
+def _copies(config: RunConfig, spec: EnvSpec) -> int:
+    """Frames per transition: policies that do not evict in order may keep stack + 1."""
+    return 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
 
 
 def check_messages(config: RunConfig, spec: EnvSpec) -> None:
