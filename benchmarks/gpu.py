@@ -4,13 +4,14 @@ Each part (`gpu_parts.py`), and the updates of each method and batch size, is a 
 writes its figures as lines of JSON while it goes, so that a part that fails, or is cut off, costs its own figures only.
 On a CPU, for a rehearsal: --device cpu --quick.
 
-    gpu.py [--out FOLDER] [--device cuda] [--seconds 235] [--parts updates profile ...] [--quick]
+    gpu.py [--out FOLDER] [--device cuda] [--seconds 235] [--parts updates profile ...] [--methods dqn ...] [--quick]
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import itertools
 import json
 import os
 import signal
@@ -38,7 +39,7 @@ PARTS = {  # with its limit in seconds
 }
 USUAL = ("facts", "updates", "jax", "run", "acting", "sb3", "tests")  # the tests take what time is left
 METHODS = ("dqn", "edql", "g-coop", "coop")
-CASES = [(method, batch) for batch in (32, 512) for method in ("dqn", "coop", "edql", "g-coop")]
+BATCHES = (32, 512)
 
 
 def main() -> None:
@@ -48,6 +49,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--seconds", type=float, default=235.0)
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS), help="of the part updates")
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(USUAL))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -66,7 +68,7 @@ def main() -> None:
             continue
         # A process each: nothing that one leaves behind counts for the next.
         until = time.monotonic() + limit
-        for method, batch in [(method, 4) for method in METHODS] if options.quick else CASES:
+        for batch, method in itertools.product((4,) if options.quick else BATCHES, options.methods):
             if (left := until - time.monotonic()) < 5:
                 say(figures, {"part": part, "method": method, "batch": batch, "skipped": "no time left"})
                 continue

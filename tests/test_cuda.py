@@ -11,10 +11,12 @@ import torch
 from commands import run_command
 from samples import make_segment
 
+from coop.common.messaging.messages.sample import NamedBatch
 from coop.common.settings.tables import resolve
 from coop.common.transitions import Batch
 from coop.common.types import EnvSpec
 from coop.learner.agent import Agent
+from coop.learner.device_mirror import DeviceMirror
 from coop.learner.device_table import DeviceTable
 from coop.learner.edl import kernels
 from coop.learner.edl.completed import Jacobians
@@ -189,6 +191,22 @@ def test_branches_change_no_update() -> None:
         for agent in (branched, plain):
             agent.update(batch)
     _assert_same(branched, plain)
+
+
+def test_updates_from_a_mirror_on_the_gpu_are_those_from_frames_of_the_host() -> None:
+    """Its rows change behind updates that the GPU has not done yet; more frames arrive than one write takes."""
+    one, other = (_agent("cuda", "nature", PICTURES, "coop", learner=SGD) for _ in range(2))
+    mirror, rng = DeviceMirror(PICTURES, 400, torch.device("cuda")), np.random.default_rng(0)
+    for number, batch in enumerate(_batches(PICTURES, 40), 1):
+        count = len(batch.frames)
+        slots, numbers = rng.permutation(400)[:count].astype(np.int32), 1000 * number + np.arange(count)
+        mirror.write(7, slots, numbers, batch.frames)
+        there = mirror.read(NamedBatch(7, "", slots, numbers, np.arange(0), batch.frames[:0], batch.columns()))
+        assert there is not None
+        assert isinstance(there.frames, torch.Tensor)
+        one.update(batch)
+        other.update(there)
+    _assert_same(one, other)
 
 
 def test_the_table_draws_the_same_with_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:

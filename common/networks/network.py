@@ -18,6 +18,7 @@ from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import UsageError
 from coop.common.networks.convolution import ConvolutionNetwork, Dense
 from coop.common.networks.custom import custom_network
+from coop.common.networks.folding import fold, folds
 from coop.common.networks.forward import ArrayT, Layout, digest, mlp_layout, preprocess, views
 from coop.common.networks.normalised import NormalisedNetwork
 from coop.common.types import EnvSpec
@@ -132,7 +133,16 @@ def _as_it_is(x: Tensor) -> Tensor:
 
 def _convolution_and_relu(layer: nn.Conv2d) -> Callable[[Tensor], Tensor]:
     options: Any = layer.stride, layer.padding, layer.dilation, layer.groups
-    return lambda x: torch.cudnn_convolution_relu(x, layer.weight, layer.bias, *options)
+    down, across = layer.stride
+
+    def run(x: Tensor) -> Tensor:
+        weight, bias = layer.weight, layer.bias
+        if folds(layer, x.shape[3]):
+            x, weight = fold(x, across), fold(weight, across)
+            return torch.cudnn_convolution_relu(x, weight, bias, (down, 1), *options[1:])
+        return torch.cudnn_convolution_relu(x, weight, bias, *options)
+
+    return run
 
 
 def _fuses_relu(layer: nn.Conv2d) -> bool:

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name that PyTorch itself uses
 from torch import Tensor, nn
 
+from coop.common.networks.folding import fold, folds, unfold
 from coop.common.networks.network import layer_functions
 from coop.learner.edl.arrays import in_dtype
 from coop.learner.edl.backprop import Backprop, Tape, UnsupportedLayerError
@@ -91,11 +92,15 @@ class TorchBackprop(Backprop[Tensor]):
             if bias is not None:
                 torch.sum(delta, 0, out=out[name + "bias"])
         elif isinstance(step, nn.Conv2d):
+            weight, (down, across) = step.weight, step.stride
+            folded = delta.is_cuda and folds(step, h.shape[3])
+            if folded:
+                h, weight = fold(h, across), fold(weight, across)
             _, weight_grad, bias_grad = torch.ops.aten.convolution_backward(
-                delta, h, self._weights[index], [step.out_channels], step.stride, step.padding, step.dilation,
-                False, [0, 0], step.groups, [False, True, bias is not None],
+                delta, h, weight, [step.out_channels], (down, 1) if folded else step.stride, step.padding,
+                step.dilation, False, [0, 0], step.groups, [False, True, bias is not None],
             )  # fmt: skip
-            out[name + "weight"].copy_(weight_grad)
+            out[name + "weight"].copy_(unfold(weight_grad, across) if folded else weight_grad)
             if bias is not None:
                 out[name + "bias"].copy_(bias_grad)
 
