@@ -18,7 +18,7 @@ from coop.common.transitions import Batch
 from coop.common.types import Array, EnvSpec
 from coop.learner.recorded import event, pinned
 
-_LANES = 8  # writes on their way to the device
+_WRITES = 8  # writes on their way to the device
 _TOGETHER = 32  # frames of one write
 
 
@@ -32,7 +32,7 @@ class DeviceMirror(FrameMirror):
         """Raise RuntimeError if the device has no room."""
         self._device = device
         super().__init__(spec, slots)
-        self._lanes = cycle([_Lane(self._on_device, device.type == "cuda") for _ in range(_LANES)])
+        self._staging = cycle([_Staging(self._on_device, device.type == "cuda") for _ in range(_WRITES)])
 
     def _allocate(self, slots: int) -> int:
         dtype = getattr(torch, self._dtype.name)
@@ -42,7 +42,7 @@ class DeviceMirror(FrameMirror):
     def _write(self, slots: NDArray[np.int32], frames: Array) -> None:
         for first in range(0, len(slots), _TOGETHER):
             part = slice(first, first + _TOGETHER)
-            next(self._lanes).write(self._on_device, slots[part], frames[part])
+            next(self._staging).write(self._on_device, slots[part], frames[part])
 
     def _read(self, batch: NamedBatch, here: bool) -> Batch:
         columns = dict(batch.columns)
@@ -56,7 +56,7 @@ class DeviceMirror(FrameMirror):
         return Batch(frames=found, **columns)
 
 
-class _Lane:
+class _Staging:
     """Memory on the host from which some frames are written."""
 
     def __init__(self, rows: torch.Tensor, on_gpu: bool) -> None:

@@ -95,6 +95,8 @@ class RunDirectory:
     def record(self, episodes: Iterable[EpisodeRow], metrics: dict[str, Any] | None) -> None:
         """Record episodes, and a row of metrics if there is one."""
         rows = list(episodes)
+        if not rows and metrics is None:
+            return
 
         def tell(sink: Sink) -> None:
             for row in rows:
