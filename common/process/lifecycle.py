@@ -39,7 +39,9 @@ class Signalled(KeyboardInterrupt):
 
 def is_interrupt(error: BaseException) -> bool:
     """Whether a signal has raised an exception; a user's code may raise KeyboardInterrupt for reasons of its own."""
-    pythons = isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    in_main = threading.current_thread() is threading.main_thread()  # where Python handles signals
+    handled = in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    pythons = handled and isinstance(error, KeyboardInterrupt)
     return pythons or isinstance(error, Signalled)
 
 
