@@ -247,4 +247,5 @@ class FlatNetwork:
         if self.in_numpy is not None:
             return self.in_numpy(preprocess(obs, spec))
         with torch.inference_mode():
-            return self(preprocess(torch.from_numpy(obs), spec).to(self.flat)).float().cpu().numpy()
+            there = torch.from_numpy(obs).to(self.flat.device)  # as bytes, of which there are fewer
+            return self(preprocess(there, spec).to(self.flat)).float().cpu().numpy()
