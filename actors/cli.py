@@ -19,6 +19,10 @@ class ActorOptions(RoleOptions, HealthOptions):
     """client: --connect names a router, and this process has no other link."""
     envs: int | None = None
     """Emulators in this process; the run's actor.num_envs if not given."""
+    device: str = "cpu"
+    """Where the networks choose actions: cpu, cuda or cuda:1."""
+    groups: int | None = None
+    """Groups of emulators that act in turn, one while the others play; 2 with a GPU, else 1, if not given."""
 
 
 def main() -> None:

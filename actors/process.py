@@ -28,6 +28,10 @@ def play(options: ActorOptions) -> None:
     """Join a run and play emulators for it until the stop."""
     use_threads(1)
     keep_freed_memory()
+    if options.device != "cpu":
+        from coop.common.networks.devices import usable_device  # noqa: PLC0415 (PyTorch, whose import takes seconds)
+
+        usable_device(options.device, f"--device {options.device}")
     stop = Stop()
     stop.on_signals()
     stop.on_thread_failures()
@@ -69,10 +73,17 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, reply: J
     # The learner gives each number once per run, also across restarts, so no two processes play the same seeds.
     seed = np.random.SeedSequence([config.seed, 3, reply.index])
     env_seed, policy_seed = seed.spawn(2)
-    policy = make_policy(reply, options.allow_import, np.random.default_rng(policy_seed))
-    env = make_vector_env(config.env, options.envs or config.actor.num_envs, int(env_seed.generate_state(1)[0]))
-    if env.spec != reply.spec:
-        raise JoinError(f"environment here {env.spec}, the learner's {reply.spec}")
+    policy = make_policy(reply, options.allow_import, np.random.default_rng(policy_seed), options.device)
+    emulators = options.envs or config.actor.num_envs
+    groups = min(options.groups or (1 if options.device == "cpu" else 2), emulators)
+    sizes = [(emulators + group) // groups for group in range(groups)]
+    envs = [
+        make_vector_env(config.env, size, int(number))
+        for size, number in zip(sizes, env_seed.generate_state(groups), strict=True)
+    ]
+    for env in envs:
+        if env.spec != reply.spec:
+            raise JoinError(f"environment here {env.spec}, the learner's {reply.spec}")
 
     def open_route(endpoints: Sequence[str]) -> zenoh.Session:
         return open_session((), endpoints, options.zenoh_config, options.shared_memory)
@@ -88,10 +99,11 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, reply: J
 
         console.event(
             f"joined run {options.run!r} on {reply.learner} as actor {reply.index}; "
-            f"plays {counted(env.num_envs, 'emulator')} of {config.env.id} for the replay service on {reply.replay}"
+            f"plays {counted(emulators, 'emulator')} of {config.env.id} for the replay service on {reply.replay}"
         )
-        service = ActorService(node, route, stop, config, env, policy, request.incarnation, console)
+        service = ActorService(node, route, stop, config, envs, policy, request.incarnation, console)
         with Membership(node, stop, request, reply, options.patience, learned, console.event, lambda: route.is_up):
             service.run()
     console.event(f"{stop.reason}; {service.progress()}")
-    env.close()
+    for env in envs:
+        env.close()

@@ -16,7 +16,7 @@ from coop.common.types import Array, EnvSpec, EpisodeEnd
 
 
 class SegmentAssembler:
-    """Turns the steps of `num_envs` streams into segments; stream i is emulator i. Pure: no I/O, no clock.
+    """Turns the steps of `num_envs` streams into segments; emulator i is stream `first_stream` + i. Without I/O.
 
     Each step begins one transition over `n_step` steps, or fewer if its episode ends earlier. A transition belongs to
     the segment in which it becomes complete; until then it waits, even across flushes, so that every transition is
@@ -34,7 +34,9 @@ class SegmentAssembler:
         *,
         n_step: int = 1,
         gamma: float = 1.0,
+        first_stream: int = 0,
     ) -> None:
+        self._first_stream = first_stream
         self._num_envs, self._incarnation, self._length = num_envs, incarnation, segment_steps
         self._n_step, self._gamma = n_step, gamma
         # Rows of a round's columns: first the earlier steps whose transitions may still wait, then its own steps.
@@ -103,7 +105,7 @@ class SegmentAssembler:
                 segments.append(
                     Segment(
                         incarnation=self._incarnation,
-                        stream=stream,
+                        stream=self._first_stream + stream,
                         sequence=self._sequences[stream],
                         frames=frames[stream],
                         obs_index=obs_index[stream, first:stop],

@@ -1,11 +1,13 @@
-"""Connects a player to Zenoh: receives weights, sends segments."""
+"""Connects players to Zenoh: receives weights, sends segments."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 
-from coop.actors.player import Player, Turn
+from coop.actors.player import Player
 from coop.actors.policy import EpsilonGreedy
 from coop.actors.segments import SegmentAssembler
 from coop.actors.weights import WeightsFollower
@@ -23,8 +25,20 @@ STATUS_EVERY = 0.5  # seconds
 SPEED_OVER = 2.0  # seconds
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Emulators that step together."""
+
+    player: Player
+    segments: SegmentAssembler
+
+
 class ActorService:
-    """Plays all emulators of one process until the stop, and sends their segments to the replay service."""
+    """Plays all emulators of one process until the stop, and sends their segments to the replay service.
+
+    Args:
+        envs: groups of emulators, which act in turn: those of one play while the network chooses for another.
+    """
 
     def __init__(
         self,
@@ -32,7 +46,7 @@ class ActorService:
         route: QuerySender,
         stop: Stop,
         config: RunConfig,
-        env: VectorEnv,
+        envs: Sequence[VectorEnv],
         policy: EpsilonGreedy,
         incarnation: int,
         console: Console,
@@ -41,18 +55,22 @@ class ActorService:
         self._node = node
         self._stop = stop
         settings = config.actor
-        self._player = Player(env, policy, partial(schedules.epsilon, settings))
         self._weights = WeightsFollower(node, policy)
-        self._inserts = InsertClient(route, stop, settings.max_in_flight * env.num_envs, self._publish_status)
-        self._segments = SegmentAssembler(
-            env.spec,
-            env.num_envs,
-            incarnation,
-            settings.segment_steps,
-            n_step=config.replay.n_step,
-            gamma=config.learner.gamma,
-        )
-        self._turn: Turn | None = None
+        self._groups: list[_Group] = []
+        emulators = 0
+        for env in envs:
+            segments = SegmentAssembler(
+                env.spec,
+                env.num_envs,
+                incarnation,
+                settings.segment_steps,
+                n_step=config.replay.n_step,
+                gamma=config.learner.gamma,
+                first_stream=emulators,
+            )
+            self._groups.append(_Group(Player(env, policy, partial(schedules.epsilon, settings)), segments))
+            emulators += env.num_envs
+        self._inserts = InsertClient(route, stop, settings.max_in_flight * emulators, self._publish_status)
         self._status_due = 0.0
         self._speed = Rate(SPEED_OVER)
 
@@ -63,22 +81,25 @@ class ActorService:
             self._publish_status()
             if self._stop.wait(0.05):
                 return
-        self._segments.begin(self._player.begin())
+        for group in self._groups:
+            group.segments.begin(group.player.begin())
+            self._act(group)
         while not self._stop.is_set():
-            self._play()
+            self._weights.refresh()
+            for group in self._groups:
+                self._play(group)
             self._publish_status()
+        for group in self._groups:
+            group.player.recv()
 
-    def _play(self) -> None:
-        """Play one step of all emulators; they work while the previous step is sent."""
-        self._weights.refresh()
-        self._player.send(self._inserts.inserted, self._weights.version)
-        if self._turn is not None:
-            self._send(self._turn)
-        self._turn = self._player.recv()
+    def _act(self, group: _Group) -> None:
+        group.player.send(self._inserts.inserted, self._weights.version)
 
-    def _send(self, turn: Turn) -> None:
-        """Add a step to the segments, and send those that it completes."""
-        for segment in self._segments.add(turn.actions, turn.steps, turn.version, turn.ended):
+    def _play(self, group: _Group) -> None:
+        """Play one step of a group; its emulators work while the step before is sent, and while other groups act."""
+        turn = group.player.recv()
+        self._act(group)
+        for segment in group.segments.add(turn.actions, turn.steps, turn.version, turn.ended):
             if not self._inserts.submit(segment):
                 break
 
@@ -88,13 +109,17 @@ class ActorService:
         if now < self._status_due:
             return
         self._status_due = now + STATUS_EVERY
-        speed = self._speed.at(now, self._player.steps)
-        self._node.publish_status(ActorStatus(self._player.steps, self._inserts.acked, speed, self._waiting()))
+        speed = self._speed.at(now, self._steps)
+        self._node.publish_status(ActorStatus(self._steps, self._inserts.acked, speed, self._waiting()))
         self._console.progress(self._inserts.acked, self._waiting(), self.progress)
+
+    @property
+    def _steps(self) -> int:
+        return sum(group.player.steps for group in self._groups)
 
     def progress(self) -> str:
         """This actor's progress in one line."""
-        return f"{self._player.steps:,} steps played, {self._inserts.acked:,} of them acknowledged"
+        return f"{self._steps:,} steps played, {self._inserts.acked:,} of them acknowledged"
 
     def _waiting(self) -> str:
         return self._inserts.waiting if self._weights.ready else "waiting for the learner's weights"

@@ -106,8 +106,10 @@ class WeightsFollower:
         self._policy.acting = role.acting - 1
 
 
-def make_policy(reply: JoinReply, allow_import: Collection[str], rng: np.random.Generator) -> EpsilonGreedy:
-    """A policy with networks of the run's layout, whose parameters the learner will send.
+def make_policy(
+    reply: JoinReply, allow_import: Collection[str], rng: np.random.Generator, device: str = "cpu"
+) -> EpsilonGreedy:
+    """A policy with networks of the run's layout on a device; the learner will send their parameters.
 
     Raises:
         JoinError: the run needs a module that this process may not import, or this process builds another layout than
@@ -115,7 +117,7 @@ def make_policy(reply: JoinReply, allow_import: Collection[str], rng: np.random.
     """
     for field, path in reply.config.imports.items():
         check_allowed(path, allow_import, field)
-    first, second = (acting_network(reply.config.network, reply.spec) for _ in range(2))
+    first, second = (acting_network(reply.config.network, reply.spec, device) for _ in range(2))
     if first.layout_digest() != reply.layout:
         raise JoinError(f"network layout here {first.layout_digest()}, the learner's {reply.layout}")
     return EpsilonGreedy((first, second), reply.spec, rng)

@@ -30,7 +30,7 @@ PARTS = {  # with its limit in seconds
     "updates": 80,
     "jax": 45,
     "run": 85,
-    "acting": 15,
+    "acting": 30,
     "sb3": 25,
     "tests": 150,
     "accuracy": 40,

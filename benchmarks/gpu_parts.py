@@ -379,16 +379,43 @@ def part_sb3(options: argparse.Namespace) -> None:
 
 
 def part_acting(options: argparse.Namespace) -> None:
-    """Decisions/s of the nature network for 64 emulators."""
+    """Decisions/s of the nature network for 64 emulators; steps/s of two groups of them, with it and without."""
     import numpy as np
     from work import ATARI
 
-    from coop.common.networks.network import FlatNetwork, build_network
+    from coop.actors.player import Player
+    from coop.actors.policy import EpsilonGreedy
+    from coop.common.envs.make import make_vector_env
+    from coop.common.networks.acting import acting_network
+    from coop.common.settings.config import NetworkSettings
+    from coop.common.settings.tables import load_tables, resolve
 
-    network = FlatNetwork(build_network("nature", ATARI, (), 0).to(options.device))
+    game, nature = resolve(load_tables("breakout", None) | {"methods": {}}, "dqn").env, NetworkSettings("nature")
+    network = acting_network(nature, ATARI, options.device)
     obs = np.random.default_rng(0).integers(0, 256, (64, 4, 84, 84)).astype(np.uint8)
     rate = _rate(lambda: network.q_values(obs, ATARI).argmax(1), 0.2 if options.quick else 1.5, options.device, 64)
     figure(what="decisions/s", emulators=64, value=rate)
+    each = 2 if options.quick else 32
+    for greedy in (False, True, False, True, False, True):
+        envs = [make_vector_env(game, each, group) for group in range(2)]
+        acts = acting_network(nature, envs[0].spec, options.device)
+        policy = EpsilonGreedy((acts, acts), envs[0].spec, np.random.default_rng(0))
+        players = [Player(env, policy, lambda _, greedy=greedy: 0.05 if greedy else 1.0) for env in envs]
+        for player in players:
+            player.begin()
+            player.send(0, 0)
+
+        def turn(players: list[Player] = players) -> None:
+            for player in players:
+                player.recv()
+                player.send(0, 0)
+
+        rate = _rate(turn, 0.5 if options.quick else 2.0, "cpu", 2 * each)
+        what = "steps/s, the network acts" if greedy else "steps/s, emulators alone"
+        figure(what=what, emulators=2 * each, value=rate)
+        for player, env in zip(players, envs, strict=True):
+            player.recv()
+            env.close()
 
 
 def part_tests(options: argparse.Namespace) -> None:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from coop.common.errors import UsageError, first_line
+from coop.common.networks.devices import usable_device
 from coop.common.networks.network import FlatNetwork
 from coop.common.numbers import generator_state, set_generator_state
 from coop.common.process.output import warn
@@ -89,7 +90,7 @@ class Agent:
         """
         self.config = config
         self.spec = spec
-        self.device = _device(config.learner.device)
+        self.device = usable_device(config.learner.device, f"learner.device = {config.learner.device!r}")
         if self.device.type == "cuda":
             torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = config.learner.tf32
         self.loss = LOSSES[config.learner.loss]
@@ -313,15 +314,6 @@ class Agent:
         if due:
             self.swap()
         return due
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise UsageError(f"learner.device = {name!r}: {str(error).splitlines()[0]}") from error
-    return device
 
 
 def _decay_vector(decay: tuple[float, ...], layout: Sequence[tuple[str, tuple[int, ...]]]) -> Tensor | None:

@@ -169,6 +169,33 @@ def test_actors_that_all_run_elsewhere(tmp_path: Path, endpoint: str) -> None:
         assert re.search(r"complete: 600 steps, \d+ updates", out)
 
 
+def test_an_actors_emulators_act_in_groups(tmp_path: Path, endpoint: str) -> None:
+    """All streams arrive, each whole: what it read is what the journal has, bit for bit."""
+    path = tmp_path / "run"
+    flags = ("--preset", "cartpole", "--total-steps", "1500", "--replay.journal", "--run-dir", str(path))
+    actor = ("--connect", endpoint, "--envs", "5", "--groups", "2")
+    with (
+        running("coop-local", "--actors", "0", "--listen", endpoint, *flags) as head,
+        running("coop-actor", *actor) as group,
+    ):
+        _, err = head.communicate(timeout=80)
+        assert (head.returncode, err, group.wait(20)) == (0, "", 0)
+        assert group.stdout is not None
+        assert "plays 5 emulators of CartPole-v0" in group.stdout.read()
+    rows = list(csv.DictReader((path / "episodes.csv").read_text().splitlines()))
+    lengths = {stream: sum(int(row["length"]) for row in rows if row["stream"] == stream) for stream in "01234"}
+    assert {row["stream"] for row in rows} == lengths.keys()
+    assert max(lengths.values()) < 2 * min(lengths.values()), "in turn"
+    assert reexecute(path).missing_segments == 0
+
+
+def test_an_actor_whose_device_is_missing_says_so_at_once() -> None:
+    done = run("coop-actor", "--device", "nowhere")
+    assert done.returncode == 2
+    assert done.stderr.startswith("coop-actor: error: --device nowhere: ")
+    assert done.stderr.count("\n") == 1
+
+
 def test_three_shells_a_late_actor_and_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "run"
     with socket.socket() as probe:

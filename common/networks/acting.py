@@ -38,12 +38,14 @@ class ActingNetwork(Protocol):
         ...
 
 
-def acting_network(settings: NetworkSettings, spec: EnvSpec) -> ActingNetwork:
-    """A network of a run's layout. An MLP in float32 does without PyTorch, whose import takes seconds and 200 MiB.
+def acting_network(settings: NetworkSettings, spec: EnvSpec, device: str = "cpu") -> ActingNetwork:
+    """A network of a run's layout on a device.
+
+    On the CPU an MLP in float32 does without PyTorch, whose import takes seconds and 200 MiB.
 
     Raises UsageError as `build_network` does.
     """
-    if settings.kind == "mlp" and settings.dtype == "float32":
+    if settings.kind == "mlp" and settings.dtype == "float32" and device == "cpu":
         return Mlp(spec, settings.hidden)
     import torch  # noqa: PLC0415 (see above)
 
@@ -51,7 +53,7 @@ def acting_network(settings: NetworkSettings, spec: EnvSpec) -> ActingNetwork:
 
     use_threads(1)
     module = build_network(settings.kind, spec, settings.hidden, seed=0)
-    return FlatNetwork(module.to(torch.bfloat16 if settings.dtype == "bfloat16" else torch.float32))
+    return FlatNetwork(module.to(device, torch.bfloat16 if settings.dtype == "bfloat16" else torch.float32))
 
 
 class Mlp:
