@@ -23,8 +23,8 @@ RANK_STATES = 32  # of the archive: no effective rank is larger; its time grows 
 DORMANT_BELOW = 0.025  # tau of Sokar et al. 2023: share of the layer's mean activation
 RANK_LEFT_OUT = 0.01  # delta of Kumar et al. 2021: share of the sum of singular values
 
-Layer = NDArray[np.float32]
-"""The activations of a hidden layer, [batch, ..., units]."""
+Layer = NDArray[np.float32] | Tensor
+"""The activations of a hidden layer, float32 [batch, ..., units]; a tensor stays on its device, which reduces it."""
 
 
 class Diagnostics:
@@ -76,7 +76,7 @@ class Diagnostics:
             "q_abs_mean": float(np.abs(q).mean()),
             "archive_td_error": float(np.abs(errors).mean()),
             **self._changes(q if agent.config.two_networks else q[:1]),
-            **_plasticity([on_host(layer) for layer in hidden]),
+            **_plasticity([layer.float() if layer.is_cuda else on_host(layer) for layer in hidden]),
         }
 
     def state(self) -> dict[str, Any]:
@@ -128,7 +128,8 @@ def dormant(layer: Layer) -> NDArray[np.bool_]:
 
     A unit is dormant if its mean |activation| is at most tau times the mean over the layer's units.
     """
-    score = np.abs(layer).reshape(-1, layer.shape[-1]).mean(0)
+    units = layer.shape[-1]
+    score = on_host(layer.abs().reshape(-1, units).mean(0) if isinstance(layer, Tensor) else _means(layer, units))
     return np.asarray(score <= DORMANT_BELOW * score.mean())
 
 
@@ -137,14 +138,28 @@ def effective_ranks(layers: Sequence[Layer]) -> list[float]:
 
     It is the least number of the largest singular values of [batch, features] whose sum is at least 1 - delta of all.
     """
-    features = [layer.reshape(len(layer), -1).astype(np.float64) for layer in layers]
     # In float64 the roots of the Gram matrices' eigenvalues are exact enough, and take a fraction of an SVD's time.
-    grams = np.stack([each @ each.T for each in features])
+    grams = np.stack([_gram(layer) for layer in layers])
     if not np.isfinite(grams).all():
         return [math.nan] * len(layers)
     sums = np.sqrt(np.linalg.eigvalsh(grams).clip(0))[:, ::-1].cumsum(1)
     short = sums < (1 - RANK_LEFT_OUT) * sums[:, -1:]
     return [float(count) for count in short.sum(1) + (sums[:, -1] > 0)]
+
+
+def _means(layer: NDArray[np.float32], units: int) -> NDArray[np.float32]:
+    means: NDArray[np.float32] = np.abs(layer).reshape(-1, units).mean(0)
+    return means
+
+
+def _gram(layer: Layer) -> NDArray[np.float64]:
+    """Products of the states' features: float64 [batch, batch]."""
+    if isinstance(layer, Tensor):
+        wide = layer.reshape(len(layer), -1).double()
+        product: NDArray[np.float64] = (wide @ wide.T).cpu().numpy()
+        return product
+    features = layer.reshape(len(layer), -1).astype(np.float64)
+    return features @ features.T
 
 
 def _plasticity(hidden: Sequence[Layer]) -> dict[str, Any]:

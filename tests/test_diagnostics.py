@@ -20,6 +20,8 @@ from coop.learner.losses import Values
 SPEC = EnvSpec("CartPole-v0", (4,), "float32", 1, 2)
 CONFIG = RunConfig(method="coop", learner=LearnerSettings(gamma=0.5, double=False), network=NetworkSettings(hidden=()))
 
+SHAPES = [(5, 6, 8), (20,)]  # of layers' activations
+
 
 def batch(count: int, first: int = 0) -> Batch:
     """Transitions from frame i to frame i + 1, number `first` and after; frames are unlike each other."""
@@ -242,6 +244,15 @@ class Duelling(nn.Module):
         x = x.flatten(1)
         value: Tensor = self.value(x)
         return value + self.advantage(x)
+
+
+def test_a_device_reduces_layers_to_what_the_host_does() -> None:
+    rng = np.random.default_rng(0)
+    layers = [rng.standard_normal((32, *shape)).astype(np.float32) * (rng.random(shape[-1]) > 0.3) for shape in SHAPES]
+    assert effective_ranks([torch.from_numpy(layer) for layer in layers]) == effective_ranks(layers)
+    for layer in layers:
+        assert 0 < dormant(layer).mean() < 1
+        assert dormant(torch.from_numpy(layer)).tolist() == dormant(layer).tolist()
 
 
 def test_channels_are_the_units_of_pictures() -> None:
