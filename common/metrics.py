@@ -80,7 +80,7 @@ METRICS = (
     Metric("time", "the time of the row, since 1970", "s", column="time", plotted=False),
     Metric("env_step", "environment steps at the row", "steps", column="env_step", plotted=False),
     Metric("update", "updates at the row", "updates", column="update"),
-    _live("return_mean_100", "mean return of the last 100 episodes; 0 before the first", column="return_mean_100"),
+    _live("return_mean_100", "mean return of the last 100 episodes; 0 before the first"),
     _live("seconds", "time that the run has taken, over all its resumptions", "s"),
     _live("acting", "number of the network that acts and learns", column="acting"),
     _live("epsilon", "share of random actions", column="epsilon", tag="charts/epsilon",

@@ -73,7 +73,8 @@ class TrainingRun:
     def metrics(self) -> Iterator[dict[str, Any]]:
         """Yield the rows of metrics.jsonl, from the first one on, as they are written; ends with the run.
 
-        Each has `eval_return_mean` and `eval_env_step` of the newest evaluation before it as well, or None.
+        Each has as well, of what was before it, or None: `return_mean_100`, the mean return of the last 100 episodes,
+        and `eval_return_mean` and `eval_env_step` of the newest evaluation.
 
         Raises:
             RunError: as `wait`, after the last row.

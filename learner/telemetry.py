@@ -69,7 +69,6 @@ class Telemetry:
             "loss": float(agent.loss.cost(errors).mean()),
             "s": agent.feedback_scale(),
             "epsilon": epsilon,
-            "return_mean_100": self.return_mean,
             **measured,
             **self._bound(agent),
             "updates_per_s": (agent.updates - updates) / seconds,

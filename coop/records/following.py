@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -10,6 +11,7 @@ from typing import Any
 
 from coop.common.errors import CoopError, RunError, UsageError
 from coop.common.imports import describe
+from coop.common.numbers import RETURN_WINDOW
 from coop.common.process.lifecycle import Stop
 from coop.records.checkpoints import EVALUATIONS, RECORDS
 from coop.records.reading import parse_row
@@ -70,26 +72,40 @@ def _value(name: str, text: str) -> int | float | str:
 
 
 class MetricsFollowing:
-    """As `Following` of metrics.jsonl, with the newest evaluation before each row."""
+    """As `Following` of metrics.jsonl, with what episodes and evaluations had reached before each row."""
 
     def __init__(self, run_dir: Path) -> None:
-        self._metrics, self._evaluations = Following(run_dir, METRICS), Following(run_dir, EVALUATIONS)
-        self._evaluated: list[Row] = []
+        self._metrics, self._episodes = Following(run_dir, METRICS), Following(run_dir, EPISODES)
+        self._evaluations = Following(run_dir, EVALUATIONS)
+        self._ended: deque[Row] = deque()  # later than the newest row
+        self._evaluated: deque[Row] = deque()
+        self._returns: deque[float] = deque(maxlen=RETURN_WINDOW)
+        self._newest: Row = {}
 
     def rows(self) -> list[Row]:
-        """The rows since the last call, with `eval_return_mean` and `eval_env_step`, None before the first one.
+        """The rows since the last call, with `return_mean_100`, `eval_return_mean` and `eval_env_step`.
+
+        These are the mean return of the last 100 episodes and the newest evaluation before the row, or None.
 
         Raises:
             RunError: a line can't be read.
         """
         rows = self._metrics.rows()
+        self._ended += self._episodes.rows()
         self._evaluated += self._evaluations.rows()
         return [{**row, **self._before(row["env_step"])} for row in rows]
 
     def _before(self, env_step: int) -> Row:
-        # That of the same step is written after the row.
-        newest: Row = next((each for each in reversed(self._evaluated) if each["env_step"] < env_step), {})
-        return {"eval_return_mean": newest.get("return_mean"), "eval_env_step": newest.get("env_step")}
+        # Those of the same step are written after the row.
+        while self._ended and self._ended[0]["env_step"] < env_step:
+            self._returns.append(self._ended.popleft()["return"])
+        while self._evaluated and self._evaluated[0]["env_step"] < env_step:
+            self._newest = self._evaluated.popleft()
+        return {
+            "return_mean_100": sum(self._returns) / len(self._returns) if self._returns else None,
+            "eval_return_mean": self._newest.get("return_mean"),
+            "eval_env_step": self._newest.get("env_step"),
+        }
 
 
 class Callbacks:
