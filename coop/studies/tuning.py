@@ -83,7 +83,7 @@ def tune(
     )  # fmt: skip
     # Another seed after each interruption: the same one would draw the same settings again.
     study.sampler = sampler or optuna.samplers.TPESampler(seed=seed + len(study.trials))
-    search = _Search(study, space, path, LocalProcesses(space.file, workers or cores()))
+    search = _Search(study, space, path, workers or cores())
     try:
         while search.advance(trials):
             time.sleep(TICK)
@@ -173,10 +173,12 @@ class _Running:
 class _Search:
     """The trials of a study, run by an executor."""
 
-    def __init__(self, study: optuna.Study, space: Space, path: Path, executor: LocalProcesses) -> None:
+    def __init__(self, study: optuna.Study, space: Space, path: Path, workers: int) -> None:
         import optuna  # noqa: PLC0415 (an extra)
 
-        self._study, self._space, self._path, self.executor = study, space, path, executor
+        self._study, self._space, self._path, self._workers = study, space, path, workers
+        self.executor = LocalProcesses(space.file, workers)
+        self._exhausted = False  # the sampler has nothing left to try
         self._states = optuna.trial.TrialState
         self._running: list[_Running] = []
         self._log = DEFAULT_LOG
@@ -186,13 +188,15 @@ class _Search:
 
     def advance(self, trials: int) -> bool:
         """Begin trials while there are free processes, and look at the running ones; False if none is left."""
-        while self._stale and self.executor.slots() > 0:
-            trial, told = self._stale.pop()
-            self._begin(trial, told)
-        while not self._stale and self.executor.slots() > 0 and len(self._study.get_trials(False)) < trials:
-            self._begin(self._study.ask(), set())
         for running in list(self._running):
             self._look(running)
+        while self._stale and len(self._running) < self._workers:
+            trial, told = self._stale.pop()
+            self._begin(trial, told)
+        while (
+            not self._exhausted and len(self._running) < self._workers and len(self._study.get_trials(False)) < trials
+        ):
+            self._begin(self._study.ask(), set())
         return bool(self._running or self._stale)
 
     def _begin(self, trial: optuna.Trial, told: set[int]) -> None:
@@ -222,7 +226,7 @@ class _Search:
                 self._fail(running.trial, ending.why)
                 return False
             self._finished(running)
-        self._study.tell(running.trial, sum(running.scores) / len(running.scores))
+        self._tell(running.trial, sum(running.scores) / len(running.scores))
         return False
 
     def _finished(self, running: _Running) -> None:
@@ -239,7 +243,7 @@ class _Search:
             if ending is None:
                 return
             if running.pruned:
-                self._study.tell(running.trial, state=self._states.PRUNED)
+                self._tell(running.trial, state=self._states.PRUNED)
             elif ending.kind == "finished":
                 self._finished(running)
                 if self._start(running):
@@ -267,4 +271,15 @@ class _Search:
 
     def _fail(self, trial: optuna.Trial, why: str) -> None:
         trial.set_user_attr("why", why)
-        self._study.tell(trial, state=self._states.FAIL)
+        self._tell(trial, state=self._states.FAIL)
+
+    def _tell(
+        self, trial: optuna.Trial, value: float | None = None, state: optuna.trial.TrialState | None = None
+    ) -> None:
+        """Tell Optuna how a trial has ended; a sampler of a finite grid then says by `Study.stop` that it is over."""
+        try:
+            self._study.tell(trial, value, state)
+        except RuntimeError as error:
+            if "Study.stop" not in str(error):
+                raise
+            self._exhausted = True
