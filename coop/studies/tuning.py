@@ -190,14 +190,21 @@ class _Search:
         """Begin trials while there are free processes, and look at the running ones; False if none is left."""
         for running in list(self._running):
             self._look(running)
-        while self._stale and len(self._running) < self._workers:
-            trial, told = self._stale.pop()
-            self._begin(trial, told)
+        for trial, told in list(self._stale):
+            if len(self._running) < self._workers:
+                if self._goes_on(trial):
+                    self._begin(trial, told)
+                if any(running.trial is trial for running in self._running) or not self._goes_on(trial):
+                    self._stale.remove((trial, told))
         while (
             not self._exhausted and len(self._running) < self._workers and len(self._study.get_trials(False)) < trials
         ):
             self._begin(self._study.ask(), set())
         return bool(self._running or self._stale)
+
+    def _goes_on(self, trial: optuna.Trial) -> bool:
+        """Whether nobody has told how a trial ended; one whose run another process holds is waited for."""
+        return bool(self._study.get_trials(False)[trial.number].state == self._states.RUNNING)
 
     def _begin(self, trial: optuna.Trial, told: set[int]) -> None:
         method, chosen = self._space.suggest(trial)
