@@ -27,8 +27,11 @@ if TYPE_CHECKING:
     from coop.evaluation.saved import SavedPolicy as SavedPolicy
     from coop.evaluation.saved import SavedRun as SavedRun
     from coop.evaluation.saved import load as load
+    from coop.studies.frames import SweepFrames as SweepFrames
+    from coop.studies.frames import load_sweep as load_sweep
     from coop.studies.sweep.run import SweepResult as SweepResult
     from coop.studies.sweep.run import sweep as sweep
+    from coop.studies.tuning import tune as tune
     from coop.training import TrainingRun as TrainingRun
     from coop.training import train as train
 
@@ -41,14 +44,17 @@ _MODULES = {
     "RunError": "coop.common.errors",
     "SavedPolicy": "coop.evaluation.saved",
     "SavedRun": "coop.evaluation.saved",
+    "SweepFrames": "coop.studies.frames",
     "SweepResult": "coop.studies.sweep.run",
     "TrainingRun": "coop.training",
     "UsageError": "coop.common.errors",
     "evaluate": "coop.evaluation.evaluate",
     "load": "coop.evaluation.saved",
+    "load_sweep": "coop.studies.frames",
     "register_method": "coop.common.settings.methods",
     "sweep": "coop.studies.sweep.run",
     "train": "coop.training",
+    "tune": "coop.studies.tuning",
 }
 
 __all__ = sorted(_MODULES)  # noqa: PLE0605

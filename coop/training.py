@@ -26,8 +26,8 @@ from coop.common.settings.resuming import settings_digest
 from coop.common.settings.starting import env_id_of, stated
 from coop.common.settings.tables import to_tables, to_toml, validated
 from coop.lockstep.run import LockstepRun
+from coop.records.following import Callback, Callbacks, MetricsFollowing
 from coop.records.locks import RunLock
-from coop.records.reading import parse_row
 from coop.records.resumption import Start
 from coop.records.run_options import RunOptions, chosen_config
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
@@ -73,24 +73,16 @@ class TrainingRun:
     def metrics(self) -> Iterator[dict[str, Any]]:
         """Yield the rows of metrics.jsonl, from the first one on, as they are written; ends with the run.
 
+        Each has as well, of what was before it, or None: `return_mean_100`, the mean return of the last 100 episodes,
+        and `eval_return_mean` and `eval_env_step` of the newest evaluation.
+
         Raises:
             RunError: as `wait`, after the last row.
         """
-        path, place, update = self.directory / "metrics.jsonl", 0, -1
+        following = MetricsFollowing(self.directory)
         while True:
             running = self.running  # read before the file, so that its last lines are not missed
-            if path.exists():
-                if path.stat().st_size < place:
-                    place = 0  # a learner that was killed has gone back to its checkpoint; rows are not yielded twice
-                with path.open("rb") as file:
-                    file.seek(place)
-                    lines = file.read().rpartition(b"\n")[0]
-                for line in lines.splitlines():
-                    row = parse_row(line, f"{path}, after update {max(update, 0):,}")
-                    if row["update"] > update:
-                        update = row["update"]
-                        yield row
-                place += len(lines) + 1 if lines else 0
+            yield from following.rows()
             if not running:
                 break
             self._thread.join(POLL)
@@ -147,6 +139,9 @@ def train(
     overwrite: bool = False,
     allow_import: Collection[str] = (),
     log: str | Iterable[str] = DEFAULT_LOG,
+    on_metrics: Callback | None = None,
+    on_episode: Callback | None = None,
+    on_evaluation: Callback | None = None,
     **settings: Any,  # noqa: ANN401 (the fields of a run, each checked)
 ) -> TrainingRun:
     """Start a run and return at once.
@@ -167,12 +162,16 @@ def train(
             folder or beside it; those that `settings` name need not be listed.
         log: where metrics go beside the run's own files: names of sinks in a list, or in a text with commas:
             "tensorboard", "wandb", "mlflow" (extras of these names); "none" for nowhere.
+        on_metrics, on_episode, on_evaluation: called, in the thread of the run, with each new row as a dictionary: as
+            `TrainingRun.metrics` yields it, and of episodes.csv and evaluations.csv. One that returns a true value
+            stops the run cleanly, as `TrainingRun.stop` does; one that raises an exception fails it.
         settings: fields of a run; a table as a mapping: `seed=1, total_steps=20_000, replay={"capacity": 500}`.
 
     Raises:
         UsageError: a setting is invalid, `run_dir` holds a run already, or one that can't be resumed.
         RunError: `run_dir` is in use.
     """
+    callbacks = Callbacks({"on_metrics": on_metrics, "on_episode": on_episode, "on_evaluation": on_evaluation})
     named, names = [*allow_import, *_named({"method": method, **settings})], chosen_sinks(log)
     permit(named)
     given = stated(settings)
@@ -189,12 +188,12 @@ def train(
         run = LockstepRun(run_config, directory, "coop.train", options.start, log=names)
         for line in run.notices:
             say(line)
-        return TrainingRun(run_config, directory, lambda stop: _play(run, stop))
+        return TrainingRun(run_config, directory, lambda stop: _play(run, stop, callbacks))
     if actors < 1:
         raise UsageError(f"actors = {actors}: must be at least 1")
     check_distributed(run_config)
     topology = _topology(run_config, options.directory(), actors, options.start, named, names)
-    return TrainingRun(run_config, topology.directory, topology.play)
+    return TrainingRun(run_config, topology.directory, lambda stop: topology.play(stop, callbacks))
 
 
 def _options(
@@ -227,9 +226,9 @@ def _options(
     return RunOptions(**values, preset=preset, config=path, run_dir=directory, **asdict(start))
 
 
-def _play(run: LockstepRun, stop: Stop) -> None:
+def _play(run: LockstepRun, stop: Stop, callbacks: Callbacks) -> None:
     with closing(run):
-        run.play(stop)
+        run.play(stop, callbacks=callbacks)
         if run.diverged:
             raise RunError(run.diverged)
 
@@ -244,15 +243,17 @@ class _Topology:
         self.directory = directory
         self._process = process
 
-    def play(self, stop: Stop) -> None:
-        """Run it to its end; raises RunError if it fails."""
+    def play(self, stop: Stop, callbacks: Callbacks) -> None:
+        """Run it to its end; raises RunError if it, or a callback, fails."""
+        callbacks.follow(self.directory, stop)
         self._process.start()
         while self._process.exit_status() is None and not stop.wait(POLL):
-            pass
+            callbacks.look()
         self._process.interrupt()
         self._process.end(GRACE)
         if self._process.exit_status() and not (stop.is_set() and self._process.was_interrupted()):
             raise RunError(self._process.why())
+        callbacks.finish()
 
 
 def _named(settings: Mapping[str, Any]) -> list[str]:

@@ -5,6 +5,7 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
 SMALL = {"learning_starts": 50, "capacity": 200}
 
 
-def trained(path: Path, method: str = "coop", **settings: object) -> coop.TrainingRun:
+def trained(path: Path, method: str = "coop", **settings: Any) -> coop.TrainingRun:
     return coop.train(method=method, total_steps=400, run_dir=path, replay=SMALL, **settings)
 
 
@@ -64,6 +65,60 @@ def test_a_stopped_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     summary = again.stop()
     assert summary is not None
     assert summary["env_steps"] >= steps
+
+
+@pytest.mark.parametrize("distributed", [False, True])
+def test_callbacks_get_each_row_once_and_may_stop_the_run(distributed: bool, tmp_path: Path) -> None:
+    rows: dict[str, list[dict[str, Any]]] = {"on_metrics": [], "on_episode": [], "on_evaluation": []}
+    calls: dict[str, Any] = {name: kept.append for name, kept in rows.items()}
+    enough = 12  # which take more steps than a row of metrics
+    calls["on_episode"] = lambda row: rows["on_episode"].append(row) or len(rows["on_episode"]) >= enough
+    settings = {"total_steps": 20_000, "replay": SMALL, "eval_every": 40}
+    run = coop.train(method="dqn", run_dir=tmp_path, distributed=distributed, **calls, **settings)
+    summary = run.wait(200)
+    assert summary is not None
+    assert summary["exit"] == ("interrupted" if distributed else "stopped by on_episode")
+    if not distributed:
+        assert summary["episodes"] == enough
+    saved = coop.load(tmp_path)
+    assert [row["episode"] for row in rows["on_episode"]] == saved.episodes["episode"].tolist()
+    assert [row["return"] for row in rows["on_episode"]] == saved.episodes["return"].tolist()
+    assert [row["return_mean"] for row in rows["on_evaluation"]] == saved.evaluations["return_mean"].tolist()
+    before, enough = len(rows["on_episode"]), len(rows["on_episode"]) + 12
+    coop.train(run_dir=tmp_path, resume=True, distributed=distributed, **calls).wait(200)
+    assert [row["episode"] for row in rows["on_episode"]] == coop.load(tmp_path).episodes["episode"].tolist()
+    assert len(rows["on_episode"]) >= before + 12
+    assert [row["update"] for row in rows["on_metrics"]] == coop.load(tmp_path).metrics["update"].tolist()
+
+
+def test_rows_of_metrics_hold_returns_and_evaluations(tmp_path: Path) -> None:
+    told: list[dict[str, Any]] = []
+    run = coop.train(total_steps=700, run_dir=tmp_path, replay=SMALL, eval_every=300, on_metrics=told.append)
+    rows = list(run.metrics())
+    assert rows == told
+    done = coop.load(tmp_path).evaluations.set_index("env_step")["return_mean"]
+    assert list(done.index) == [300, 600]
+    for row in rows:
+        at = row["eval_env_step"]
+        assert at == max((step for step in done.index if step < row["env_step"]), default=None)
+        assert row["eval_return_mean"] == (None if at is None else done[at])
+    assert {row["eval_env_step"] for row in rows} == {None, 300, 600}
+    episodes = coop.load(tmp_path).episodes
+    ended = episodes[episodes["env_step"] < rows[-1]["env_step"]]["return"]
+    assert rows[-1]["return_mean_100"] == pytest.approx(ended.tail(100).mean())
+
+
+def test_a_callback_that_fails_is_named(tmp_path: Path) -> None:
+    with pytest.raises(coop.UsageError, match=r"^on_episode = 5: must be a function of a row"):
+        trained(tmp_path, on_episode=5)
+    run = trained(tmp_path, on_episode=lambda row: row["retrun"])
+    with pytest.raises(coop.RunError, match=r"^on_episode: KeyError: 'retrun'$"):
+        run.wait()
+    summary = coop.load(tmp_path).summary
+    assert summary is not None
+    assert summary["exit"] == "failed: on_episode: KeyError: 'retrun'"
+    assert summary["episodes"] == 1
+    assert coop.train(run_dir=tmp_path, resume=True).wait()["exit"] == "complete"  # type: ignore[index]
 
 
 def test_bad_settings_are_refused_before_anything_starts(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from coop.evaluation.episodes import Evaluator
 from coop.learner.initial_networks import load_initial_networks
 from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep, Replaying
+from coop.records.following import Callbacks
 from coop.records.learner_checkpoints import load_learner
 from coop.records.locks import RunLock
 from coop.records.resumption import Start
@@ -77,8 +78,15 @@ class LockstepRun:
             self.close()
             raise
 
-    def play(self, stop: Stop, progress: Callable[[str], None] = lambda line: None) -> Summary:
+    def play(
+        self,
+        stop: Stop,
+        progress: Callable[[str], None] = lambda line: None,
+        callbacks: Callbacks | None = None,
+    ) -> Summary:
         """Play until the run is over or stopped; progress: called with a line every few seconds.
+
+        callbacks: called after each step with what it has recorded; one that fails stops the run.
 
         Raises:
             RunError: there is no space for the closing checkpoint or the summary.
@@ -87,7 +95,11 @@ class LockstepRun:
         with self.files() as directory:
             if directory.aside:
                 progress(directory.aside)
-            return play_lockstep(self.run, directory, stop, progress)
+            callbacks = callbacks or Callbacks()
+            callbacks.follow(self.path, stop)
+            summary = play_lockstep(self.run, directory, stop, progress, callbacks.look)
+            callbacks.finish()
+            return summary
 
     def files(self) -> RunDirectory:
         """Open the run's files, to go on from where it is; raises as `RunDirectory`."""
@@ -107,9 +119,13 @@ class LockstepRun:
 
 
 def play_lockstep(
-    run: Lockstep, directory: RunDirectory, stop: Stop, progress: Callable[[str], None] = lambda line: None
+    run: Lockstep,
+    directory: RunDirectory,
+    stop: Stop,
+    progress: Callable[[str], None] = lambda line: None,
+    recorded: Callable[[], None] = lambda: None,
 ) -> Summary:
-    """Play until the run is over or stopped, and complete its files.
+    """Play until the run is over or stopped, and complete its files; recorded: called after each step.
 
     Raises:
         RunError: there is no space for the closing checkpoint or the summary.
@@ -123,6 +139,7 @@ def play_lockstep(
             for effects in run.play():
                 directory.record(effects.episodes, effects.metrics)
             _evaluate(run, directory, evaluator)
+            recorded()
             if trainer.checkpoint_due() and not trainer.outcome():
                 trainer.checkpoint_begun()
                 try:

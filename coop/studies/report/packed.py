@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -71,6 +72,11 @@ class PackedStudy:
         read = {name: decimals(each.as_py()) if each.type == six else each.as_py() for name, each in held.items()}
         lacking: list[Any] = [None] * len(next(iter(read.values()), ()))
         return {name: read[name] for name in wanted} | {name: read.get(name, lacking) for name in optional}
+
+    def table(self, run: str, file: str) -> pd.DataFrame:
+        """All columns of a run's episodes or metrics that are packed, empty if it has none."""
+        names = [name.removeprefix(f"{file}/") for name in self._table.column_names if name.startswith(f"{file}/")]
+        return pd.DataFrame(self.columns(run, file, (), names)).dropna(axis=1, how="all")
 
 
 def decimals(values: Sequence[float]) -> list[float]:

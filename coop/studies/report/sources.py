@@ -39,6 +39,10 @@ class RunSource(Protocol):
         """
         ...
 
+    def table(self, run: str, file: str) -> pd.DataFrame:
+        """All columns of a run's episodes or metrics, empty if it has none; raises RunError."""
+        ...
+
 
 class FolderSource:
     """A folder of run directories, or a single one."""

@@ -128,6 +128,11 @@ class LocalProcesses:
             return Ending("failed", why)
         return ending
 
+    def interrupt(self, folder: CellFolder) -> None:
+        """Ask the process of a running cell to save its state and end."""
+        if (process := self._processes.get(folder.cell.name)) is not None:
+            process.interrupt()
+
     def stop(self, seconds: float) -> None:
         """See `Executor`."""
         running = self._running()

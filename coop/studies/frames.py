@@ -1,0 +1,71 @@
+"""All runs of a sweep as tables of pandas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from coop.common.errors import UsageError
+from coop.common.imports import check_extra
+from coop.common.places import absolute
+from coop.common.settings.config import value_of
+from coop.common.settings.overrides import leaves
+from coop.common.settings.tables import identity, parse_run_config
+
+
+@dataclass(frozen=True)
+class SweepFrames:
+    """The records of all runs that a sweep has begun, each row with the settings of its run.
+
+    Attributes:
+        episodes, metrics: the rows of episodes.csv and metrics.jsonl; in front of their columns stand `run`, the
+            folder's name, `method`, `seed`, and the dotted names of the settings in which the runs differ.
+    """
+
+    episodes: pd.DataFrame
+    metrics: pd.DataFrame
+
+
+def load_sweep(folder: str | Path) -> SweepFrames:
+    """Read the runs of a sweep, of any folder of runs, or of a packed study; runs that go on are included.
+
+    Raises:
+        UsageError: there is no run, or pyarrow (extra `report`) is not installed.
+        RunError: a record can't be read.
+    """
+    check_extra("coop.load_sweep", "report", "pyarrow")
+    from coop.studies.report.packed import CONFIG, EPISODES, METRICS  # noqa: PLC0415 (needs the extra)
+    from coop.studies.report.sources import open_source  # noqa: PLC0415
+
+    path = absolute(folder, "folder")
+    if not path.exists():
+        raise UsageError(f"folder {path}: does not exist")
+    source = open_source(path)
+    texts = {name: source.text(name, CONFIG) for name in source.names}
+    configs = {name: parse_run_config(text, f"{path}/{name}/{CONFIG}") for name, text in texts.items() if text}
+    if not configs:
+        raise UsageError(f"{path}: holds no run")
+    flat = [{".".join(place): value for place, value in leaves(identity(config))} for config in configs.values()]
+    names = dict.fromkeys(name for each in flat for name in each)
+    differing = [name for name in names if any(each.get(name) != flat[0].get(name) for each in flat)]
+    axes = dict.fromkeys(("method", "seed", *differing))
+
+    def settings(name: str) -> dict[str, Any]:
+        values = {axis: value_of(configs[name], axis) for axis in axes}
+        return {"run": name, **{axis: str(v) if isinstance(v, list | tuple) else v for axis, v in values.items()}}
+
+    def table(file: str) -> pd.DataFrame:
+        frames = [_beside(settings(name), source.table(name, file)) for name in configs]
+        frames = [frame for frame in frames if len(frame)]
+        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=["run", *axes])
+
+    return SweepFrames(table(EPISODES), table(METRICS))
+
+
+def _beside(settings: dict[str, Any], records: pd.DataFrame) -> pd.DataFrame:
+    """Records behind columns of settings; a record's own column of that name stays."""
+    columns = {name: value for name, value in settings.items() if name not in records}
+    return pd.concat([pd.DataFrame(columns, index=records.index), records], axis=1)

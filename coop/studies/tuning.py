@@ -1,0 +1,292 @@
+"""A search for settings by Optuna (extra `optuna`): each trial is a run, or one for each seed, in a process."""
+
+from __future__ import annotations
+
+import json
+import time
+import tomllib
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pydantic
+
+from coop.common.errors import CoopError, UsageError
+from coop.common.imports import check_extra
+from coop.common.numbers import RETURN_WINDOW
+from coop.common.places import absolute
+from coop.common.process.files import make_folder
+from coop.common.process.limits import cores
+from coop.common.process.untrusted import MAX_SETTINGS, read_text
+from coop.common.settings.overrides import merged, nested
+from coop.common.settings.tables import first_problem
+from coop.records.following import EPISODES, Following
+from coop.records.sinks import DEFAULT_LOG
+from coop.records.summaries import read_summary
+from coop.studies.sweep.folder import CellFolder
+from coop.studies.sweep.grid import Cell, Grid, GridFile
+from coop.studies.sweep.local import LocalProcesses
+
+if TYPE_CHECKING:
+    import optuna
+
+TICK = 0.2  # seconds
+REPORTS = 20  # of a run, to the pruner, at equal distances in environment steps
+GRACE = 60.0  # seconds for the runs to save their state
+RANGE = {"low", "high", "log", "step"}
+
+
+def tune(
+    grid: str | Path | Mapping[str, Any],
+    folder: str | Path,
+    *,
+    trials: int = 20,
+    workers: int | None = None,
+    seed: int = 0,
+    sampler: optuna.samplers.BaseSampler | None = None,
+    pruner: optuna.pruners.BasePruner | None = None,
+    storage: str | None = None,
+) -> optuna.Study:
+    """Search for the settings with the largest mean return of the last 100 episodes, over a grid's seeds; wait.
+
+    The same call goes on with a search that was interrupted, its runs from their newest checkpoints. Several processes
+    may share a folder. A trial whose run fails, diverges or is refused is a failed trial, with the reason in its
+    attribute `why`; its attributes `seeds` and `settings` say what was run.
+
+    Args:
+        grid: as of `coop.sweep`, the contents or the path of a TOML file. Of a field in `vary`, a list is chosen from,
+            and a table `{low, high}`, with `log = true` or a `step`, is a range.
+        folder: for the runs, `trial-0000` and so on, and Optuna's storage.
+        trials: number of trials that are to have been run in the end, earlier ones included.
+        workers: processes to run concurrently; the number of cores if None.
+        seed: of the sampler, if none is given.
+        sampler, pruner: Optuna's; TPE, and the median rule, if None. The pruner is told the mean return of the last 100
+            episodes after each twentieth of a run.
+        storage: URL of Optuna's storage; SQLite in the folder if None.
+
+    Raises:
+        UsageError: Optuna is not installed, or the grid is invalid.
+    """
+    check_extra("coop.tune", "optuna", "optuna")
+    import optuna  # noqa: PLC0415 (an extra, which may be missing)
+
+    if trials < 1 or (workers is not None and workers < 1):
+        raise UsageError(f"trials = {trials}, workers = {workers}: must be at least 1")
+    path = absolute(folder, "folder")
+    space = Space(grid)
+    make_folder(path)
+    study = optuna.create_study(
+        storage=storage or f"sqlite:///{path / 'optuna.db'}", study_name=path.name, direction="maximize",
+        load_if_exists=True, pruner=pruner,
+    )  # fmt: skip
+    # Another seed after each interruption: the same one would draw the same settings again.
+    study.sampler = sampler or optuna.samplers.TPESampler(seed=seed + len(study.trials))
+    search = _Search(study, space, path, workers or cores())
+    try:
+        while search.advance(trials):
+            time.sleep(TICK)
+    finally:
+        search.executor.stop(GRACE)
+    return study
+
+
+class Space:
+    """The settings among which a search chooses."""
+
+    def __init__(self, grid: str | Path | Mapping[str, Any]) -> None:
+        """Read a grid; raises UsageError, also for settings that no run takes."""
+        try:
+            tables = dict(grid) if isinstance(grid, Mapping) else tomllib.loads(read_text(Path(grid), MAX_SETTINGS))
+            tables.pop("quick", None)
+            self.file = pydantic.TypeAdapter(GridFile).validate_python(tables)
+        except pydantic.ValidationError as error:
+            raise UsageError(f"grid: {first_problem(error, GridFile())}") from error
+        except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise UsageError(f"grid {grid}: {getattr(error, 'strerror', None) or error}") from error
+        self.axes = _axes(self.file.vary)
+        first = {name: each["low"] if isinstance(each, Mapping) else each[0] for name, each in self.axes.items()}
+        self.cells("trial", self.file.methods[0], first)
+
+    def cells(self, name: str, method: str, chosen: Mapping[str, Any]) -> list[Cell]:
+        """A cell for each seed with the chosen settings, by their dotted names; raises UsageError."""
+        fixed = self.file.fixed
+        for field_name, value in chosen.items():
+            fixed = merged(fixed, nested(tuple(field_name.split(".")), value))
+        cells = Grid(replace(self.file, methods=(method,), fixed=fixed, vary={})).cells
+        each = [f"{name}-seed={cell.config.seed}" if len(cells) > 1 else name for cell in cells]
+        return [Cell(own, cell.config) for own, cell in zip(each, cells, strict=True)]
+
+    def suggest(self, trial: optuna.Trial) -> tuple[str, dict[str, Any]]:
+        """(method, settings) of a trial."""
+        methods = list(self.file.methods)
+        method = trial.suggest_categorical("method", methods) if len(methods) > 1 else methods[0]
+        return str(method), {name: _suggested(trial, name, values) for name, values in self.axes.items()}
+
+
+def _axes(vary: Mapping[str, Any], at: str = "") -> dict[str, Any]:
+    """The varying fields by dotted names: a list, or the table of a range. Raises UsageError."""
+    found: dict[str, Any] = {}
+    for key, value in vary.items():
+        name = f"{at}{key}"
+        if isinstance(value, Mapping) and "low" in value:
+            low, high = value["low"], value.get("high")
+            kinds = all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high))
+            log_and_step = value.get("log") and "step" in value
+            if value.keys() - RANGE or not kinds or low > high or log_and_step or (value.get("log") and low <= 0):
+                raise UsageError(f"vary.{name} = {dict(value)!r}: must be low and high, with log = true or a step")
+            found[name] = value
+        elif isinstance(value, Mapping):
+            found |= _axes(value, f"{name}.")
+        elif isinstance(value, list | tuple) and value:
+            found[name] = list(value)
+        else:
+            raise UsageError(f"vary.{name} = {value!r}: must be a list of at least one value, or low and high")
+    return found
+
+
+def _suggested(trial: optuna.Trial, name: str, values: Any) -> Any:  # noqa: ANN401 (of any field)
+    if isinstance(values, Mapping):
+        low, high, log, step = values["low"], values["high"], bool(values.get("log")), values.get("step")
+        if isinstance(low, int) and isinstance(high, int):
+            return trial.suggest_int(name, low, high, log=log, step=step or 1)
+        return trial.suggest_float(name, low, high, log=log, step=step)
+    if all(isinstance(value, str | bool | int | float) for value in values):
+        return trial.suggest_categorical(name, values)
+    return json.loads(str(trial.suggest_categorical(name, [json.dumps(value) for value in values])))
+
+
+@dataclass
+class _Running:
+    """A trial that is being run: its runs that are left, the first one under way; scores: of those that are done."""
+
+    trial: optuna.Trial
+    left: list[CellFolder]
+    following: Following
+    told: set[int]
+    scores: list[float] = field(default_factory=list)
+    returns: deque[float] = field(default_factory=lambda: deque(maxlen=RETURN_WINDOW))
+    pruned: bool = False
+
+
+class _Search:
+    """The trials of a study, run by an executor."""
+
+    def __init__(self, study: optuna.Study, space: Space, path: Path, workers: int) -> None:
+        import optuna  # noqa: PLC0415 (an extra)
+
+        self._study, self._space, self._path, self._workers = study, space, path, workers
+        self.executor = LocalProcesses(space.file, workers)
+        self._exhausted = False  # the sampler has nothing left to try
+        self._states = optuna.trial.TrialState
+        self._running: list[_Running] = []
+        self._log = DEFAULT_LOG
+        # Those of a search that was interrupted go on; those that another process runs are refused by their locks.
+        stale = study.get_trials(states=(self._states.RUNNING,))
+        self._stale = [(optuna.Trial(study, each._trial_id), set(each.intermediate_values)) for each in stale]
+
+    def advance(self, trials: int) -> bool:
+        """Begin trials while there are free processes, and look at the running ones; False if none is left."""
+        for running in list(self._running):
+            self._look(running)
+        for trial, told in list(self._stale):
+            if len(self._running) < self._workers:
+                if self._goes_on(trial):
+                    self._begin(trial, told)
+                if any(running.trial is trial for running in self._running) or not self._goes_on(trial):
+                    self._stale.remove((trial, told))
+        while (
+            not self._exhausted and len(self._running) < self._workers and len(self._study.get_trials(False)) < trials
+        ):
+            self._begin(self._study.ask(), set())
+        return bool(self._running or self._stale)
+
+    def _goes_on(self, trial: optuna.Trial) -> bool:
+        """Whether nobody has told how a trial ended; one whose run another process holds is waited for."""
+        return bool(self._study.get_trials(False)[trial.number].state == self._states.RUNNING)
+
+    def _begin(self, trial: optuna.Trial, told: set[int]) -> None:
+        method, chosen = self._space.suggest(trial)
+        trial.set_user_attr("seeds", list(self._space.file.seeds))
+        trial.set_user_attr("settings", {"method": method, **chosen})
+        try:
+            cells = self._space.cells(f"trial-{trial.number:04}", method, chosen)
+            folders = [CellFolder(self._path, cell, self._log) for cell in cells]
+            running = _Running(trial, folders, Following(folders[0].path, EPISODES), told)
+            if self._start(running):
+                self._running.append(running)
+        except CoopError as error:
+            self._fail(trial, str(error))
+
+    def _start(self, running: _Running) -> bool:
+        """Start the first run that has not ended; False if another process runs it, or nothing is left to do."""
+        while running.left:
+            folder = running.left[0]
+            folder.check()
+            running.following = Following(folder.path, EPISODES)
+            running.returns.clear()
+            ending = folder.ending()
+            if ending is None:
+                return self.executor.start(folder)
+            if ending.kind != "finished":
+                self._fail(running.trial, ending.why)
+                return False
+            self._finished(running)
+        self._tell(running.trial, sum(running.scores) / len(running.scores))
+        return False
+
+    def _finished(self, running: _Running) -> None:
+        running.scores.append(float(read_summary(running.left.pop(0).path)["return_mean_100"]))
+
+    def _look(self, running: _Running) -> None:
+        """Tell the pruner what is new, and see whether the run has ended."""
+        folder = running.left[0]
+        ending = self.executor.ending(folder)
+        try:
+            if not running.pruned and self._report(running, folder):
+                running.pruned = True
+                self.executor.interrupt(folder)
+            if ending is None:
+                return
+            if running.pruned:
+                self._tell(running.trial, state=self._states.PRUNED)
+            elif ending.kind == "finished":
+                self._finished(running)
+                if self._start(running):
+                    return
+            else:
+                self._fail(running.trial, ending.why)
+        except CoopError as error:
+            if ending is None:
+                self.executor.interrupt(folder)
+            self._fail(running.trial, str(error))
+        self._running.remove(running)
+
+    def _report(self, running: _Running, folder: CellFolder) -> bool:
+        """Report what has been reached at each new twentieth of the run; True if the trial is to be pruned."""
+        before, total = len(running.scores) * REPORTS, folder.cell.config.total_steps
+        for row in running.following.rows():
+            running.returns.append(row["return"])
+            step = before + min(REPORTS, row["env_step"] * REPORTS // total)
+            if step > before and step not in running.told:
+                running.told.add(step)
+                running.trial.report(sum(running.returns) / len(running.returns), step)
+                if running.trial.should_prune():
+                    return True
+        return False
+
+    def _fail(self, trial: optuna.Trial, why: str) -> None:
+        trial.set_user_attr("why", why)
+        self._tell(trial, state=self._states.FAIL)
+
+    def _tell(
+        self, trial: optuna.Trial, value: float | None = None, state: optuna.trial.TrialState | None = None
+    ) -> None:
+        """Tell Optuna how a trial has ended; a sampler of a finite grid then says by `Study.stop` that it is over."""
+        try:
+            self._study.tell(trial, value, state)
+        except RuntimeError as error:
+            if "Study.stop" not in str(error):
+                raise
+            self._exhausted = True
