@@ -17,6 +17,7 @@ ERRORS = "Mean |TD error| and loss"
 Q_VALUES = "Mean |Q| against its bound"
 AGE = "Age of the samples, environment steps"
 TERMINAL = "Share of terminal transitions"
+FORGETTING = "Forgetting: the first 64 transitions drawn"
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Metric:
     line, words: the label of a line of screen and page, and what it says there of the value, after "; " or, if it
         begins with a space or a comma, right behind the one before.
     chart, curve, bound: title of a chart on the page, name of the line in it, and whether it bounds another.
+    listed: it is a list of numbers; only the page shows one that is in the status.
     """
 
     name: str
@@ -44,11 +46,12 @@ class Metric:
     chart: str = ""
     curve: str = ""
     bound: bool = False
+    listed: bool = False
 
     @property
     def prometheus(self) -> str:
         """Its name for Prometheus; empty if it is not served."""
-        return f"coop_{self.name}{'_total' if self.counter else ''}" if self.field else ""
+        return f"coop_{self.name}{'_total' if self.counter else ''}" if self.field and not self.listed else ""
 
     @property
     def tensorboard(self) -> str:
@@ -66,9 +69,9 @@ def _row(name: str, meaning: str, unit: str = "", **shown: Any) -> Metric:  # no
     return Metric(name, meaning, unit, column=name, **{"field": f"measured.{name}", **shown})
 
 
-def _list(name: str, meaning: str, unit: str = "") -> Metric:
+def _list(name: str, meaning: str, unit: str = "", **shown: Any) -> Metric:  # noqa: ANN401 (as above)
     """A column that holds a list of numbers."""
-    return Metric(name, meaning, unit, column=name, plotted=False)
+    return Metric(name, meaning, unit, column=name, plotted=False, listed=True, **shown)
 
 
 METRICS = (
@@ -115,7 +118,8 @@ METRICS = (
         words="samples {:,.0f} steps old", chart=AGE, curve="mean"),
     _row("sample_age_p95", "95th percentile of the age of the transitions drawn", "steps", line="table",
         words=" (p95 {:,.0f})", chart=AGE, curve="p95"),
-    _list("sample_age_histogram", "transitions drawn that were 0, 1, 2 to 3, 4 to 7, ... steps old", "transitions"),
+    _list("sample_age_histogram", "transitions drawn that were 0, 1, 2 to 3, 4 to 7, ... steps old", "transitions",
+        field="measured.sample_age_histogram"),
     _row("reuse_mean", "mean number of draws of a transition drawn, so far", "draws"),
     _list("reuse_histogram", "transitions drawn for the 1st time, the 2nd or 3rd, the 4th to 7th, ...", "transitions"),
     _row("distinct_share", "share of distinct transitions in a batch"),
@@ -132,8 +136,10 @@ METRICS = (
     _row("q_gap", "mean distance between the two networks' Q-values on the archive", line="Q-values",
         words="the networks differ by {:.3g} (Q gap)",
         chart="Q gap: distance between the two networks' Q-values", curve="Q gap"),
-    _row("archive_td_error", "mean absolute TD error of the archive, as an update would find it"),
-    _row("archive_drift", "mean absolute change of Q on the archive since the last row"),
+    _row("archive_td_error", "mean absolute TD error of the archive, as an update would find it",
+        chart=FORGETTING, curve="|TD error|"),
+    _row("archive_drift", "mean absolute change of Q on the archive since the last row",
+        chart=FORGETTING, curve="drift of Q"),
     _row("policy_churn", "share of the archive's states whose greedy action has changed since the last row"),
     _row("dormant_share", "share of hidden units that are dormant"),
     _list("dormant_by_layer", "the same, by layer"),
@@ -142,6 +148,7 @@ METRICS = (
 )  # fmt: skip
 
 COLUMNS = frozenset(metric.column for metric in METRICS if metric.column)
-MEASURED = tuple(metric.name for metric in METRICS if metric.field.startswith("measured."))
+MEASURED = {metric.name: metric.listed for metric in METRICS if metric.field.startswith("measured.")}
+"""What a status carries of a row of metrics.jsonl, by name; True if it is a list."""
 TAGS = {metric.column: metric.tensorboard for metric in METRICS if metric.tensorboard}
 """Tags of TensorBoard by column of metrics.jsonl."""

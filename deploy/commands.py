@@ -30,7 +30,7 @@ MODULES = {
     "coop-report": "coop.studies.report.cli",
     "coop-router": "coop.deploy.router",
     "coop-sweep": "coop.studies.sweep.cli",
-    "coop-watch": "coop.monitor.watch",
+    "coop-watch": "coop.studies.watch.cli",
 }
 
 

@@ -22,6 +22,7 @@ from coop.common.settings.resuming import settings_digest
 from coop.common.settings.tables import to_toml
 from coop.deploy.supervisor import RestartPolicy
 from coop.monitor.watch import Display, Page, RunStatus, live_page
+from coop.records.growing import Evaluations
 from coop.records.locks import RunLock
 from coop.records.run_options import LearnerRunOptions, parse_run
 
@@ -189,7 +190,10 @@ def _supervise(
 ) -> None:
     """Run the processes to the end of the run."""
     topology.start()
-    status = RunStatus(config.run, topology.endpoint, new_incarnation(), options.zenoh_config)
+    evaluations = Evaluations(directory)
+    status = RunStatus(
+        config.run, topology.endpoint, new_incarnation(), options.zenoh_config, evaluations=evaluations.points
+    )
     title = f"{config.env.id}, {config.method}, seed {config.seed}: {shown(directory)}"
     interrupted = False
     try:

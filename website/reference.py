@@ -21,12 +21,12 @@ from coop.evaluation.cli import EvalOptions
 from coop.evaluation.export_cli import ExportOptions
 from coop.learner.cli import LearnerOptions
 from coop.lockstep.reexecute_cli import ReexecuteOptions
-from coop.monitor.watch import WatchOptions
 from coop.records.run_options import RunOptions, with_methods
 from coop.replay.cli import ReplayOptions
 from coop.replay.limits_cli import LimitsOptions
 from coop.studies.report.cli import ReportOptions
 from coop.studies.sweep.cli import SweepOptions
+from coop.studies.watch.cli import WatchOptions
 
 COMMANDS: dict[str, type[Any]] = {
     "coop-local": LocalOptions,

@@ -128,7 +128,9 @@ def averaged_over(episodes: int) -> str:
 
 
 def connected(counts: Mapping[str, int]) -> str:
-    """The number of connected processes of the other roles, in words."""
+    """The number of connected processes of the other roles, in words; empty where the run's files alone are known."""
+    if not counts:
+        return ""
     text = f"{counted(counts.get('replay', 0), 'replay service')}, {counted(counts.get('actor', 0), 'actor')}"
     return f"{text}, {counted(counts['evaluator'], 'evaluator')}" if counts.get("evaluator") else text
 

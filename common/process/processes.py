@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -136,7 +136,7 @@ class ChildProcess:
 
     def _reason(self) -> str:
         """The line in which it says why it failed, or else its last line."""
-        return next((line for line in reversed(self._lines()) if SAYS_WHY in line), self.last_line())[:LAST_WORDS]
+        return reason_in(self._lines())
 
     def _lines(self) -> list[str]:
         """What it has printed since this start."""
@@ -160,3 +160,8 @@ def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"{like.rpartition(':')[0] or 'tcp/127.0.0.1'}:{probe.getsockname()[1]}"
+
+
+def reason_in(lines: Sequence[str]) -> str:
+    """The line of a log in which a command says why it failed, or else the last one."""
+    return next((line for line in reversed(lines) if SAYS_WHY in line), lines[-1] if lines else "")[:LAST_WORDS]

@@ -13,10 +13,10 @@ SILENT_AFTER = 3.0  # seconds without a status, after which displays say so
 
 
 def values(status: LearnerStatus) -> dict[str, float]:
-    """What is known of the metrics that a status carries, by name."""
+    """What is known of the metrics that a status carries, but for lists, by name."""
     found = {}
     for metric in METRICS:
-        if metric.field:
+        if metric.field and not metric.listed:
             value: Any = status
             for name in metric.field.split("."):
                 value = getattr(value, name, None)
@@ -35,7 +35,7 @@ def facts(status: LearnerStatus) -> dict[str, str]:
         "acting": _acting(status),
         **{label: lines.pop(label) for label in ("exploration", "speed", "table")},
         "ratio": _ratio(status),
-        "waiting": "\n".join(map(_sentence, status.waits)) or "nobody",
+        **({"waiting": "\n".join(map(_sentence, status.waits)) or "nobody"} if status.connected else {}),
         **lines,
     }
     return shown | ({"warning": printable(status.warning)} if status.warning else {})
@@ -48,8 +48,8 @@ def settings(status: LearnerStatus) -> str:
 
 def times(status: LearnerStatus) -> str:
     """The time that the run has taken, and what is left of it."""
-    left = "" if status.seconds_left is None else f", about {_clock(status.seconds_left)} left"
-    return f"{_clock(status.seconds)} so far{left}"
+    left = "" if status.seconds_left is None else f", about {clock(status.seconds_left)} left"
+    return f"{clock(status.seconds)} so far{left}"
 
 
 def progress(status: LearnerStatus) -> float:
@@ -107,8 +107,11 @@ def _ratio(status: LearnerStatus) -> str:
         return "not known without the replay service"
     if ratio.measured is None:
         return f"target {ratio.target:g} updates per step; no update yet"
+    measured = f"{ratio.measured:.3f} updates per step (target {ratio.target:g})"
+    if ratio.ahead is None:
+        return measured
     ahead = f"acting {ratio.ahead:,.0f} steps ahead ({ratio.least:,.0f} to {ratio.most:,.0f})"
-    return f"{ratio.measured:.3f} updates per step (target {ratio.target:g}); {ahead}"
+    return f"{measured}; {ahead}"
 
 
 def _sentence(wait: Wait) -> str:
@@ -116,6 +119,7 @@ def _sentence(wait: Wait) -> str:
     return f"{wait.who} {verb} for {wait.for_whom} {wait.share:.0%} of the time: {printable(wait.reason)}"
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """A time as hours, minutes and seconds."""
     whole = max(0, round(seconds))
     return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"

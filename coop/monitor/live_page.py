@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -13,23 +13,22 @@ from coop.common.messaging.messages.status import LearnerStatus
 from coop.common.metrics import METRICS, SPEED
 from coop.common.numbers import strict_json
 from coop.common.process.console import connected
+from coop.monitor.curves import Point, Thinned
 from coop.monitor.display import printable
 from coop.monitor.facts import SILENT_AFTER, detail, facts, place, progress, settings, silence, times, values
 from coop.monitor.web import Document, WebServer
 
 FOLLOWS = 3.0  # seconds within which a browser that follows the run asks again
-MOST = 400  # points of the curves; with one more, every second one is dropped
+MOST = 400  # points of the curves
 CHARTED = [metric for metric in METRICS if metric.chart]
 COLUMNS = ("env_steps", *(metric.name for metric in CHARTED))
 
-Point = list[float | None]
 
-
-class LivePage:
+class ServedPage:
     """Serves the page, which asks for /page.json once a second.
 
     Args:
-        run: its name.
+        name: of what it shows.
         address: PORT or HOST:PORT, as `--web` gave it.
 
     Attributes:
@@ -39,13 +38,11 @@ class LivePage:
         UsageError: it can't listen there.
     """
 
-    def __init__(self, run: str, address: str) -> None:
-        self._run = run
+    def __init__(self, name: str, address: str) -> None:
+        self._name = name
         self._lock = threading.Lock()
-        self._curves = Curves()
-        self._status: LearnerStatus | None = None
         self._events: list[str] = []
-        self._notice, self._ended = "waiting for the learner", False
+        self._notice, self._ended = "", False
         self._asked_at = -math.inf
         self._end_was_asked_for = threading.Event()
         html = files("coop.monitor").joinpath("page.html").read_bytes()
@@ -59,42 +56,18 @@ class LivePage:
         )
         self.url = self._server.url
 
-    def show(self, status: LearnerStatus | None, events: Sequence[str], silent: float, ended: str) -> None:
-        """See `coop.monitor.watch.Page`."""
-        with self._lock:
-            if status is not None and status is not self._status:
-                self._curves.add(status)
-            self._status, self._events = status, list(events)
-            if ended:
-                self._notice, self._ended = f"the run has ended: {ended}", True
-            elif status is not None:
-                self._notice = silence(silent) if silent > SILENT_AFTER else ""
-
     def state(self) -> dict[str, Any]:
         """What /page.json holds: words as they are shown, and the numbers of the curves."""
         with self._lock:
             self._asked_at = time.monotonic()
             if self._ended:
                 self._end_was_asked_for.set()
-            status, points = self._status, list(self._curves.points)
-            shown = {"run": printable(self._run), "notice": printable(self._notice), "ended": self._ended}
-            shown |= {"events": list(map(printable, self._events))}
-        if status is None:
-            return shown
-        members = [[printable(each.name), place(each), each.state, detail(each, status)] for each in status.members]
-        return shown | {
-            "settings": settings(status),
-            "times": times(status),
-            "progress": progress(status),
-            "facts": list(facts(status).items()),
-            "connected": connected(status.connected),
-            "members": members,
-            "episodes": status.episodes,
-            "returns": status.return_history,
-            "charts": charts(),
-            "columns": COLUMNS,
-            "points": points,
-        }
+            shown = {"run": printable(self._name), "notice": printable(self._notice), "ended": self._ended}
+            return shown | {"events": list(map(printable, self._events))} | self.shown()
+
+    def shown(self) -> dict[str, Any]:
+        """What the page shows beside name, notice and events; called while nothing changes."""
+        return {}
 
     def close(self) -> None:
         """Stop serving, once a browser that follows the run has heard that it has ended."""
@@ -103,30 +76,64 @@ class LivePage:
         self._server.close()
 
 
-class Curves:
-    """Keeps at most `MOST` points; with `add` they are of every status, then of every second one, and so on.
+class LivePage(ServedPage):
+    """The page of a run; see `ServedPage`."""
 
-    points: the oldest first, each with a value for every name of `COLUMNS`; None where it is not known.
-    """
+    def __init__(self, run: str, address: str) -> None:
+        self._curves: Thinned[Point] = Thinned(MOST)
+        self._status: LearnerStatus | None = None
+        self._evaluations: Sequence[Point] = ()
+        super().__init__(run, address)
+        self._notice = "waiting for the learner"
 
-    def __init__(self) -> None:
-        self.points: list[Point] = []
-        self._every = 1
-        self._seen = 0
+    def show(
+        self,
+        status: LearnerStatus | None,
+        events: Sequence[str],
+        silent: float,
+        ended: str,
+        points: Iterable[Mapping[str, float]] | None = None,
+        evaluations: Sequence[Point] = (),
+    ) -> None:
+        """See `coop.monitor.watch.Page`."""
+        with self._lock:
+            if points is None:
+                points = [values(status)] if status is not None and status is not self._status else []
+            for known in points:
+                self._curves.add(point(known))
+            self._status, self._events, self._evaluations = status, list(events), evaluations
+            if ended:
+                self._notice, self._ended = f"the run has ended: {ended}", True
+            elif status is not None:
+                self._notice = silence(silent) if silent > SILENT_AFTER else ""
 
-    def add(self, status: LearnerStatus) -> None:
-        """Note a new status; steps that go back, after a resumption from a checkpoint, begin the curves anew."""
-        known = values(status)
-        if "ratio_measured" not in known:
-            known.pop("ratio_ahead", None)  # the band holds from the first update on
-        if self.points and status.env_steps < (self.points[-1][0] or 0):
-            self.points, self._every, self._seen = [], 1, 0
-        if self._seen % self._every == 0:
-            self.points.append([known.get(name) for name in COLUMNS])
-        self._seen += 1
-        if len(self.points) > MOST:
-            self.points = self.points[::2]
-            self._every *= 2
+    def shown(self) -> dict[str, Any]:
+        """See `ServedPage`."""
+        status = self._status
+        if status is None:
+            return {}
+        members = [[printable(each.name), place(each), each.state, detail(each, status)] for each in status.members]
+        return {
+            "settings": settings(status),
+            "times": times(status),
+            "progress": progress(status),
+            "facts": list(facts(status).items()),
+            "connected": connected(status.connected),
+            "members": members,
+            "episodes": status.episodes,
+            "returns": status.return_history,
+            "evaluations": list(self._evaluations),
+            "ages": getattr(status.measured, "sample_age_histogram", None) or [],
+            "charts": charts(),
+            "columns": COLUMNS,
+            "points": list(self._curves.points),
+        }
+
+
+def point(known: Mapping[str, float]) -> Point:
+    """A value for every name of `COLUMNS`; None where it is not known."""
+    band = () if "ratio_measured" in known else ("ratio_ahead",)  # it holds from the first update on
+    return [None if name in band else known.get(name) for name in COLUMNS]
 
 
 def charts() -> list[dict[str, Any]]:

@@ -73,7 +73,7 @@ class RunScreen:
         lines, status = [_heading("members", width)], self.status
         if status is not None:
             shown = len(status.members) if height is None else max(1, height - 2 - EVENTS_AT_LEAST)
-            lines = [_heading(f"members: {connected(status.connected)}", width), *_members(status, shown)]
+            lines = [_heading(f"members: {connected(status.connected)}".rstrip(": "), width), *_members(status, shown)]
         lines.append(_heading("events", width))
         events: Lines = []
         for event in self.events:

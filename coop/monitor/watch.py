@@ -1,33 +1,28 @@
-"""Follows the status of a run's roles, and displays it; `coop-watch` does so from any machine."""
+"""Follows the status of a run's roles, and displays it."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 import msgspec
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 
-from coop.common.errors import BadMessage, JoinError, PeerLost, UsageError
+from coop.common.errors import BadMessage
 from coop.common.messaging.joining import no_learner
 from coop.common.messaging.keys import status_key
 from coop.common.messaging.messages.status import LearnerStatus
 from coop.common.messaging.session import open_session
-from coop.common.messaging.transport import Node, new_incarnation
-from coop.common.numbers import strict_json
-from coop.common.process.cli import parse
+from coop.common.messaging.transport import Node
 from coop.common.process.console import PeerMonitor, progress_line, stamped
-from coop.common.process.flags import HttpAddress
-from coop.common.process.lifecycle import Stop, run_main
-from coop.common.process.untrusted import check_run
+from coop.common.process.lifecycle import Stop
+from coop.monitor.curves import Point
 from coop.monitor.display import LiveDisplay
 from coop.monitor.screen import RunScreen
 
-TICK = 0.1  # seconds
 PLAIN_EVERY = 5.0  # seconds between lines if the output is no terminal
 
 
@@ -37,19 +32,31 @@ class RunStatus:
     Args:
         endpoint: of the learner, or of a router connected to it.
         zenoh_config: like the run's roles.
+        evaluations: returns those of the run, which no status carries.
 
     Attributes:
         run: its name.
         learner: the learner's newest status; None before the first.
     """
 
-    def __init__(self, run: str, endpoint: str, incarnation: int, zenoh_config: Path | None = None) -> None:
+    def __init__(
+        self,
+        run: str,
+        endpoint: str,
+        incarnation: int,
+        zenoh_config: Path | None = None,
+        evaluations: Callable[[], list[Point]] = list,
+    ) -> None:
         self.run = run
         self.learner: LearnerStatus | None = None
         self._endpoint = endpoint
         self._node = Node(open_session((), (endpoint,), zenoh_config), run, "watch", incarnation)
         self._statuses = self._node.latest(status_key(self._node, "learner"))
         self._updated_at = time.monotonic()
+        self._monitor = PeerMonitor("the learner")
+        self._over = Stop()  # set at the end of the run
+        self._node.follow_stop(self._over)
+        self._evaluations = evaluations
 
     def refresh(self) -> None:
         """Read the statuses published since the last call."""
@@ -72,9 +79,22 @@ class RunStatus:
             return f"the learner of run {self.run!r} has sent no status in {waited:g} s; it may wait for other roles"
         return no_learner(self._node, (self._endpoint,), waited)
 
-    def follow_stop(self, stop: Stop) -> None:
-        """Set `stop` when the learner ends the run."""
-        self._node.follow_stop(stop)
+    def loss(self) -> str:
+        """See `Followed`."""
+        if self.learner is None or self._over.is_set():
+            return ""
+        return self._monitor.check(self.learner_is_there(), self.learner.origin)
+
+    def over(self) -> str:
+        """See `Followed`."""
+        return self._over.reason if self._over.is_set() else ""
+
+    def points(self) -> None:
+        """See `Followed`."""
+
+    def evaluations(self) -> list[Point]:
+        """See `Followed`."""
+        return self._evaluations()
 
     def line(self) -> str:
         """The status in one line."""
@@ -95,13 +115,62 @@ class RunStatus:
         self._node.close()
 
 
+class Followed(Protocol):
+    """A run that is followed, by the messages of its learner or by its files.
+
+    run: its name. learner: its newest status; None before the first.
+    """
+
+    run: str
+    learner: LearnerStatus | None
+
+    def refresh(self) -> None:
+        """Read what is new."""
+
+    def events(self) -> Sequence[tuple[int, str]]:
+        """The newest lines of its console, with increasing numbers."""
+        ...
+
+    def loss(self) -> str:
+        """The line to say now of a learner that has disappeared or is back; empty if there is none."""
+        ...
+
+    def silent_for(self) -> float:
+        """Seconds since the learner's last status, or since the start if there was none; 0 where none is due."""
+        ...
+
+    def over(self) -> str:
+        """Why the run has ended; empty while it goes on."""
+        ...
+
+    def points(self) -> list[dict[str, float]] | None:
+        """What is new of the curves: metrics by name; None for those of the status."""
+        ...
+
+    def evaluations(self) -> list[Point]:
+        """Environment steps and mean return of each evaluation."""
+        ...
+
+    def line(self) -> str:
+        """The status in one line."""
+        ...
+
+
 class Page(Protocol):
     """A web page, at `url`, that shows a run."""
 
     url: str
 
-    def show(self, status: LearnerStatus | None, events: Sequence[str], silent: float, ended: str) -> None:
-        """Show the newest status; events: newest last. silent: seconds since it. ended: why the run did; else empty."""
+    def show(
+        self,
+        status: LearnerStatus | None,
+        events: Sequence[str],
+        silent: float,
+        ended: str,
+        points: Iterable[Mapping[str, float]] | None = None,
+        evaluations: Sequence[Point] = (),
+    ) -> None:
+        """Show the newest status; events: newest last. For the others see `Followed`."""
         ...
 
 
@@ -123,14 +192,11 @@ class Display(LiveDisplay):
     page: shows it too; see `live_page`.
     """
 
-    def __init__(self, status: RunStatus, page: Page | None = None) -> None:
+    def __init__(self, status: Followed, page: Page | None = None) -> None:
         super().__init__(PLAIN_EVERY, refreshes=4, screen=True)
         self._page = page
         self._status = status
         self._shown = 0
-        self._learner = PeerMonitor("the learner")
-        self._over = Stop()  # set at the end of the run
-        status.follow_stop(self._over)
 
     def __enter__(self) -> Self:
         super().__enter__()
@@ -145,27 +211,25 @@ class Display(LiveDisplay):
     @property
     def run_is_over(self) -> bool:
         """Whether the learner has said so."""
-        return self._over.is_set()
+        return bool(self._status.over())
 
     def update(self) -> None:
         """Show the present status."""
-        self._status.refresh()
-        for number, line in self._status.events():
+        status = self._status
+        status.refresh()
+        for number, line in status.events():
             if number > self._shown:
                 self._shown = number
                 self.say(line)
-        learner = self._status.learner
-        if learner is not None and not self._over.is_set():
-            text = self._learner.check(self._status.learner_is_there(), learner.origin)
-            if text:
-                self.say(stamped(text))
+        if text := status.loss():
+            self.say(stamped(text))
         self._show_page()
         super().update()
 
     def _show_page(self) -> None:
         if self._page is not None:
-            ended = self._over.reason if self._over.is_set() else ""
-            self._page.show(self._status.learner, self.said(), self._status.silent_for(), ended)
+            now = self._status
+            self._page.show(now.learner, self.said(), now.silent_for(), now.over(), now.points(), now.evaluations())
 
     def line(self) -> str:
         """The status in one line."""
@@ -176,92 +240,6 @@ class Display(LiveDisplay):
         return RunScreen(self._status.run, self._status.learner, self.said(), self._status.silent_for())
 
 
-@dataclass(frozen=True)
-class WatchOptions:
-    """Flags of `coop-watch`."""
-
-    run: str = "coop"
-    """Name of the run."""
-    connect: str = "tcp/127.0.0.1:7447"
-    """Endpoint of the learner, for example tcp/head:7447."""
-    join_timeout: float = 30.0
-    """Seconds to search for the learner before giving up."""
-    patience: float = 60.0
-    """Seconds to wait for a lost learner before giving up."""
-    zenoh_config: Path | None = None
-    """A Zenoh configuration file (TLS, access control); the endpoint given as a flag still applies."""
-    once: bool = False
-    """Print the present status and end."""
-    web: HttpAddress = ""
-    """Show the screen as a web page too: PORT, on loopback, or HOST:PORT."""
-    json: bool = False
-    """With --once: print one JSON object instead of the screen; docs/watching.md lists its fields."""
-
-    def __post_init__(self) -> None:
-        """Raise UsageError for a name that no run has."""
-        check_run(self.run)
-
-
-def main() -> None:
-    """Entry point."""
-    run_main("coop-watch", _run)
-
-
-def _run() -> None:
-    options = parse(WatchOptions, "coop-watch", "Show the live status of a run until it ends.")
-    if options.json and not options.once:
-        raise UsageError("--json: needs --once")
-    if options.web and options.once:
-        raise UsageError("--web: shows a live run; leave out --once")
-    ctrl_c = Stop()
-    ctrl_c.on_signals()
-    status = RunStatus(options.run, options.connect, new_incarnation(), options.zenoh_config)
-    try:
-        if options.once:
-            _print_once(status, options, ctrl_c)
-        else:
-            _follow(status, options, ctrl_c)
-    finally:
-        status.close()
-
-
-def _follow(status: RunStatus, options: WatchOptions, ctrl_c: Stop) -> None:
-    """Show the status until the run ends."""
-    ended = Stop()
-    status.follow_stop(ended)
-    with live_page(options.run, options.web) as page, Display(status, page) as display:
-        while not ended.is_set() and not ctrl_c.wait(TICK):
-            display.update()
-            _check(status, options)
-        if status.learner is not None:
-            display.say(status.line())
-        if ended.is_set():
-            display.say(f"the run has ended: {ended.reason}")
-
-
-def _print_once(status: RunStatus, options: WatchOptions, ctrl_c: Stop) -> None:
-    """Wait for a status, and print it."""
-    while status.learner is None:
-        if ctrl_c.wait(TICK):
-            ctrl_c.raise_for_status()
-        status.refresh()
-        _check(status, options)
-    if options.json:
-        print(strict_json(report(status.run, status.learner)))
-    else:
-        lines = [line for _, line in status.events()]
-        Console().print(RunScreen(status.run, status.learner, lines, whole=True))
-
-
 def report(run: str, status: LearnerStatus) -> dict[str, Any]:
     """The status as plain values: `LearnerStatus`'s fields, with the run's name, and of the events the lines alone."""
     return {"run": run, **msgspec.to_builtins(status), "events": [line for _, line in status.events]}
-
-
-def _check(status: RunStatus, options: WatchOptions) -> None:
-    """Raise JoinError or PeerLost if the learner has been silent for too long."""
-    silent = status.silent_for()
-    if status.learner is None and silent > options.join_timeout:
-        raise JoinError(status.why_nothing(options.join_timeout))
-    if status.learner is not None and silent > options.patience:
-        raise PeerLost(f"the learner of run {options.run!r} has been silent for {options.patience:g} s")

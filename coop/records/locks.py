@@ -312,3 +312,22 @@ def _is_local(folder: Path) -> bool:
 def _now() -> float:
     """Seconds, those in which the machine was suspended included."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def holder(folder: Path, role: str = "learner") -> tuple[str, bool]:
+    """Who works in a run's folder, seen without touching its lock: "coop-local on head (pid 7)", and whether it does.
+
+    Empty where nobody has signed the lock, or the last one released it; False where the last one has been killed.
+    """
+    path = folder / f".{role}.lock"
+    line = _read(path)[0]
+    if not line:
+        return "", False
+    try:
+        if not _is_local(folder):
+            return line, time.time() - _touched(path) / 1e9 < LEASE
+        inode = f":{path.stat().st_ino} "
+        locks = Path("/proc/locks").read_text(encoding="utf-8").splitlines()
+        return line, any(inode in lock and " FLOCK " in lock for lock in locks)
+    except OSError:
+        return line, True  # as it says

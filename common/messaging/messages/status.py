@@ -22,6 +22,7 @@ from coop.common.metrics import MEASURED
 KIND = "status"
 MAX_MEMBERS = 256  # listed in one status
 
+Counts = Annotated[list[Counter], Meta(max_length=64)]
 Returns = Annotated[list[Real], Meta(max_length=MAX_POINTS)]
 RoleName = Annotated[str, Meta(pattern=f"^({'|'.join(ROLES)})$")]
 State = Annotated[str, Meta(pattern="^(training|serving|playing|waiting|lost)$")]
@@ -70,14 +71,15 @@ class Ratio(msgspec.Struct, frozen=True):
     """The replay ratio, in updates per environment step.
 
     target: as set. measured: since the first update was due; null before. ahead: environment steps by which acting is
-    ahead of learning, negative if it is behind. least, most: the band in which the limiter keeps `ahead`.
+    ahead of learning, negative if it is behind. least, most: the band in which the limiter keeps `ahead`; null, like
+    it, if the run's files alone are known.
     """
 
     target: Real
     measured: Real | None
-    ahead: Real
-    least: Real
-    most: Real
+    ahead: Real | None = None
+    least: Real | None = None
+    most: Real | None = None
 
 
 class ReplayStatus(Status, frozen=True):
@@ -122,11 +124,15 @@ if TYPE_CHECKING:
     class Measured(msgspec.Struct, frozen=True):
         """Columns of the newest row of metrics.jsonl, those of `coop.common.metrics.MEASURED`; null if not known."""
 
-        def __init__(self, **columns: float | None) -> None: ...
+        def __init__(self, **columns: float | list[int] | None) -> None: ...
 
 else:
     Measured = msgspec.defstruct(
-        "Measured", [(name, Real | None, None) for name in MEASURED], frozen=True, kw_only=True, module=__name__
+        "Measured",
+        [(name, Counts | None if listed else Real | None, None) for name, listed in MEASURED.items()],
+        frozen=True,
+        kw_only=True,
+        module=__name__,
     )
 
 

@@ -1,0 +1,99 @@
+"""Reads records that others are writing: whole lines only, each once.
+
+A line that can't be read is left out: this is for displays, and who resumes or reports the run names it.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from coop.records.checkpoints import EVALUATIONS
+
+MOST = 1 << 24  # bytes of one reading
+TAIL = 1 << 16  # bytes, more than any row of metrics.jsonl
+
+
+class GrowingFile:
+    """The lines of a file that grows, as far as they are whole.
+
+    restarted: at the last reading the file was shorter than before, or another one: what had been read is no longer
+        true, as after a resumption from a checkpoint, and it was read anew.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.restarted = False
+        self._read = 0
+        self._inode = 0
+
+    def lines(self) -> list[str]:
+        """The whole lines since the last call; none while the file is not there or can't be read."""
+        self.restarted = False
+        try:
+            with self.path.open("rb") as file:
+                found = os.fstat(file.fileno())
+                if self._read and (found.st_ino != self._inode or found.st_size < self._read):
+                    self._read, self.restarted = 0, True
+                self._inode = found.st_ino
+                lines: list[str] = []
+                file.seek(self._read)
+                while whole := file.read(MOST).rpartition(b"\n")[0]:
+                    self._read += len(whole) + 1
+                    lines += whole.decode(errors="replace").split("\n")
+                    file.seek(self._read)
+                return lines
+        except OSError:
+            return []
+
+
+class GrowingTable(GrowingFile):
+    """The rows of a CSV file that grows."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._columns: list[str] = []
+
+    def rows(self) -> Iterator[dict[str, str]]:
+        """Yield the rows since the last call, by the names of their columns."""
+        lines = self.lines()
+        if self.restarted:
+            self._columns = []
+        for values in csv.reader(lines):
+            if not self._columns:
+                self._columns = values
+            elif len(values) == len(self._columns):
+                yield dict(zip(self._columns, values, strict=True))
+
+
+class Evaluations:
+    """The evaluations of a run, as they are recorded."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = GrowingTable(folder / EVALUATIONS)
+        self._points: list[list[float | None]] = []
+
+    def points(self) -> list[list[float | None]]:
+        """Environment steps and mean return of each, so far."""
+        rows = list(self._file.rows())
+        if self._file.restarted:
+            self._points = []
+        for row in rows:
+            with suppress(KeyError, ValueError):
+                self._points.append([float(row["env_step"]), float(row["return_mean"])])
+        return self._points
+
+
+def tail(path: Path, most: int = TAIL) -> str:
+    """The end of a file, from the begin of a line; empty if there is none or it can't be read."""
+    try:
+        with path.open("rb") as file:
+            start = max(0, os.fstat(file.fileno()).st_size - most)
+            file.seek(start)
+            text = file.read().decode(errors="replace")
+    except OSError:
+        return ""
+    return text.partition("\n")[2] if start else text

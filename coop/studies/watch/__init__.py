@@ -1,0 +1,1 @@
+"""Watching runs and sweeps, by their messages or by the files in their folders."""

@@ -1,0 +1,175 @@
+"""`coop-watch DIR`: runs and sweeps by their folders, while they grow and when they have ended."""
+
+import json
+import re
+import signal
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from commands import run_command
+
+from coop.common.process.processes import command
+from coop.lockstep.lockstep import Lockstep
+from coop.monitor.live_page import LivePage
+from coop.records.growing import GrowingTable
+from coop.records.run_directory import RunDirectory
+from coop.records.run_options import base_config
+from coop.studies.watch.run import RunFolder
+from coop.studies.watch.screen import SweepPage
+from coop.studies.watch.sweep import SweepFolder
+
+GRID = """
+title = "Two methods"
+methods = ["coop", "dqn"]
+preset = "cartpole"
+[fixed]
+total_steps = 600
+replay.learning_starts = 100
+"""
+
+
+def wait_until(reached: Callable[[], bool], seconds: float = 100) -> None:
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+
+
+def test_rows_are_read_once_when_they_are_whole_and_anew_after_a_resumption(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    table = GrowingTable(path)
+    assert list(table.rows()) == [], "there is no file yet"
+    path.write_text("a,b\n1,2\n3,")
+    assert list(table.rows()) == [{"a": "1", "b": "2"}]
+    path.write_text("a,b\n1,2\n3,4\n5\n")
+    assert list(table.rows()) == [{"a": "3", "b": "4"}], "the half line, once whole; not the torn one"
+    assert not table.restarted
+    path.write_text("a,b\n9,9\n")
+    assert list(table.rows()) == [{"a": "9", "b": "9"}]
+    assert table.restarted
+
+
+def test_a_run_by_its_files_while_they_grow(tmp_path: Path) -> None:
+    run = Lockstep(base_config(["--method", "coop", "--replay.learning-starts", "50"]))
+    with RunDirectory(tmp_path / "r", run.config) as directory:
+        watched, rows = RunFolder(tmp_path / "r"), 0
+        watched.refresh()
+        assert watched.learner is not None
+        assert (watched.learner.env_steps, watched.learner.episodes, watched.points()) == (0, 0, [])
+        episodes = returns = 0.0
+        while rows < 2:
+            for effects in run.play():
+                directory.record(effects.episodes, effects.metrics)
+                rows += bool(effects.metrics)
+                episodes += len(effects.episodes)
+                returns += sum(row.record.end.episode_return for row in effects.episodes)
+        with (tmp_path / "r" / "metrics.jsonl").open("a") as file:
+            file.write('{"time": 1, "upd')  # as a reader may find a row that is being written
+        (tmp_path / "r" / "evaluations.csv").write_text(
+            "env_step,update,network,episodes,return_mean,return_sd,epsilon,seconds\n200,150,1,4,12.5,1,0,1\n"
+        )
+        watched.refresh()
+        first, second = watched.points()
+        before, row = map(json.loads, (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()[:2])
+    run.env.close()
+    status = watched.learner
+    assert (status.updates, status.episodes) == (row["update"], episodes)
+    assert status.return_mean_100 == pytest.approx(returns / episodes), "fewer than 100"
+    assert (first["env_steps"], second["env_steps"]) == (before["env_step"], row["env_step"])
+    assert second["archive_drift"] == row["archive_drift"]
+    assert status.measured is not None
+    assert status.measured.sample_age_histogram == row["sample_age_histogram"]
+    assert watched.evaluations() == [[200.0, 12.5]]
+    assert watched.over() == "no process works in its folder"
+    with closing(LivePage("r", "0")) as page:
+        page.show(status, [], 0.0, "", [first, second], watched.evaluations())
+        with urllib.request.urlopen(f"{page.url}page.json", timeout=20) as answer:
+            told = json.load(answer)
+    assert [point[0] for point in told["points"]] == [before["env_step"], row["env_step"]]
+    assert told["evaluations"] == [[200.0, 12.5]]
+    assert told["ages"] == row["sample_age_histogram"]
+    assert {"Forgetting: the first 64 transitions drawn", "Share of terminal transitions"} <= {
+        chart["title"] for chart in told["charts"]
+    }
+
+
+@pytest.mark.timeout(400)  # on a busy machine
+def test_a_run_of_a_process_that_is_killed(tmp_path: Path) -> None:
+    flags = ["--preset", "cartpole", "--total-steps", "1000000", "--run-dir", str(tmp_path / "r")]
+    with subprocess.Popen(command("coop-lockstep", *flags), stdout=subprocess.DEVNULL) as process:
+        try:
+            wait_until((tmp_path / "r" / "metrics.jsonl").exists)
+            watched = RunFolder(tmp_path / "r")
+            wait_until(lambda: (watched.refresh() or watched.learner) is not None and watched.learner.updates > 0)
+            assert watched.over() == ""
+            (member,) = watched.learner.members
+            assert (member.name, member.pid, member.state) == ("coop-lockstep", process.pid, "training")
+            assert watched.learner.seconds_left
+        finally:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    watched.refresh()
+    assert watched.over() == "no process works in its folder"
+    assert [member.state for member in watched.learner.members] == ["lost"]
+    done = run_command("coop-watch", tmp_path / "r", cwd=tmp_path)
+    assert done.returncode == 0, "a run that nobody goes on with is not followed"
+    assert done.stdout.endswith("the run has ended: no process works in its folder\n")
+
+
+@pytest.mark.timeout(600)  # on a busy machine
+def test_a_sweep_by_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "grid.toml").write_text(GRID)
+    folder = tmp_path / "sweep"
+    run_command("coop-sweep", "grid.toml", "--dir", folder, "--cell", "0", cwd=tmp_path, check=True, timeout=300)
+    sweep = SweepFolder(folder)
+    sweep.refresh()
+    assert sweep.counts() == {"finished": 1, "waiting": 1}
+    assert (sweep.steps(), sweep.over) == ((600, 1200), False)
+    (folder / "dqn-seed=0").mkdir()
+    (folder / "dqn-seed=0" / "run-id").write_text("none\n")  # its run can't start
+    failed = run_command("coop-sweep", "grid.toml", "--dir", folder, cwd=tmp_path, timeout=300)
+    assert failed.returncode == 1
+    sweep.refresh()
+    assert sweep.counts() == {"finished": 1, "failed": 1}
+    assert sweep.over
+    (failure,) = sweep.failures()
+    assert "run-id" in failure.why
+    done = run_command("coop-watch", folder, cwd=tmp_path, check=True)
+    flat = re.sub(r"\s+", " ", done.stdout)
+    assert "2 cells: 1 finished, 1 failed; 1,200 of 1,200 steps (100%); nothing is left to do" in flat
+    assert "dqn-seed=0: failed: " in flat
+    told = json.loads(run_command("coop-watch", folder, "--once", "--json", check=True).stdout)
+    assert [(cell["name"], cell["state"]) for cell in told["cells"]] == [
+        ("coop-seed=0", "finished"), ("dqn-seed=0", "failed"),
+    ]  # fmt: skip
+    with closing(SweepPage(sweep, "0")) as page, urllib.request.urlopen(f"{page.url}page.json", timeout=20) as answer:
+        shown = json.load(answer)
+    (panel,) = shown["panels"]
+    assert panel["title"] == "coop"
+    (name, _, points) = panel["lines"][0]
+    episodes = (folder / "coop-seed=0" / "episodes.csv").read_text().splitlines()
+    assert (name, points[-1][0]) == ("seed 0", float(episodes[len(points)].split(",")[1]))
+    assert shown["events"][0].startswith("dqn-seed=0: failed: ")
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["empty"], "neither a run, with its config.toml, nor a sweep, with its sweep.toml"),
+        (["nowhere"], "no such folder"),
+        (["file"], "no folder"),
+        (["empty", "--connect", "tcp/127.0.0.1:1"], "--connect: for a run that is found by its learner"),
+    ],
+)
+def test_what_is_no_folder_of_a_run(flags: list[str], words: str, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").touch()
+    done = run_command("coop-watch", *flags, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
