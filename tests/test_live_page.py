@@ -20,8 +20,9 @@ from test_screen import EVENTS, STATUS
 from coop.common.errors import UsageError
 from coop.common.messaging.messages.status import Member, Ratio
 from coop.common.process.ports import http_address
+from coop.monitor.curves import Thinned
 from coop.monitor.facts import facts
-from coop.monitor.live_page import COLUMNS, MOST, Curves, LivePage
+from coop.monitor.live_page import COLUMNS, LivePage
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 STRANGER = Member("<b>actor</b>", "actor", "\x1b[2J", 1, "waiting", 0.0, "<script>document.title = 'x'</script>")
@@ -131,14 +132,12 @@ def test_the_end_of_the_run_reaches_a_browser_that_follows_it() -> None:
 
 
 def test_curves_keep_evenly_spaced_points() -> None:
-    curves = Curves()
+    curves: Thinned[list[float | None]] = Thinned(400)
     for step in range(1000):
-        curves.add(replace(STATUS, env_steps=step))
-    steps = [point[0] for point in curves.points]
-    assert steps == list(range(0, 1000, 4))
-    assert len(steps) <= MOST
-    curves.add(replace(STATUS, env_steps=500))
-    assert [point[0] for point in curves.points] == [500], "the run was resumed from a checkpoint"
+        curves.add([step, None])
+    assert curves.points == [[step, None] for step in range(0, 1000, 4)]
+    curves.add([500, 1.0])
+    assert curves.points == [[500, 1.0]], "the run was resumed from a checkpoint"
 
 
 def test_only_the_page_is_served_and_it_loads_nothing(page: LivePage) -> None:
