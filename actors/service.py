@@ -26,7 +26,7 @@ SPEED_OVER = 2.0  # seconds
 
 
 @dataclass(frozen=True)
-class _Group:
+class _Emulators:
     """Emulators that step together."""
 
     player: Player
@@ -56,7 +56,7 @@ class ActorService:
         self._stop = stop
         settings = config.actor
         self._weights = WeightsFollower(node, policy)
-        self._groups: list[_Group] = []
+        self._groups: list[_Emulators] = []
         emulators = 0
         for env in envs:
             segments = SegmentAssembler(
@@ -68,7 +68,7 @@ class ActorService:
                 gamma=config.learner.gamma,
                 first_stream=emulators,
             )
-            self._groups.append(_Group(Player(env, policy, partial(schedules.epsilon, settings)), segments))
+            self._groups.append(_Emulators(Player(env, policy, partial(schedules.epsilon, settings)), segments))
             emulators += env.num_envs
         self._inserts = InsertClient(route, stop, settings.max_in_flight * emulators, self._publish_status)
         self._status_due = 0.0
@@ -92,10 +92,10 @@ class ActorService:
         for group in self._groups:
             group.player.recv()
 
-    def _act(self, group: _Group) -> None:
+    def _act(self, group: _Emulators) -> None:
         group.player.send(self._inserts.inserted, self._weights.version)
 
-    def _play(self, group: _Group) -> None:
+    def _play(self, group: _Emulators) -> None:
         """Play one step of a group; its emulators work while the step before is sent, and while other groups act."""
         turn = group.player.recv()
         self._act(group)

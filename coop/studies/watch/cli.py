@@ -26,7 +26,7 @@ from coop.common.settings.tables import CONFIG
 from coop.monitor.screen import RunScreen
 from coop.monitor.watch import Display, Followed, RunStatus, live_page, report
 from coop.studies.watch.run import RunFolder
-from coop.studies.watch.screen import SweepDisplay, SweepPage, sweep_screen
+from coop.studies.watch.screen import SweepPage, WatchedSweep, sweep_screen
 from coop.studies.watch.sweep import SweepFolder
 
 TICK = 0.1  # seconds
@@ -108,7 +108,7 @@ def _watch_folder(folder: Path, options: WatchOptions, ctrl_c: Stop) -> None:
     if options.once:
         print(strict_json(sweep.report()), file=out()) if options.json else Console().print(sweep_screen(sweep))
         return
-    with _sweep_page(sweep, options.web) as page, SweepDisplay(sweep, page) as display:
+    with _sweep_page(sweep, options.web) as page, WatchedSweep(sweep, page) as display:
         if page is not None:
             display.say(f"this screen is also at {page.url}")
         while (page is not None or not sweep.over) and not ctrl_c.wait(TICK_OF_FILES):

@@ -29,7 +29,7 @@ _HOLDER = re.compile(r"(\S+) on (\S+) \(pid (\d+)\)")
 _PROGRESS = re.compile(r"(\S+ )?step [\d,]+/")  # of which the figures say the newest
 
 
-class Episodes:
+class EpisodeFacts:
     """The episodes of a run, as its episodes.csv grows.
 
     count: those that have ended. newest: the values of the last one by column, as text; empty before the first.
@@ -76,7 +76,7 @@ class RunFolder:
         self.run, self.path = path.resolve().name, path
         self.learner: LearnerStatus | None = None
         self._config = read_run_config(path)
-        self._episodes = Episodes(path, MAX_POINTS)
+        self._episodes = EpisodeFacts(path, MAX_POINTS)
         self._metrics = GrowingFile(path / RECORDS[1])
         self._evaluations = Evaluations(path)
         self._log = next((GrowingFile(path / name) for name in LOGS if (path / name).exists()), None)

@@ -34,7 +34,7 @@ def time_line(sweep: SweepFolder) -> str:
     return f"{sweep.speed():,.0f} steps/s, about {clock(left)} left"
 
 
-class SweepDisplay(LiveDisplay):
+class WatchedSweep(LiveDisplay):
     """A sweep on a terminal, and on a page if there is one."""
 
     def __init__(self, sweep: SweepFolder, page: SweepPage | None = None) -> None:

@@ -20,7 +20,7 @@ from coop.records.reading import parse_row, read_run_config
 from coop.records.summaries import SUMMARY, read_summary
 from coop.studies.report.sources import run_names
 from coop.studies.sweep.grid import Choice, Grid, parse_grid
-from coop.studies.watch.run import Episodes
+from coop.studies.watch.run import EpisodeFacts
 
 State = Literal["waiting", "running", "stopped", "finished", "diverged", "failed"]
 OVER: tuple[State, ...] = ("finished", "diverged", "failed")
@@ -52,7 +52,7 @@ class CellFiles:
     def __init__(self, path: Path, group: str, seed: str, total: int | None) -> None:
         self.path, self.group, self.seed = path, group, seed
         self.total = total
-        self.episodes = Episodes(path, CURVE)
+        self.episodes = EpisodeFacts(path, CURVE)
         self._configured = False
         self._ended_at = 0.0
         self.now = Shown(path.name, group, seed, "waiting", 0, total, 0.0, 0.0, "")
