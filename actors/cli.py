@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from coop.common.errors import UsageError
 from coop.common.imports import importing
 from coop.common.process import cli
 from coop.common.process.lifecycle import run_main
@@ -32,6 +33,8 @@ def main() -> None:
 
 def _run() -> None:
     options = cli.parse(ActorOptions, "coop-actor", "Play emulators for a run; its learner sends the config.")
+    if options.groups is not None and options.groups < 1:
+        raise UsageError(f"--groups: {options.groups} is not allowed; at least 1")
     with importing():
         from coop.actors.process import play  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
 

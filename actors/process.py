@@ -75,7 +75,7 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, reply: J
     env_seed, policy_seed = seed.spawn(2)
     policy = make_policy(reply, options.allow_import, np.random.default_rng(policy_seed), options.device)
     emulators = options.envs or config.actor.num_envs
-    groups = min(options.groups or (1 if options.device == "cpu" else 2), emulators)
+    groups = max(1, min(options.groups or (1 if options.device == "cpu" else 2), emulators))
     sizes = [(emulators + group) // groups for group in range(groups)]
     envs = [
         make_vector_env(config.env, size, int(number))

@@ -189,11 +189,22 @@ def test_an_actors_emulators_act_in_groups(tmp_path: Path, endpoint: str) -> Non
     assert reexecute(path).missing_segments == 0
 
 
-def test_an_actor_whose_device_is_missing_says_so_at_once() -> None:
-    done = run("coop-actor", "--device", "nowhere")
+@pytest.mark.parametrize(
+    ("flag", "value", "words"), [("--device", "nowhere", " nowhere: "), ("--groups", "0", ": 0 is")]
+)
+def test_an_actor_refuses_what_it_can_t_have_at_once(flag: str, value: str, words: str) -> None:
+    done = run("coop-actor", flag, value)
     assert done.returncode == 2
-    assert done.stderr.startswith("coop-actor: error: --device nowhere: ")
+    assert done.stderr.startswith(f"coop-actor: error: {flag}{words}")
     assert done.stderr.count("\n") == 1
+
+
+def test_an_actor_without_emulators_is_refused(tmp_path: Path, endpoint: str) -> None:
+    local = ("--actors", "0", "--listen", endpoint, "--total-steps", "600", "--run-dir", str(tmp_path / "run"))
+    with running("coop-local", *local):
+        done = run("coop-actor", "--connect", endpoint, "--envs", "-3")
+    assert done.returncode == 2
+    assert done.stderr == "coop-actor: error: envs: -3 is not allowed; at least 1\n"
 
 
 def test_three_shells_a_late_actor_and_a_kill(tmp_path: Path) -> None:

@@ -51,6 +51,17 @@ def change(agent: Agent, number: int, version: int) -> None:
     agent.versions[number] = agent.updates = version
 
 
+def followed(nodes: tuple[Node, Node], spec: EnvSpec) -> tuple[Agent, Broadcaster, EpsilonGreedy, WeightsFollower]:
+    """An agent with its broadcasts, and a policy that has followed them so far."""
+    learner, actor = nodes
+    agent = Agent(CONFIG, spec)
+    broadcaster = Broadcaster(learner, agent)
+    policy = own_policy(spec)
+    follower = WeightsFollower(actor, policy)
+    refresh_until(follower, 0)
+    return agent, broadcaster, policy, follower
+
+
 def test_an_actor_follows_weights_and_role_through_swaps(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
     learner, actor = nodes
     agent = Agent(CONFIG, spec)
@@ -75,12 +86,8 @@ def test_an_actor_follows_weights_and_role_through_swaps(nodes: tuple[Node, Node
 
 
 def test_a_broadcast_that_was_lost_is_asked_for(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
-    learner, actor = nodes
-    agent = Agent(CONFIG, spec)
-    broadcaster = Broadcaster(learner, agent)
-    policy = own_policy(spec)
-    follower = WeightsFollower(actor, policy)
-    refresh_until(follower, 0)
+    learner, _ = nodes
+    agent, broadcaster, policy, follower = followed(nodes, spec)
     change(agent, 0, 5)
     publish, learner.publish = learner.publish, lambda key, payload: None  # type: ignore[method-assign]
     broadcaster.publish(wait=True)
@@ -94,12 +101,8 @@ def test_a_broadcast_that_was_lost_is_asked_for(nodes: tuple[Node, Node], spec: 
 
 def test_broadcasts_that_take_long_hold_up_no_update(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
     """What changes meanwhile follows in one broadcast, and no role names weights that have not been sent."""
-    learner, actor = nodes
-    agent = Agent(CONFIG, spec)
-    broadcaster = Broadcaster(learner, agent)
-    policy = own_policy(spec)
-    follower = WeightsFollower(actor, policy)
-    refresh_until(follower, 0)
+    learner, _ = nodes
+    agent, broadcaster, policy, follower = followed(nodes, spec)
     publish, gate, sent = learner.publish, threading.Event(), []
 
     def slow(key: str, payload: bytearray) -> None:
