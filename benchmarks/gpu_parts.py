@@ -6,17 +6,15 @@ Each imports what it measures only when it runs, in a process of its own.
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import re
-import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import gpu_rivals
+import gpu_whole
+from gpu_figures import figure, kept, per_second
 
 BENCHMARKS = Path(__file__).parent
 
@@ -31,12 +29,8 @@ def main() -> None:
     parser.add_argument("--case", nargs=2, metavar=("METHOD", "BATCH"), help="of the part updates")
     options = parser.parse_args()
     sys.path[:0] = [str(BENCHMARKS.parent), str(BENCHMARKS / "bench/subjects")]
-    globals()[f"part_{options.part}"](options)
-
-
-def figure(**row: Any) -> None:
-    """A figure of a part."""
-    print(json.dumps(row), flush=True)
+    parts = {**globals(), **vars(gpu_rivals), **vars(gpu_whole)}
+    parts[f"part_{options.part}"](options)
 
 
 def part_facts(options: argparse.Namespace) -> None:
@@ -116,25 +110,6 @@ def _config(method: str, batch: int, device: str, dtype: str = "float32", **lear
     return replace(config, learner=replace(config.learner, double=True, **learner))
 
 
-def _rate(update: Callable[[], object], seconds: float, device: str, each: int = 1) -> float:
-    import torch
-
-    def wait() -> None:
-        if device != "cpu":
-            torch.cuda.synchronize()
-
-    for _ in range(3):
-        update()
-    wait()
-    count, began = 0, time.perf_counter()
-    while time.perf_counter() - began < seconds or not count:
-        for _ in range(20 if device != "cpu" else 1):
-            update()
-            count += each
-        wait()
-    return round(count / (time.perf_counter() - began), 1)
-
-
 def drawn_updates(agent: Any, spec: Any, count: int, recorded: bool, branches: bool = True) -> Callable[[], object]:
     """Updates with batches drawn on the device: `count` of them with each call."""
     import torch
@@ -184,33 +159,21 @@ def part_updates(options: argparse.Namespace) -> None:
     for dtype, tf32 in (("float32", True), *([("bfloat16", True), ("float32", False)] if main else [])):
         precision = dtype if not tf32 or dtype != "float32" else "TF32"
         row = {"what": "updates/s", "method": method, "batch": batch, "precision": precision}
-        with _kept(row):
+        with kept(row):
             agent = Agent(_config(method, batch, device, dtype, tf32=tf32), ATARI)
             drawn = drawn_updates(agent, ATARI, many, True)
-            figure(**row, way=f"drawn on the device, {many} a replay", value=_rate(drawn, seconds, device, many))
+            figure(**row, way=f"drawn on the device, {many} a replay", value=per_second(drawn, seconds, device, many))
             if precision != "TF32":
                 continue
             if main:
                 drawn = drawn_updates(agent, ATARI, many, True, branches=False)
                 way = f"drawn on the device, {many} a replay, no branches"
-                figure(**row, way=way, value=_rate(drawn, seconds / 2, device, many))
-            value = _rate(lambda: agent.update(given), seconds, device)
+                figure(**row, way=way, value=per_second(drawn, seconds / 2, device, many))
+            value = per_second(lambda: agent.update(given), seconds, device)
             figure(**row, way="batches of the host", value=value, eager=agent.eager)
             if method == "coop":
                 drawn = drawn_updates(agent, ATARI, 1, False)
-                figure(**row, way="eager, drawn on the device", value=_rate(drawn, seconds / 2, device))
-
-
-@contextmanager
-def _kept(row: dict[str, Any]) -> Iterator[None]:
-    """Let what fails cost no more than itself."""
-    try:
-        yield
-    except Exception as error:
-        figure(**row, failed=f"{type(error).__name__}: {error}"[:300])
-        import traceback
-
-        traceback.print_exc()
+                figure(**row, way="eager, drawn on the device", value=per_second(drawn, seconds / 2, device))
 
 
 def part_profile(options: argparse.Namespace) -> None:
@@ -224,7 +187,7 @@ def part_profile(options: argparse.Namespace) -> None:
     activities = [ProfilerActivity.CUDA if options.device != "cpu" else ProfilerActivity.CPU]
     lines: list[str] = []
     for method, batch in (("coop", 4),) if options.quick else (("dqn", 32), ("coop", 32), ("dqn", 512), ("coop", 512)):
-        with _kept({"what": "profile", "method": method, "batch": batch}):
+        with kept({"what": "profile", "method": method, "batch": batch}):
             agent = Agent(_config(method, batch, options.device), ATARI)
             update = drawn_updates(agent, ATARI, 2, True)
             for _ in range(3):
@@ -298,196 +261,11 @@ def part_pieces(options: argparse.Namespace) -> None:
                     head, i, d, out
                 )
             for name, piece in pieces.items():
-                with _kept({"what": "microseconds", "piece": name, "batch": batch}):
+                with kept({"what": "microseconds", "piece": name, "batch": batch}):
                     many = lambda piece=piece: [piece() for _ in range(count)]  # noqa: E731
                     repeat = cuda_graph(many, agent.device) if on_gpu else many
-                    value = round(1e6 / _rate(repeat, 0.05 if options.quick else 0.15, options.device, count), 1)
+                    value = round(1e6 / per_second(repeat, 0.05 if options.quick else 0.15, options.device, count), 1)
                     figure(what="microseconds", piece=name, batch=batch, value=value)
-
-
-def part_jax(options: argparse.Namespace) -> None:
-    """Updates/s of a jitted DQN in JAX: flax, optax, a scan over updates, batches drawn on the device."""
-    import flax.linen as nn
-    import jax
-    import jax.numpy as jnp
-    import optax
-
-    class Nature(nn.Module):
-        @nn.compact
-        def __call__(self, x):
-            x = x.astype(jnp.float32) / 255
-            for features, kernel, stride in ((32, 8, 4), (64, 4, 2), (64, 3, 1)):
-                x = nn.relu(nn.Conv(features, (kernel, kernel), (stride, stride), padding="VALID")(x))
-            return nn.Dense(6)(nn.relu(nn.Dense(512)(x.reshape(x.shape[0], -1))))
-
-    network, optimizer = Nature(), optax.adam(1e-4, eps=1.5e-4)
-    keys = jax.random.split(jax.random.PRNGKey(0), 3)
-    frames = jax.random.randint(keys[0], (10_000, 84, 84), 0, 256).astype(jnp.uint8)
-    blank = jnp.zeros((1, 84, 84, 4))
-    online, target = network.init(keys[1], blank), network.init(keys[2], blank)
-    for batch in (4,) if options.quick else (32, 512):
-
-        def update(state, key, batch=batch):
-            parameters, moments = state
-            drawn, acted, paid = jax.random.split(key, 3)
-            index = jax.random.randint(drawn, (batch, 1), 0, 9_990) + jnp.arange(4)
-            obs, next_obs = (frames[index + i].transpose(0, 2, 3, 1) for i in (0, 1))
-            actions, rewards = jax.random.randint(acted, (batch, 1), 0, 6), jax.random.normal(paid, (batch,))
-            best = network.apply(parameters, next_obs).argmax(1)[:, None]
-            goal = rewards + 0.99 * jnp.take_along_axis(network.apply(target, next_obs), best, 1)[:, 0]
-
-            def loss(parameters):
-                values = jnp.take_along_axis(network.apply(parameters, obs), actions, 1)[:, 0]
-                return optax.huber_loss(values, goal).mean()
-
-            updates, moments = optimizer.update(jax.grad(loss)(parameters), moments, parameters)
-            return (optax.apply_updates(parameters, updates), moments), 0.0
-
-        count = 2 if options.quick else 200
-        many = jax.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, count))[0])
-        state = jax.block_until_ready(many((online, optimizer.init(online)), keys[0]))
-        done, began = 0, time.perf_counter()
-        while time.perf_counter() - began < (0.1 if options.quick else 1.5):
-            state = jax.block_until_ready(many(state, keys[done % 3]))
-            done += 1
-        taken = time.perf_counter() - began
-        row = {"what": "updates/s", "method": "JAX dqn", "batch": batch, "device": str(jax.devices()[0])}
-        figure(**row, way="drawn on the device, a scan", value=round(done * count / taken, 1))
-
-
-def part_sb3(options: argparse.Namespace) -> None:
-    """Updates/s of Stable-Baselines3's DQN, from its own buffer."""
-    import gymnasium
-    import numpy as np
-    from stable_baselines3 import DQN
-    from stable_baselines3.common.logger import Logger
-
-    class Spaces(gymnasium.Env):
-        observation_space = gymnasium.spaces.Box(0, 255, (4, 84, 84), np.uint8)
-        action_space = gymnasium.spaces.Discrete(6)
-
-    for batch in (4,) if options.quick else (32, 512):
-        model = DQN("CnnPolicy", Spaces(), buffer_size=1024, batch_size=batch, device=options.device, seed=0)
-        model.set_logger(Logger(None, []))
-        rng = np.random.default_rng(0)
-        for _ in range(1024):
-            obs, next_obs = rng.integers(0, 256, (2, 1, 4, 84, 84)).astype(np.uint8)
-            model.replay_buffer.add(obs, next_obs, np.array([rng.integers(6)]), np.zeros(1), np.zeros(1), [{}])
-        update = lambda: model.train(gradient_steps=1, batch_size=batch)  # noqa: E731
-        row = {"what": "updates/s", "method": "Stable-Baselines3", "batch": batch}
-        figure(**row, way="batches of the host", value=_rate(update, 0.1 if options.quick else 2, options.device))
-
-
-def part_acting(options: argparse.Namespace) -> None:
-    """Decisions/s of the nature network for 64 emulators; steps/s of two groups of them, with it and without."""
-    import numpy as np
-    from work import ATARI
-
-    from coop.actors.player import Player
-    from coop.actors.policy import EpsilonGreedy
-    from coop.common.envs.make import make_vector_env
-    from coop.common.networks.acting import acting_network
-    from coop.common.settings.config import NetworkSettings
-    from coop.common.settings.tables import load_tables, resolve
-
-    game, nature = resolve(load_tables("breakout", None) | {"methods": {}}, "dqn").env, NetworkSettings("nature")
-    network = acting_network(nature, ATARI, options.device)
-    obs = np.random.default_rng(0).integers(0, 256, (64, 4, 84, 84)).astype(np.uint8)
-    rate = _rate(lambda: network.q_values(obs, ATARI).argmax(1), 0.2 if options.quick else 1.5, options.device, 64)
-    figure(what="decisions/s", emulators=64, value=rate)
-    each = 2 if options.quick else 32
-    for greedy in (False, True, False, True, False, True):
-        envs = [make_vector_env(game, each, group) for group in range(2)]
-        acts = acting_network(nature, envs[0].spec, options.device)
-        policy = EpsilonGreedy((acts, acts), envs[0].spec, np.random.default_rng(0))
-        players = [Player(env, policy, lambda _, greedy=greedy: 0.05 if greedy else 1.0) for env in envs]
-        for player in players:
-            player.begin()
-            player.send(0, 0)
-
-        def turn(players: list[Player] = players) -> None:
-            for player in players:
-                player.recv()
-                player.send(0, 0)
-
-        rate = _rate(turn, 0.5 if options.quick else 2.0, "cpu", 2 * each)
-        what = "steps/s, the network acts" if greedy else "steps/s, emulators alone"
-        figure(what=what, emulators=2 * each, value=rate)
-        for player, env in zip(players, envs, strict=True):
-            player.recv()
-            env.close()
-
-
-def part_tests(options: argparse.Namespace) -> None:
-    """The tests of a GPU, and those of recorded updates."""
-    tests = ["tests/test_recorded.py"] if options.device == "cpu" else ["tests/test_cuda.py", "tests/test_recorded.py"]
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x" if options.quick else "--maxfail=20",
-        "-p",
-        "no:cacheprovider",
-    ]
-    done = subprocess.run([*command, *tests], capture_output=True, text=True, check=False)
-    (options.out / "tests.txt").write_text(done.stdout[-40_000:] + done.stderr[-10_000:])
-    figure(what="tests", status=done.returncode, last=done.stdout.strip().splitlines()[-1] if done.stdout else "")
-    for line in re.findall(r"^(?:FAILED|ERROR) .*", done.stdout, re.MULTILINE)[:12]:
-        figure(what="tests", failed=line[:200])
-
-
-def part_run(options: argparse.Namespace) -> None:
-    """A whole run of Breakout over processes."""
-    seconds = 20 if options.quick else 60
-    actors = max(1, min(10, (os.cpu_count() or 2) - 4))
-    with tempfile.TemporaryDirectory() as folder:
-        flags = [
-            "--preset",
-            "breakout",
-            "--method",
-            "coop",
-            "--learner.device",
-            options.device,
-            "--total-steps",
-            "100000000",
-        ]
-        flags += ["--replay.learning-starts", "1000", "--replay.capacity", "10000", "--actors", str(actors)]
-        if options.quick:
-            flags += ["--network.kind", "nips2013"]
-        command = [sys.executable, "-m", "coop.deploy.commands", "coop-local", *flags, "--run-dir", f"{folder}/run"]
-        process = subprocess.Popen(command, stdout=sys.stderr, stderr=subprocess.STDOUT)
-        busy, rows = [], []
-        began = time.monotonic()
-        metrics = Path(folder, "run", "metrics.jsonl")
-        while time.monotonic() - began < seconds and process.poll() is None:
-            time.sleep(1)
-            if options.device != "cpu":
-                busy.append(_busy())
-        if metrics.exists():
-            rows = [json.loads(line) for line in metrics.read_text().splitlines()]
-        process.send_signal(2)
-        try:
-            process.wait(25)
-        except subprocess.TimeoutExpired:
-            process.kill()
-        for log in sorted(Path(folder, "run", "logs").glob("*.log")):
-            print(f"--- {log.name}", log.read_text(errors="replace")[-1500:], file=sys.stderr)
-        later = rows[len(rows) // 2 :]
-        mean = lambda name: round(sum(row[name] for row in later) / max(1, len(later)), 1)  # noqa: E731
-        figure(
-            what="run", rows=len(rows), actors=actors,
-            **{name: mean(name) for name in ("updates_per_s", "env_steps_per_s", "weight_lag_mean") if later},
-            gpu_busy=round(sum(busy[len(busy) // 2 :]) / len(busy[len(busy) // 2 :]), 1) if busy else None,
-        )  # fmt: skip
-
-
-def _busy() -> float:
-    command = ["nvidia-smi", "--query-gpu=utilization.gpu", "--format=csv,noheader,nounits"]
-    try:
-        return float(subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.split()[0])
-    except (OSError, subprocess.SubprocessError, ValueError, IndexError):
-        return float("nan")
 
 
 if __name__ == "__main__":
