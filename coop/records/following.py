@@ -14,6 +14,7 @@ from coop.common.imports import describe
 from coop.common.numbers import RETURN_WINDOW
 from coop.common.process.lifecycle import Stop
 from coop.records.checkpoints import EVALUATIONS, RECORDS
+from coop.records.growing import GrowingFile
 from coop.records.reading import parse_row
 from coop.records.sinks.files import EPISODE_FIELDS, FIELDS
 
@@ -29,23 +30,19 @@ class Following:
 
     def __init__(self, run_dir: Path, name: str) -> None:
         """name: one of episodes.csv, metrics.jsonl and evaluations.csv, which need not exist yet."""
-        self._path, self._name = run_dir / name, name
-        self._place, self._newest = 0, -1
+        self._file, self._name = GrowingFile(run_dir / name), name
+        self._begun, self._newest = False, -1
 
     def rows(self) -> list[Row]:
         """The rows since the last call, numbers as such; raises RunError for a line that can't be read."""
         try:
-            if self._path.stat().st_size < self._place:
-                self._place = 0  # a learner that was killed has gone back to its checkpoint
-            with self._path.open("rb") as file:
-                file.seek(self._place)
-                lines = file.read().rpartition(b"\n")[0]
+            lines = self._file.raw_lines()
         except FileNotFoundError:
             return []
-        first = not self._place
-        self._place += len(lines) + 1 if lines else 0
+        first = self._file.restarted or not self._begun  # a learner that was killed has gone back to its checkpoint
+        self._begun = self._begun or bool(lines)
         found = []
-        for number, line in enumerate(lines.splitlines()):
+        for number, line in enumerate(lines):
             if self._name == METRICS or number or not first:  # the others begin with a header
                 row = self._parse(line)
                 if row[_KEYS[self._name]] > self._newest:
@@ -54,7 +51,7 @@ class Following:
         return found
 
     def _parse(self, line: bytes) -> Row:
-        place = f"{self._path}, after {_KEYS[self._name]} {max(self._newest, 0):,}"
+        place = f"{self._file.path}, after {_KEYS[self._name]} {max(self._newest, 0):,}"
         if self._name == METRICS:
             return parse_row(line, place)
         try:

@@ -1,6 +1,6 @@
 """Reads records that others are writing: whole lines only, each once.
 
-A line that can't be read is left out: this is for displays, and who resumes or reports the run names it.
+A line of text that can't be read is left out: that is for displays, and who resumes or reports the run names it.
 """
 
 from __future__ import annotations
@@ -30,22 +30,26 @@ class GrowingFile:
         self._read = 0
         self._inode = 0
 
-    def lines(self) -> list[str]:
-        """The whole lines since the last call; none while the file is not there or can't be read."""
+    def raw_lines(self) -> list[bytes]:
+        """The whole lines since the last call; raises OSError while the file is not there or can't be read."""
         self.restarted = False
-        try:
-            with self.path.open("rb") as file:
-                found = os.fstat(file.fileno())
-                if self._read and (found.st_ino != self._inode or found.st_size < self._read):
-                    self._read, self.restarted = 0, True
-                self._inode = found.st_ino
-                lines: list[str] = []
+        with self.path.open("rb") as file:
+            found = os.fstat(file.fileno())
+            if self._read and (found.st_ino != self._inode or found.st_size < self._read):
+                self._read, self.restarted = 0, True
+            self._inode = found.st_ino
+            lines: list[bytes] = []
+            file.seek(self._read)
+            while whole := file.read(MOST).rpartition(b"\n")[0]:
+                self._read += len(whole) + 1
+                lines += whole.split(b"\n")
                 file.seek(self._read)
-                while whole := file.read(MOST).rpartition(b"\n")[0]:
-                    self._read += len(whole) + 1
-                    lines += whole.decode(errors="replace").split("\n")
-                    file.seek(self._read)
-                return lines
+            return lines
+
+    def lines(self) -> list[str]:
+        """The same as text; none while the file is not there or can't be read."""
+        try:
+            return [line.decode(errors="replace") for line in self.raw_lines()]
         except OSError:
             return []
 
