@@ -1,20 +1,17 @@
 """Console commands, each in a process of its own, forked where torch has been imported: a cold start takes seconds."""
 
-import multiprocessing
 import os
 import signal
+import socket
 import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from importlib.metadata import entry_points
+from contextlib import nullcontext
 from pathlib import Path
 
-TESTS = str(Path(__file__).parent)
-_SERVER = multiprocessing.get_context("forkserver")
-_SERVER.set_forkserver_preload(
-    ["coop.actors.process", "coop.evaluation.evaluate", "coop.lockstep.run", "coop.learner.process"]
-)
+from forked import SERVER, become, forked_children, serve
+
+SUPERVISORS = ("coop-local", "coop-sweep")
 
 
 class Command:
@@ -30,7 +27,7 @@ class Command:
         self._folder = tempfile.TemporaryDirectory()
         self._files = [Path(self._folder.name, stream) for stream in ("out", "err")]
         variables = dict(os.environ if environment is None else environment)
-        self._process = _SERVER.Process(
+        self._process = SERVER.Process(
             target=_run, args=(self.arguments, str(cwd or Path.cwd()), variables, list(map(str, self._files)))
         )
         self._process.start()
@@ -86,12 +83,12 @@ def _run(arguments: Sequence[str], cwd: str, environment: Mapping[str, str], fil
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT)
         os.dup2(descriptor, number)
         os.close(descriptor)
-    os.chdir(cwd)
-    os.environ.clear()
-    os.environ.update(environment)
-    sys.path[:] = [place for place in sys.path if not place.startswith(TESTS)]
-    sys.argv = list(arguments)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)
-    (script,) = entry_points(group="console_scripts", name=arguments[0])
-    script.load()()
+    with forked_children(_fork) if arguments[0] in SUPERVISORS else nullcontext():
+        become(arguments, cwd, environment)
+
+
+def _fork(asking: socket.socket, requests: socket.socket) -> None:
+    if os.fork() == 0:
+        asking.close()
+        serve(requests)
+        os._exit(0)
