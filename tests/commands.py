@@ -5,9 +5,11 @@ import signal
 import socket
 import subprocess
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Self
 
 from forked import SERVER, become, forked_children, serve
 
@@ -15,7 +17,7 @@ SUPERVISORS = ("coop-local", "coop-sweep")
 
 
 class Command:
-    """A console command that has been started; its output goes to files in a folder of its own.
+    """A console command that has been started; its output goes to files. As a context it is killed at its end.
 
     environment: all variables; those of this process if None.
     """
@@ -31,33 +33,48 @@ class Command:
             target=_run, args=(self.arguments, str(cwd or Path.cwd()), variables, list(map(str, self._files)))
         )
         self._process.start()
+        assert self._process.pid is not None
+        self.pid = self._process.pid
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self.send_signal(signal.SIGKILL)
+        self._process.join()
+        self._folder.cleanup()
 
     def output(self) -> tuple[str, str]:
         """What it has written so far to standard output and to standard error."""
         out, err = (file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files)
         return out, err
 
-    def status(self) -> int | None:
+    @property
+    def returncode(self) -> int | None:
         """Its exit status; None while it runs."""
         return self._process.exitcode
 
-    def interrupt(self) -> None:
-        """Send it SIGINT."""
-        if self._process.pid is not None and self.status() is None:
-            os.kill(self._process.pid, signal.SIGINT)
+    def send_signal(self, number: int) -> None:
+        """Send it a signal, if it still runs."""
+        if self.returncode is None:
+            os.kill(self.pid, number)
+
+    def wait(self, timeout: float) -> int:
+        """Wait for its end; return its exit status. Raises TimeoutExpired."""
+        self._process.join(timeout)
+        if (status := self.returncode) is None:
+            raise subprocess.TimeoutExpired(self.arguments, timeout, *self.output())
+        return status
+
+    def communicate(self, timeout: float) -> tuple[str, str]:
+        """Wait for its end; return all that it has written. Raises TimeoutExpired."""
+        self.wait(timeout)
+        return self.output()
 
     def end(self, timeout: float) -> subprocess.CompletedProcess[str]:
         """Wait for its end; raises TimeoutExpired, having killed it."""
-        self._process.join(timeout)
-        status = self.status()
-        if status is None:
-            self._process.kill()
-            self._process.join()
-        out, err = self.output()
-        self._folder.cleanup()
-        if status is None:
-            raise subprocess.TimeoutExpired(self.arguments, timeout, out, err)
-        return subprocess.CompletedProcess(self.arguments, status, out, err)
+        with self:
+            return subprocess.CompletedProcess(self.arguments, self.wait(timeout), *self.output())
 
 
 def run_command(
@@ -78,9 +95,22 @@ def run_command(
     return done
 
 
+def wait_for(what: str, reached: object, seconds: float = 60.0) -> None:
+    """Look until `reached()` is true; fail after `seconds`."""
+    deadline = time.monotonic() + seconds
+    while not reached():  # type: ignore[operator]
+        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
+        time.sleep(0.1)
+
+
+def lines(path: Path) -> int:
+    """The number of a file's lines; 0 if it is not there."""
+    return len(path.read_text().splitlines()) if path.exists() else 0
+
+
 def _run(arguments: Sequence[str], cwd: str, environment: Mapping[str, str], files: Sequence[str]) -> None:
     for number, file in enumerate(files, 1):
-        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT)
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(descriptor, number)
         os.close(descriptor)
     with forked_children(_fork) if arguments[0] in SUPERVISORS else nullcontext():

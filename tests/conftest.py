@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -15,6 +16,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 import torch
+from forked import SERVER, forked_children, serve
 
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
@@ -168,6 +170,17 @@ def nodes(endpoint: str) -> Iterator[tuple[Node, Node]]:
         while not second.presence.counts().get("learner") and time.monotonic() < deadline:
             time.sleep(0.02)
         yield first, second
+
+
+@pytest.fixture(scope="module")
+def quick_children() -> Iterator[None]:
+    """Commands that this process starts as children are forks where torch has been imported."""
+
+    def start(asking: socket.socket, requests: socket.socket) -> None:
+        SERVER.Process(target=serve, args=(requests,)).start()
+
+    with forked_children(start):
+        yield
 
 
 @pytest.fixture

@@ -111,7 +111,9 @@ def become(arguments: Sequence[str], cwd: str, environment: Mapping[str, str]) -
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(environment)
-    sys.path[:] = [place for place in sys.path if not place.startswith(TESTS)]
+    own = environment.get("PYTHONPATH", "")
+    others = [place for place in sys.path if not place.startswith(TESTS)]
+    sys.path[:] = [*(own.split(os.pathsep) if own else ()), *others]
     sys.argv = list(arguments)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)

@@ -6,6 +6,7 @@ ends, or until another one takes a replay service's place.
 
 import re
 import shlex
+import signal
 import subprocess
 import time
 import tomllib
@@ -106,13 +107,13 @@ class Reader:
         name = service.arguments[0]
         deadline = time.monotonic() + PATIENCE
         while not any(READY[name] in text for text in service.output()):
-            assert service.status() is None, f"{name} ended: {service.output()}"
+            assert service.returncode is None, f"{name} ended: {service.output()}"
             assert time.monotonic() < deadline, f"{name}: {service.output()}"
             time.sleep(0.05)
 
     @staticmethod
     def _end(service: Command) -> None:
-        service.interrupt()
+        service.send_signal(signal.SIGINT)
         service.end(PATIENCE)
 
 

@@ -16,7 +16,8 @@ from coop.learner.losses import Values
 from coop.learner.methods.rule import UpdateRule
 from coop.lockstep import cli as lockstep_cli
 
-pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
+# Whole runs, also on a busy machine.
+pytestmark = [pytest.mark.timeout(300), pytest.mark.usefixtures("quick_children")]
 
 SMALL = {"learning_starts": 50, "capacity": 200}
 

@@ -1,5 +1,6 @@
 """Sweeps on a Dask cluster: runs outlive their workers, Ctrl-C stops them, and what is wrong is said in one line."""
 
+import signal
 import socket
 import subprocess
 import sys
@@ -42,7 +43,7 @@ def cluster() -> Iterator[subprocess.Popen[str]]:
 def wait_for(command: Command, condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + 200
     while not condition():
-        assert command.status() is None, command.output()
+        assert command.returncode is None, command.output()
         assert time.monotonic() < deadline, command.output()
         time.sleep(0.05)
 
@@ -60,7 +61,7 @@ def test_a_run_goes_on_after_its_worker_and_stops_at_ctrl_c(cluster: subprocess.
     wait_for(command, lambda: "\nworkers: 0, threads: 0; gone: tcp://127.0.0.1:" in command.output()[0])
     print(1, file=cluster.stdin, flush=True)
     wait_for(command, lambda: "resuming from checkpoint" in (run / "run.log").read_text())
-    command.interrupt()
+    command.send_signal(signal.SIGINT)
     done = command.end(200)
     assert (done.returncode, done.stderr) == (
         130,

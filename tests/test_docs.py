@@ -22,6 +22,7 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Reader:
 
 
 @pytest.mark.timeout(1200)
+@pytest.mark.usefixtures("quick_children")
 @pytest.mark.parametrize("page", WITH_CODE)
 def test_the_code_of_a_page_runs(page: str, reader: Reader) -> None:
     reader.follow(page)

@@ -12,10 +12,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from commands import run_command
+from commands import Command, run_command, wait_for
 from samples import await_service
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_topology import running, wait_for
 
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import UsageError
@@ -247,8 +246,8 @@ def test_evaluators_join_a_run_and_evaluate_its_final_networks(tmp_path: Path) -
     flags += ("--network.hidden", "8", "--video-every", "200")
     mine = ("--connect", endpoint, "--every", "0.5", "--episodes", "3", "--epsilon", "0.5", "--envs", "2")
     with (
-        running("coop-eval", "--run", "coop", *mine, "--join-timeout", "500") as second,
-        running("coop-local", "--listen", endpoint, *flags) as local,
+        Command("coop-eval", "--run", "coop", *mine, "--join-timeout", "500") as second,
+        Command("coop-local", "--listen", endpoint, *flags) as local,
     ):
         out, err = local.communicate(timeout=500)
         printed, wrong = second.communicate(timeout=80)

@@ -3,8 +3,8 @@
 import json
 import os
 import re
+import signal
 import subprocess
-import sysconfig
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,7 @@ from typing import Any
 import gymnasium
 import my_envs
 import pytest
-from commands import Command, run_command
-from test_topology import wait_for
+from commands import Command, run_command, wait_for
 
 from coop.common.errors import RunError
 from coop.common.process.processes import free_endpoint
@@ -24,7 +23,6 @@ from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
 
 pytestmark = pytest.mark.timeout(300)  # whole runs, also on a busy machine
-SCRIPTS = Path(sysconfig.get_path("scripts"))
 OWN = Path(__file__).with_name("data") / "own" / "my_envs.py"
 SHORT = [
     *("--method", "dqn", "--total-steps", "200", "--replay.capacity", "100", "--replay.learning-starts", "100"),
@@ -85,7 +83,7 @@ def test_playing_the_actions_again_shows_progress_and_can_be_interrupted(tmp_pat
     (tmp_path / "slow").touch()
     command = Command("coop-lockstep", *flags, "--total-steps", "1000", "--resume", cwd=tmp_path)  # takes 12 s
     wait_for("progress", lambda: command.output()[0])
-    command.interrupt()
+    command.send_signal(signal.SIGINT)
     done = command.end(60)
     assert done.returncode == 130, done.stderr
     shown, said = done.stdout.splitlines()
@@ -149,7 +147,7 @@ def test_an_actor_imports_only_what_its_own_user_allows(folder: Path, tmp_path: 
         ["coop-learner", "--env.id", "my_envs:Planes-v0", "--network.kind", "minatar", "--listen", endpoint],
         ["coop-replay", *joining, "--run-dir", str(tmp_path / "replay")],
     ]
-    processes = [subprocess.Popen([SCRIPTS / name, *flags], cwd=folder) for name, *flags in roles]
+    processes = [Command(name, *flags, cwd=folder) for name, *flags in roles]
     try:
         refused = run(folder, "coop-actor", *joining, "--allow-import", "other", "my_envs_too")
         assert refused.returncode == 1
@@ -158,6 +156,6 @@ def test_an_actor_imports_only_what_its_own_user_allows(folder: Path, tmp_path: 
         )
     finally:
         for process in processes:
-            process.terminate()
+            process.send_signal(signal.SIGTERM)
         for process in processes:
-            process.wait(60)
+            process.end(60)

@@ -5,14 +5,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import sysconfig
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from commands import run_command
+from commands import Command, run_command, wait_for
 from samples import make_segment
 from test_checkpoints import CONFIG, save, save_learner
 
@@ -39,8 +37,6 @@ from coop.replay.persistence.folder import ReplayFolder
 from coop.replay.persistence.journal import Journal, journal_files
 
 pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
-
-SCRIPTS = Path(sysconfig.get_path("scripts"))
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -254,21 +250,10 @@ def test_the_learner_goes_back_to_the_checkpoint_that_is_chosen(tmp_path: Path) 
 
 def serve_replay(endpoint: str, folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
     """`coop-replay` in a folder, until it ends by itself or has said that it serves, when it is interrupted."""
-    command = [str(SCRIPTS / "coop-replay"), "--run", "test", "--connect", endpoint, "--run-dir", str(folder), *flags]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        timer = threading.Timer(60, process.kill)
-        timer.start()
-        assert process.stdout is not None
-        out = []
-        for line in process.stdout:
-            out.append(line)
-            if "checkpoint" in line:
-                process.send_signal(signal.SIGINT)
-        assert process.stderr is not None
-        err = process.stderr.read()
-        process.wait()
-        timer.cancel()
-    return subprocess.CompletedProcess(command, process.returncode, "".join(out), err)
+    service = Command("coop-replay", "--run", "test", "--connect", endpoint, "--run-dir", folder, *flags)
+    wait_for("its end", lambda: service.returncode is not None or "checkpoint" in service.output()[0])
+    service.send_signal(signal.SIGINT)
+    return service.end(60)
 
 
 @pytest.fixture

@@ -97,7 +97,7 @@ CASES = {
 def test_each_run_is_to_the_bit_what_it_is_by_itself(case: str) -> None:
     config, steps = config_of(*CASES[case]), 500
     assert not why_not(config)
-    configs = [replace(config, seed=seed) for seed in (3, 4, 5, 6, 7)]
+    configs = [replace(config, seed=seed) for seed in (3, 4, 5)]
     runs = [Lockstep(each) for each in configs]
     seeds = Seeds(runs)
     recorded: dict[Lockstep, tuple[list[EpisodeRow], list[dict[str, Any]]]] = {run: ([], []) for run in runs}
@@ -105,7 +105,7 @@ def test_each_run_is_to_the_bit_what_it_is_by_itself(case: str) -> None:
         for each in seeds.play(steps - seeds.step):
             recorded[each.run][0].extend(each.episodes)
             recorded[each.run][1].extend(each.metrics)
-    for k in (0, 4):
+    for k in (0, 2):
         own = Lockstep(configs[k])
         episodes, metrics = alone(own, seeds.step)
         assert recorded[runs[k]][0] == episodes

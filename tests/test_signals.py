@@ -8,8 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import run_command
-from test_topology import lines, running, wait_for
+from commands import Command, lines, run_command, wait_for
 
 from coop.common.errors import PeerLost
 from coop.common.process.lifecycle import Stop
@@ -66,7 +65,7 @@ def test_a_signal_at_the_worst_moment() -> None:
 def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "run"
     flags = ("--total-steps", "3000", "--run-dir", str(path), "--resume")
-    with running("coop-lockstep", *flags) as run:
+    with Command("coop-lockstep", *flags) as run:
         wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
         run.send_signal(signal.SIGTERM)
         out, err = run.communicate(timeout=60)
@@ -83,7 +82,7 @@ def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_whole_run_on_one_machine(number: signal.Signals, status: int, tmp_path: Path) -> None:
     path = tmp_path / "run"
-    with running("coop-local", "--total-steps", "100000", "--run-dir", str(path)) as local:
+    with Command("coop-local", "--total-steps", "100000", "--run-dir", str(path)) as local:
         wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
         local.send_signal(number)
         out, err = local.communicate(timeout=90)

@@ -1,13 +1,12 @@
 """Runs of Stream Q(lambda): their files, their policies, and their place in sweeps and reports."""
 
-import subprocess
-import sysconfig
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
 import pytest
 import torch
+from commands import run_command
 from safetensors.numpy import load_file
 
 import coop
@@ -22,15 +21,13 @@ from coop.studies.report.results import aggregate_table, breaking_table, setting
 from coop.studies.report.study import Study, load_study
 from coop.studies.sweep.grid import load_grid
 
-COMMAND = str(Path(sysconfig.get_path("scripts")) / "coop-lockstep")
-
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of 600 steps by its command."""
     path = tmp_path_factory.mktemp("run") / "run"
     flags = ["--method", "stream-q", "--total-steps", "600", "--network.hidden", "16", "8", "--run-dir", str(path)]
-    done = subprocess.run([COMMAND, *flags], capture_output=True, text=True, check=True)
+    done = run_command("coop-lockstep", *flags, check=True)
     assert "complete: 600 steps, 600 updates" in done.stdout
     assert done.stderr == ""
     return path
@@ -78,7 +75,7 @@ def test_its_networks_are_exported(run_dir: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["coop-local", "coop-learner"])
 def test_distributed_commands_refuse_it_in_one_line(command: str, tmp_path: Path) -> None:
     flags = ["--method", "stream-q", "--run-dir", str(tmp_path / "run")]
-    done = subprocess.run([Path(COMMAND).with_name(command), *flags], capture_output=True, text=True, check=False)
+    done = run_command(command, *flags)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "method = 'stream-q': in lockstep runs only; it has no replay buffer to share" in done.stderr
     assert not (tmp_path / "run").exists()

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from commands import Command, lines, wait_for
 from samples import await_service, make_segment
-from test_topology import lines, running, wait_for
 
 from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.keys import replay_key, status_key
@@ -106,15 +106,15 @@ def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path
     learning = ("--run", "hand", "--listen", endpoint, "--total-steps", "10000000", "--run-dir", str(path))
     metrics = path / "metrics.jsonl"
     with (
-        running("coop-learner", *learning) as learner,
-        running("coop-replay", *joining, "--run-dir", str(tmp_path / "first")) as first,
-        running("coop-actor", *joining) as actor,
+        Command("coop-learner", *learning) as learner,
+        Command("coop-replay", *joining, "--run-dir", str(tmp_path / "first")) as first,
+        Command("coop-actor", *joining) as actor,
     ):
         wait_for("the first metrics", lambda: lines(metrics) >= 1, 120)
         serving: list[int] = []
         with (
             Node(open_session((), (endpoint,)), "hand", "watch", new_incarnation()) as watcher,
-            running("coop-replay", *joining, "--run-dir", str(tmp_path / "second")) as second,
+            Command("coop-replay", *joining, "--run-dir", str(tmp_path / "second")) as second,
         ):
             watcher.session.declare_subscriber(
                 status_key(watcher, "learner"),
@@ -126,7 +126,7 @@ def test_a_second_is_refused_and_a_frozen_one_finds_its_successor(tmp_path: Path
         host = socket.gethostname()
         assert f"run 'hand': the replay service on {host} (pid {first.pid}) serves this run\n" in err
         first.send_signal(signal.SIGSTOP)
-        with running("coop-replay", *joining, "--run-dir", str(tmp_path / "third")) as third:
+        with Command("coop-replay", *joining, "--run-dir", str(tmp_path / "third")) as third:
             before = lines(metrics)
             wait_for("metrics with the third", lambda: lines(metrics) > before + 1)
             first.send_signal(signal.SIGCONT)
@@ -147,9 +147,9 @@ def test_whoever_is_told_to_stop_first_the_closing_checkpoint_is_saved(first: st
     learning = ("--run", "hand", "--listen", endpoint, "--total-steps", "10000000", "--run-dir", str(path))
     serving = (*joining, "--run-dir", str(path), "--listen", "tcp/127.0.0.1:0")
     with (
-        running("coop-learner", *learning) as learner,
-        running("coop-replay", *serving) as replay,
-        running("coop-actor", *joining) as actor,
+        Command("coop-learner", *learning) as learner,
+        Command("coop-replay", *serving) as replay,
+        Command("coop-actor", *joining) as actor,
     ):
         wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1, 120)
         if first == "everybody":
@@ -160,7 +160,7 @@ def test_whoever_is_told_to_stop_first_the_closing_checkpoint_is_saved(first: st
             replay.wait(40)
             saved = newest_checkpoint(path)
             assert saved is not None, "the checkpoint comes first"
-            with running("coop-replay", *serving, "--resume") as another:
+            with Command("coop-replay", *serving, "--resume") as another:
                 before = lines(path / "metrics.jsonl")
                 wait_for("metrics with another one", lambda: lines(path / "metrics.jsonl") > before + 1)
                 another.send_signal(signal.SIGTERM)

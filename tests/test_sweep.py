@@ -6,12 +6,12 @@ import json
 import os
 import signal
 import subprocess
-import sysconfig
 import time
 import tomllib
 from pathlib import Path
 
 import pytest
+from commands import Command, run_command, wait_for
 
 from coop.common.errors import UsageError
 from coop.common.settings.medqn import MedqnSettings
@@ -22,16 +22,12 @@ from coop.studies.sweep.grid import load_grid, shipped_grids
 from coop.studies.sweep.local import LocalProcesses
 
 pytestmark = pytest.mark.timeout(300)  # a dozen processes, one after the other, also on a machine that is busy
-SCRIPTS = Path(sysconfig.get_path("scripts"))
 NAMED = "CUDA_VISIBLE_DEVICES="
 TINY = 'methods = ["dqn", "coop"]\n[fixed]\ntotal_steps = 900\nreplay.capacity = 300\nlearner.swap_every = 10\n'
 
 
 def sweep(*flags: str, path: str = os.environ["PATH"]) -> subprocess.CompletedProcess[str]:
-    command = [str(SCRIPTS / "coop-sweep"), *flags]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=250, check=False, env={**os.environ, "PATH": path}
-    )
+    return run_command("coop-sweep", *flags, environment={**os.environ, "PATH": path}, timeout=250)
 
 
 def summaries(folder: Path) -> dict[str, bytes]:
@@ -200,13 +196,13 @@ def test_bad_flags_are_refused_before_anything_runs(
 def test_interrupted_killed_and_started_again(tmp_path: Path) -> None:
     (tmp_path / "g.toml").write_text(TINY)
     folder = tmp_path / "d"
-    command = [str(SCRIPTS / "coop-sweep"), str(tmp_path / "g.toml"), "--dir", str(folder), "--jobs", "1"]
+    flags = (str(tmp_path / "g.toml"), "--dir", str(folder), "--jobs", "1")
     first, second = folder / "dqn-seed=0", folder / "coop-seed=0"
 
     def until(path: Path, how: signal.Signals) -> str:
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        with Command("coop-sweep", *flags) as process:
             while not (path.exists() and path.stat().st_size):
-                assert process.poll() is None
+                assert process.returncode is None
                 time.sleep(0.02)
             process.send_signal(how)
             return process.communicate(timeout=250)[1]
@@ -217,7 +213,7 @@ def test_interrupted_killed_and_started_again(tmp_path: Path) -> None:
     assert json.loads((first / "summary.json").read_text())["exit"] == "interrupted"
     until(second / "metrics.jsonl", signal.SIGKILL)
     before = summaries(folder)["dqn-seed=0"]
-    done = sweep(*command[1:])
+    done = sweep(*flags)
     assert (done.returncode, done.stderr) == (0, "")
     assert "2 cells in" in done.stdout
     assert "1 of them finished before" in done.stdout
@@ -236,21 +232,19 @@ def test_a_failing_cell_does_not_stop_the_rest_and_one_that_another_process_runs
     broken, taken = tmp_path / "d" / "dqn-seed=0", tmp_path / "d" / "coop-seed=0"
     (broken / "metrics.jsonl").mkdir(parents=True)
     taken.mkdir()
-    command = [str(SCRIPTS / "coop-sweep"), str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--jobs", "2"]
-    with (
-        (taken / ".learner.lock").open("w") as lock,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
-    ):
+    flags = (str(tmp_path / "g.toml"), "--dir", str(tmp_path / "d"), "--jobs", "2")
+    with (taken / ".learner.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert process.stdout is not None
-        line = next(line for line in process.stdout if line.startswith("dqn-seed=0: "))
+        process = Command("coop-sweep", *flags)
+        wait_for("the failure", lambda: "\ndqn-seed=0: " in process.output()[0], 200)
+        line = next(line for line in process.output()[0].splitlines() if line.startswith("dqn-seed=0: "))
         assert line.startswith("dqn-seed=0: FAILED, dqn-seed=0 ended (exit status 1): coop-lockstep: error: run dir")
         assert [path.name for path in taken.iterdir()] == [".learner.lock"]
         lock.close()
-        out, err = process.communicate(timeout=250)
-    assert process.returncode == 1
-    assert err == "coop-sweep: error: 1 of 2 cells failed; the same command tries them again\n"
-    assert "failed: dqn-seed=0: dqn-seed=0 ended (exit status 1): coop-lockstep: error: run directory" in out
+        done = process.end(250)
+    assert done.returncode == 1
+    assert done.stderr == "coop-sweep: error: 1 of 2 cells failed; the same command tries them again\n"
+    assert "failed: dqn-seed=0: dqn-seed=0 ended (exit status 1): coop-lockstep: error: run directory" in done.stdout
     assert list(summaries(tmp_path / "d")) == ["coop-seed=0"]
 
 

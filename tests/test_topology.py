@@ -10,13 +10,12 @@ import subprocess
 import sysconfig
 import time
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import torch
-from commands import run_command
+from commands import Command, lines, run_command, wait_for
 
 from coop.common.metrics import COLUMNS
 from coop.lockstep.reexecute import reexecute
@@ -49,44 +48,18 @@ SUMMARY = [
 ]
 
 
-@contextmanager
-def running(name: str, *flags: str) -> Iterator[subprocess.Popen[str]]:
-    """A console command; killed at the end if it is still there."""
-    command = [str(SCRIPTS / name), *flags]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def run(name: str, *flags: str) -> subprocess.CompletedProcess[str]:
     return run_command(name, *flags, timeout=90)
-
-
-def wait_for(what: str, reached: object, seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not reached():  # type: ignore[operator]
-        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
-        time.sleep(0.1)
-
-
-def lines(path: Path) -> int:
-    return len(path.read_text().splitlines()) if path.exists() else 0
 
 
 def children(pid: int) -> dict[str, int]:
     """Direct children by their command's name, the last one of each."""
     found = {}
     for entry in Path("/proc").iterdir():
-        try:
-            if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
-                arguments = (entry / "cmdline").read_bytes().split(b"\0")
-                found[next(Path(os.fsdecode(a)).name for a in arguments if b"coop-" in a)] = int(entry.name)
-        except (OSError, ValueError, StopIteration):
-            continue
+        with suppress(OSError, ValueError):
+            name, _, rest = (entry / "stat").read_text().partition("(")[2].rpartition(")")
+            if int(rest.split()[1]) == pid and name.startswith("coop-"):
+                found[name] = int(entry.name)
     return found
 
 
@@ -140,7 +113,7 @@ def test_coop_local_end_to_end(tmp_path: Path) -> None:
 
 def test_a_learner_reads_frames_in_the_memory_of_the_replay_service(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    flags = ("--preset", "catch", "--actors", "1", "--total-steps", "3000", "--run-dir", str(path), "--shared-memory")
+    flags = ("--preset", "catch", "--actors", "1", "--total-steps", "1200", "--run-dir", str(path), "--shared-memory")
 
     def shared(pid: int) -> set[str]:
         """The memories that a process has mapped."""
@@ -148,7 +121,7 @@ def test_a_learner_reads_frames_in_the_memory_of_the_replay_service(tmp_path: Pa
             return set(re.findall(r"/memfd:(coop-\w+)", Path(f"/proc/{pid}/maps").read_text()))
         return set()
 
-    with running("coop-local", *flags, "--replay.journal", "--replay.journal-keep") as local:
+    with Command("coop-local", *flags, "--replay.journal", "--replay.journal-keep") as local:
 
         def same() -> bool:
             roles = children(local.pid)
@@ -163,7 +136,7 @@ def test_a_learner_reads_frames_in_the_memory_of_the_replay_service(tmp_path: Pa
 
 def test_actors_that_all_run_elsewhere(tmp_path: Path, endpoint: str) -> None:
     local = ("--actors", "0", "--listen", endpoint, "--total-steps", "600", "--run-dir", str(tmp_path / "run"))
-    with running("coop-local", *local) as head, running("coop-actor", "--connect", endpoint) as actor:
+    with Command("coop-local", *local) as head, Command("coop-actor", "--connect", endpoint) as actor:
         out, err = head.communicate(timeout=80)
         assert (head.returncode, err, actor.wait(20)) == (0, "", 0)
         assert re.search(r"complete: 600 steps, \d+ updates", out)
@@ -175,13 +148,12 @@ def test_an_actors_emulators_act_in_groups(tmp_path: Path, endpoint: str) -> Non
     flags = ("--preset", "cartpole", "--total-steps", "1500", "--replay.journal", "--run-dir", str(path))
     actor = ("--connect", endpoint, "--envs", "5", "--groups", "2")
     with (
-        running("coop-local", "--actors", "0", "--listen", endpoint, *flags) as head,
-        running("coop-actor", *actor) as group,
+        Command("coop-local", "--actors", "0", "--listen", endpoint, *flags) as head,
+        Command("coop-actor", *actor) as group,
     ):
         _, err = head.communicate(timeout=80)
         assert (head.returncode, err, group.wait(20)) == (0, "", 0)
-        assert group.stdout is not None
-        assert "plays 5 emulators of CartPole-v0" in group.stdout.read()
+        assert "plays 5 emulators of CartPole-v0" in group.output()[0]
     rows = list(csv.DictReader((path / "episodes.csv").read_text().splitlines()))
     lengths = {stream: sum(int(row["length"]) for row in rows if row["stream"] == stream) for stream in "01234"}
     assert {row["stream"] for row in rows} == lengths.keys()
@@ -201,7 +173,7 @@ def test_an_actor_refuses_what_it_can_t_have_at_once(flag: str, value: str, word
 
 def test_an_actor_without_emulators_is_refused(tmp_path: Path, endpoint: str) -> None:
     local = ("--actors", "0", "--listen", endpoint, "--total-steps", "600", "--run-dir", str(tmp_path / "run"))
-    with running("coop-local", *local):
+    with Command("coop-local", *local):
         done = run("coop-actor", "--connect", endpoint, "--envs", "-3")
     assert done.returncode == 2
     assert done.stderr == "coop-actor: error: envs: -3 is not allowed; at least 1\n"
@@ -215,12 +187,12 @@ def test_three_shells_a_late_actor_and_a_kill(tmp_path: Path) -> None:
     joining = ("--run", "hand", "--connect", endpoint)
     learning = ("--run", "hand", "--listen", endpoint, "--total-steps", "4000", "--run-dir", str(path))
     with (
-        running("coop-actor", *joining) as first,
-        running("coop-replay", *joining, "--run-dir", str(path)) as replay,
-        running("coop-learner", *learning) as learner,
+        Command("coop-actor", *joining) as first,
+        Command("coop-replay", *joining, "--run-dir", str(path)) as replay,
+        Command("coop-learner", *learning) as learner,
     ):
         wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
-        with running("coop-actor", *joining) as second:
+        with Command("coop-actor", *joining) as second:
             wait_for("more metrics", lambda: lines(path / "metrics.jsonl") >= 4)
             printed = run("coop-limits", *joining, "--tolerance", "16")
             assert (printed.returncode, printed.stderr) == (0, "")
@@ -238,7 +210,7 @@ def test_three_shells_a_late_actor_and_a_kill(tmp_path: Path) -> None:
 def test_ctrl_c_a_killed_actor_and_resume(tmp_path: Path) -> None:
     path = tmp_path / "run"
     flags = ("--actors", "1", "--total-steps", "3000", "--run-dir", str(path))
-    with running("coop-local", *flags) as local:
+    with Command("coop-local", *flags) as local:
         wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
         roles = children(local.pid)
         assert sorted(roles) == ["coop-actor", "coop-learner", "coop-replay"]

@@ -15,7 +15,11 @@ import pytest
 import coop
 from coop.studies.report.packing import pack
 
-pytestmark = [pytest.mark.timeout(500), pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")]
+pytestmark = [
+    pytest.mark.timeout(500),
+    pytest.mark.usefixtures("quick_children"),
+    pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning"),
+]
 EXAMPLE = Path(__file__).parents[1] / "examples" / "tune_buffer.py"
 FIXED = {"total_steps": 300, "replay": {"capacity": 100, "learning_starts": 50}}
 RATES = {"learner": {"learning_rate": {"low": 1e-4, "high": 1e-2, "log": True}}}

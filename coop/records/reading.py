@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from coop.common.errors import RunError, UsageError
 from coop.common.process.output import warn
-from coop.common.process.untrusted import MAX_SETTINGS, read_bytes, read_text
+from coop.common.process.untrusted import MAX_SETTINGS, check_run_name, read_bytes, read_text
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import CONFIG, parse_run_config
 from coop.records.checkpoints import (
@@ -37,6 +37,12 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 TAIL = 16_384  # bytes at the end of a CSV record, enough for 100 lines of episodes.csv
+
+
+def run_names(folder: Path) -> list[str]:
+    """The names of the runs in a folder, in order, without hidden folders; raises UsageError as `check_run_name`."""
+    found = (path.parent.name for path in folder.glob(f"*/{CONFIG}"))
+    return sorted(check_run_name(name, str(folder)) for name in found if not name.startswith("."))
 
 
 def check_records(run_dir: Path) -> None:

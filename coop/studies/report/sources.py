@@ -12,9 +12,9 @@ import pandas as pd
 
 from coop.common.errors import RunError
 from coop.common.process.output import warn
-from coop.common.process.untrusted import check_links, check_run_name, read_text
+from coop.common.process.untrusted import check_links, read_text
 from coop.common.settings.tables import check_toml
-from coop.records.reading import check_records, column, read_csv, read_jsonl
+from coop.records.reading import check_records, column, read_csv, read_jsonl, run_names
 from coop.records.run_ids import RUN_ID
 from coop.studies.report.packed import CONFIG, EPISODES, SUMMARY, SWEEP, PackedStudy
 
@@ -106,12 +106,6 @@ class FolderSource:
             self._checked.add(run)
         path = self._folder / run / file
         return read_csv(path) if file == EPISODES else read_jsonl(path)
-
-
-def run_names(folder: Path) -> list[str]:
-    """The names of the runs in a folder, in order, without hidden folders; raises UsageError as `check_run_name`."""
-    found = (path.parent.name for path in folder.glob(f"*/{CONFIG}"))
-    return sorted(check_run_name(name, str(folder)) for name in found if not name.startswith("."))
 
 
 def _numbers(column: pd.Series) -> pd.Series:

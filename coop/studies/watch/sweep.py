@@ -16,9 +16,8 @@ from coop.common.settings.tables import CONFIG, check_toml
 from coop.records.checkpoints import RECORDS, SWEEP
 from coop.records.growing import tail
 from coop.records.locks import holder
-from coop.records.reading import parse_row, read_run_config
+from coop.records.reading import parse_row, read_run_config, run_names
 from coop.records.summaries import SUMMARY, read_summary
-from coop.studies.report.sources import run_names
 from coop.studies.sweep.grid import Choice, Grid, parse_grid
 from coop.studies.watch.run import EpisodeFacts
 
