@@ -27,9 +27,13 @@ from coop.common.process.lifecycle import SUPERVISED
 TESTS = str(Path(__file__).parent)
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
-    ["coop.actors.process", "coop.evaluation.evaluate", "coop.lockstep.run", "coop.learner.process"]
+    [
+        *("coop.actors.cli", "coop.deploy.local", "coop.evaluation.cli", "coop.lockstep.cli", "coop.learner.process"),
+        *("coop.common.envs.gymnasium_env", "coop.evaluation.evaluate", "coop.lockstep.run", "coop.studies.sweep.cli"),
+        *("coop.records.sinks.tensorboard", "matplotlib.backends.backend_agg", "matplotlib.style"),
+    ]
 )
-ADOPT = 36  # PR_SET_CHILD_SUBREAPER
+ADOPT, NAME = 36, 15  # PR_SET_CHILD_SUBREAPER, PR_SET_NAME
 LARGEST = 1 << 20  # bytes of a request
 POLL = 0.001  # seconds
 
@@ -47,8 +51,11 @@ def forked_children(start: Callable[[socket.socket, socket.socket], object]) -> 
 
     class Forked(subprocess.Popen[bytes]):
         def __init__(
-            self, args: list[str], *, stdout: IO[bytes], cwd: Path, pass_fds: Sequence[int], env: Any, **rest: object
+            self, args: list[str], *, stdout: IO[bytes], cwd: Path, pass_fds: Sequence[int], env: Any, **rest: Any
         ) -> None:
+            if not Path(args[0]).name.startswith("coop-"):  # no console command
+                super().__init__(args, stdout=stdout, cwd=cwd, pass_fds=pass_fds, env=env, **rest)
+                return
             assert rest == {"stdin": subprocess.DEVNULL, "stderr": subprocess.STDOUT, "start_new_session": True}
             self.args = args
             self.stdin = self.stdout = self.stderr = self.returncode = None  # type: ignore[assignment]
@@ -115,6 +122,7 @@ def become(arguments: Sequence[str], cwd: str, environment: Mapping[str, str]) -
     others = [place for place in sys.path if not place.startswith(TESTS)]
     sys.path[:] = [*(own.split(os.pathsep) if own else ()), *others]
     sys.argv = list(arguments)
+    ctypes.CDLL(None).prctl(NAME, arguments[0].encode(), 0, 0, 0)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
     (script,) = entry_points(group="console_scripts", name=arguments[0])

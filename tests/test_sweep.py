@@ -59,10 +59,10 @@ def test_one_cell_by_name_or_number() -> None:
     grid = load_grid("paper-buffers", quick=True)
     names = [cell.name for cell in grid.cells]
     for asked, number in (("0", 0), ("23", 23), (names[7], 7)):
-        (one,) = chosen(SweepOptions("paper-buffers", cell=asked), grid, Path("runs"))
+        (one,) = chosen(SweepOptions("paper-buffers", cell=(asked,)), grid, Path("runs"))
         assert one.cell.name == names[number]
     with pytest.raises(UsageError, match="--cell 24: not in the grid"):
-        chosen(SweepOptions("paper-buffers", cell="24"), grid, Path("runs"))
+        chosen(SweepOptions("paper-buffers", cell=("24",)), grid, Path("runs"))
 
 
 def test_cells_share_the_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -316,6 +316,22 @@ def test_what_slurm_holds_is_not_submitted_again_and_large_grids_are_split(tmp_p
     (slurm / "queue").write_text("")
     (slurm / "size").write_text("0")
     assert sweep(*flags, path=path).stderr == ("coop-sweep: error: this Slurm takes no job arrays: MaxArraySize is 0\n")
+
+
+def test_several_cells_of_a_task_run_at_once_after_its_setup(tmp_path: Path, slurm: Path) -> None:
+    (tmp_path / "g.toml").write_text(TINY.replace("900", "100\nreplay.learning_starts = 50"))
+    folder, path = tmp_path / "d", f"{slurm}:{os.environ['PATH']}"
+    setup = f"echo ready > {tmp_path / 'made'}"
+    flags = (str(tmp_path / "g.toml"), "--dir", str(folder), "--slurm", "--per-task", "2", "--setup", setup)
+    assert sweep(*flags, path=path).stdout == "job 12: 2 cells submitted\n"
+    assert sweep(*flags, path=path).stdout == "job 12: 2 cells queued or running\n"
+    script = folder / "array-1.sh"
+    assert "#SBATCH --array=0-0\n#SBATCH --cpus-per-task=2\n" in script.read_text()
+    task = {**os.environ, "SLURM_ARRAY_TASK_ID": "0"}
+    subprocess.run(["bash", str(script)], env=task, capture_output=True, timeout=250, check=True)
+    assert (tmp_path / "made").read_text() == "ready\n"
+    assert sorted(summaries(folder)) == ["coop-seed=0", "dqn-seed=0"]
+    assert sweep(*flags[:-4], "--per-task", "0", path=path).stderr.endswith("--per-task 0: must be at least 1\n")
 
 
 def test_a_job_array_of_distributed_cells(tmp_path: Path, slurm: Path) -> None:

@@ -96,12 +96,16 @@ class SweepOptions:
     `fast`); 1: none; as many as keep all jobs busy if not given."""
     dir: Path | None = None
     """Folder of the sweep; runs/sweeps/GRID if not given."""
-    cell: str | None = None
-    """Run only this cell: its name, or its number in the grid, from 0."""
+    cell: tuple[str, ...] = ()
+    """Run only these cells: by name, or by number in the grid, from 0."""
     log: str = DEFAULT_LOG
     """Where the runs' metrics go, as --log of coop-lockstep: a group of Weights & Biases, an experiment of MLflow."""
     slurm: bool = False
     """Submit the cells as Slurm job arrays instead of running them on this machine."""
+    per_task: int = 1
+    """Cells that each task of --slurm runs at the same time."""
+    setup: str = ""
+    """What the shell of each task of --slurm runs first, such as "module load cuda"."""
     dask: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
     """Run the cells on the workers of this Dask scheduler, such as tcp://head:8786 (extra `dask`)."""
 
@@ -115,6 +119,8 @@ def _run() -> None:
     options = parse(SweepOptions, "coop-sweep", "Run every cell of a grid once.")
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: must be at least 1")
+    if options.per_task < 1:
+        raise UsageError(f"--per-task {options.per_task}: must be at least 1")
     if options.stack is not None and options.stack < 1:
         raise UsageError(f"--stack {options.stack}: must be at least 1")
     chosen_sinks(options.log)  # refuses
@@ -130,7 +136,8 @@ def _run() -> None:
         say("--stack: on this machine only; each cell runs by itself")
     if options.slurm:
         left = [cell.cell.name for cell in cells if cell.ending() is None]
-        submitted = slurm.submit(grid.file, folder, left, options.jobs, options.log) if left else []
+        tasks = slurm.Tasks(grid.file, folder, options.jobs, options.log, options.per_task, options.setup)
+        submitted = slurm.submit(tasks, left) if left else []
         print(*(submitted or ["every cell is finished"]), sep="\n")
         return
     with _executor(options, grid.file, cells) as executor:
@@ -150,14 +157,14 @@ def _executor(options: SweepOptions, grid: GridFile, folders: Sequence[CellFolde
 
 def chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
     """The cells that the options ask for; raises UsageError if there is none of that name or number."""
-    asked = options.cell
-    there = [cell for n, cell in enumerate(grid.cells) if asked in (None, cell.name, str(n))]
-    cells = [CellFolder(folder, cell, options.log) for cell in there]
-    if not cells:
-        names = [cell.name for cell in grid.cells]
-        near = closest(str(options.cell), names)
-        raise UsageError(f"--cell {options.cell}: {refusal('not in the grid', near, f'its first cell is {names[0]}')}")
-    return cells
+    known = {asked: cell for n, cell in enumerate(grid.cells) for asked in (str(n), cell.name)}
+    for asked in options.cell:
+        if asked not in known:
+            names = [cell.name for cell in grid.cells]
+            near = closest(asked, names)
+            raise UsageError(f"--cell {asked}: {refusal('not in the grid', near, f'its first cell is {names[0]}')}")
+    there = {known[asked].name: known[asked] for asked in options.cell} if options.cell else {}
+    return [CellFolder(folder, cell, options.log) for cell in there.values() or grid.cells]
 
 
 def _work(runner: Runner, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Runs a sweep as Slurm job arrays: one task per cell, each of which is a sweep of that cell alone."""
+"""Runs a sweep as Slurm job arrays: each task is a sweep of one cell, or of some, alone."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 from collections import Counter
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
@@ -14,31 +15,45 @@ from coop.common.process.processes import command
 from coop.studies.sweep.grid import GridFile
 
 
-def submit(grid: GridFile, folder: Path, cells: list[str], jobs: int | None, log: str) -> list[str]:
+@dataclass(frozen=True)
+class Tasks:
+    """What the tasks of a sweep are.
+
+    folder: of the sweep, with its sweep.toml. jobs: number of concurrent tasks; arrays then run one after another, and
+    without limit if None. log: see `--log`. per_task: cells of a task. setup: shell code that each task begins with.
+    """
+
+    grid: GridFile
+    folder: Path
+    jobs: int | None
+    log: str
+    per_task: int
+    setup: str
+
+
+def submit(tasks: Tasks, cells: list[str]) -> list[str]:
     """Submit the cells that no job holds yet, in as many arrays as Slurm's limit requires; return lines that say so.
 
     Each array's script and the names of its cells stay in the sweep's folder: from them a later call knows the cell of
     every task that Slurm still lists.
 
     Args:
-        folder: of the sweep, with its sweep.toml.
+        tasks: what they are.
         cells: names of the cells to run.
-        jobs: number of concurrent tasks; arrays then run one after another. None: no limit.
-        log: see `--log`.
 
     Raises:
         RunError: Slurm is not installed, or refused.
     """
-    folder = folder.resolve()
-    held = _held(folder)
+    tasks = replace(tasks, folder=tasks.folder.resolve())
+    held = _held(tasks.folder)
     lines = [f"job {job}: {_cells(number)} queued or running" for job, number in Counter(held.values()).items()]
     left = [cell for cell in cells if cell not in held]
-    size = _array_size() if left else 1
+    size = _array_size() * tasks.per_task if left else 1
     after: str | None = None
     for start in range(0, len(left), size):
         part = left[start : start + size]
         try:
-            after = _submit(_write(grid, folder, part, jobs, log), after if jobs else None)
+            after = _submit(_write(tasks, part), after if tasks.jobs else None)
         except RunError as error:
             done = f" after {_cells(start)} submitted; the same command submits the rest" if start else ""
             raise RunError(f"{error}{done}") from error
@@ -52,12 +67,12 @@ def _cells(number: int) -> str:
 
 def _held(folder: Path) -> dict[str, str]:
     """The cells of this folder's pending or running tasks, with the job ids of their arrays."""
-    held = {}
+    held: dict[str, str] = {}
     for line in _ask("squeue", "--array", "--noheader", "--format=%F %K %o").splitlines():
         job, task, script = line.split(maxsplit=2)
         names = Path(script.strip()).with_suffix(".cells")
         if names.parent == folder and names.exists():
-            held[names.read_text(encoding="utf-8").splitlines()[int(task)]] = job
+            held |= dict.fromkeys(names.read_text(encoding="utf-8").splitlines()[int(task)].split("\t"), job)
     return held
 
 
@@ -72,11 +87,12 @@ def _array_size() -> int:
     return size
 
 
-def _write(grid: GridFile, folder: Path, cells: list[str], jobs: int | None, log: str) -> Path:
-    """Write an array's script and the names of its cells, one per line, under a new number."""
-    script = next(path for n in count(1) if not (path := folder / f"array-{n}.sh").exists())
-    script.with_suffix(".cells").write_text("".join(f"{cell}\n" for cell in cells), encoding="utf-8")
-    script.write_text(_script(grid, folder, script.with_suffix(".cells"), len(cells), jobs, log), encoding="utf-8")
+def _write(tasks: Tasks, cells: list[str]) -> Path:
+    """Write an array's script and the names of its cells, those of a task in one line, under a new number."""
+    script = next(path for n in count(1) if not (path := tasks.folder / f"array-{n}.sh").exists())
+    lines = ["\t".join(cells[n : n + tasks.per_task]) for n in range(0, len(cells), tasks.per_task)]
+    script.with_suffix(".cells").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    script.write_text(_script(tasks, script.with_suffix(".cells"), len(lines)), encoding="utf-8")
     return script
 
 
@@ -103,18 +119,20 @@ def _ask(program: str, *arguments: str) -> str:
     return done.stdout
 
 
-def _script(grid: GridFile, folder: Path, names: Path, tasks: int, jobs: int | None, log: str) -> str:
-    limit = f"%{jobs}" if jobs else ""
-    processes = 1 if grid.mode == "lockstep" else grid.actors + 2
+def _script(tasks: Tasks, names: Path, number: int) -> str:
+    folder, limit = tasks.folder, f"%{tasks.jobs}" if tasks.jobs else ""
+    processes = 1 if tasks.grid.mode == "lockstep" else tasks.grid.actors + 2
     (program,) = command("coop-sweep")
     return f"""#!/bin/bash
 #SBATCH --job-name=coop-sweep
-#SBATCH --array=0-{tasks - 1}{limit}
-#SBATCH --cpus-per-task={processes}
+#SBATCH --array=0-{number - 1}{limit}
+#SBATCH --cpus-per-task={processes * tasks.per_task}
 #SBATCH --output="{folder}/slurm-%A_%a.log"
 #SBATCH --open-mode=append
 #SBATCH --requeue
-mapfile -t cells < {shlex.quote(str(names))}
+{tasks.setup or ":"}
+mapfile -t tasks < {shlex.quote(str(names))}
+IFS=$'\\t' read -ra cells <<< "${{tasks[$SLURM_ARRAY_TASK_ID]}}"
 exec {shlex.quote(program)} {shlex.quote(str(folder / "sweep.toml"))} --dir {shlex.quote(str(folder))} \\
-  --log {shlex.quote(log)} --cell "${{cells[$SLURM_ARRAY_TASK_ID]}}"
+  --log {shlex.quote(tasks.log)} --jobs {tasks.per_task} --cell "${{cells[@]}}"
 """
