@@ -1,8 +1,9 @@
-# Two commands: `make run` and `make test`. Both set up .venv first, which takes seconds where nothing has changed.
+# Two commands: `make run` and `make test`. Both set up .venv first, with what they need, which takes seconds where nothing has changed.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RUNS := $(VENV)/.runs
 READY := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 # Bytes of all files in git.
@@ -13,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants bench gpu gpu-atari docs dist
 
-run: $(READY)
+run: $(RUNS)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
 
 test: check
@@ -91,8 +92,11 @@ dist: $(READY)
 	@$(PIP) --editable '.[dev,dist]' > $(VENV)/dist.log 2>&1 || { cat $(VENV)/dist.log; exit 1; }
 	@BUILDER="$(CURDIR)/$(BIN)/python" PYTHON="$(PYTHON)" deploy/check_dist.sh
 
-$(READY): pyproject.toml constraints.txt
+# What runs need; and what checks and tests need as well.
+$(RUNS): PACKAGES := .
+$(READY): PACKAGES := .[dev]
+$(RUNS) $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV): some minutes and 2 GB; $(VENV)/install.log has the details"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(PIP) --editable '.[dev]' > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log; exit 1; }
-	@touch $(READY)
+	@$(PIP) --editable '$(PACKAGES)' > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log; exit 1; }
+	@touch $(RUNS) $@

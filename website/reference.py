@@ -8,6 +8,7 @@ from typing import Any
 
 import pydantic
 
+import coop
 from coop.actors.cli import ActorOptions
 from coop.common.bounds import MAX_INTEGER
 from coop.common.metrics import METRICS
@@ -93,6 +94,15 @@ def metrics_reference() -> str:
         code = [f"`{name}`" if name else "" for name in names]
         rows.append((f"`{each.name}`", each.meaning, each.unit, *code, each.chart))
     return _table(head, rows)
+
+
+def names_reference() -> str:
+    """A table of what `import coop` gives, with the first sentence of its text."""
+    rows = []
+    for name in coop.__all__:
+        first, _, _ = (getattr(coop, name).__doc__ or "").strip().partition("\n\n")
+        rows.append((f"`coop.{name}`", " ".join(first.split())))
+    return _table(("name", "what it is"), rows)
 
 
 def field_name(flag: Flag) -> str:
