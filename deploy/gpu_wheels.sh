@@ -3,8 +3,8 @@
 # PYTHON: whose pip fetches them; any version.
 set -eu
 cd "$(dirname "$0")/.."
-packages="ale-py annotated-types docstring-parser eclipse-zenoh farama-notifications gymnasium markdown-it-py mdurl msgpack msgspec
-    pydantic pydantic-core pygments rich stable-baselines3 threadpoolctl tomli-w typeguard typing-inspection tyro"
+packages="ale-py docstring-parser eclipse-zenoh farama-notifications gymnasium markdown-it-py mdurl msgpack msgspec
+    pygments rich stable-baselines3 threadpoolctl tomli-w typeguard tyro"
 platforms=$(printf ' --platform manylinux_2_%s_x86_64' 17 24 27 28 31 34; printf ' --platform manylinux2014_x86_64')
 rm -rf .whl
 # shellcheck disable=SC2086 # words are meant

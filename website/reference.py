@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import html
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import pydantic
+import msgspec
 
 import coop
 from coop.actors.cli import ActorOptions
@@ -15,6 +16,7 @@ from coop.common.metrics import METRICS
 from coop.common.process.flags import Flag, sections
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS, table_of
+from coop.common.settings.reading import fields_of
 from coop.common.settings.tables import load_tables, preset_names, resolve
 from coop.deploy.local import LocalOptions
 from coop.deploy.router import RouterOptions
@@ -116,17 +118,22 @@ def _last(name: str) -> str:
 
 def _schemas() -> dict[str, Mapping[str, Any]]:
     """JSON schemas of the settings' fields, by section and field; those of the run itself are in section ""."""
-    whole = pydantic.TypeAdapter(RunConfig).json_schema()
     found: dict[str, Mapping[str, Any]] = {"": {}}
-    for name, schema in whole["properties"].items():
-        if "$ref" in schema:
-            found[name] = whole["$defs"][schema["$ref"].rpartition("/")[2]]["properties"]
+    for name, schema in _properties(RunConfig).items():
+        kind = fields_of(RunConfig)[name] if "$ref" in schema else None
+        if kind is not None:
+            found[name] = _properties(kind)
         elif name not in ("method_settings", "methods"):
             found[""] = {**found[""], name: schema}
     for method in map(METHODS.get, METHODS.names()):
         if method.settings is not None:
-            found[table_of(method.name)] = pydantic.TypeAdapter(method.settings).json_schema()["properties"]
+            found[table_of(method.name)] = _properties(method.settings)
     return found
+
+
+def _properties(kind: type[Any]) -> Mapping[str, Any]:
+    fields: Mapping[str, Any] = msgspec.json.schema(kind)["$defs"][kind.__name__]["properties"]
+    return fields
 
 
 def _allowed(flag: Flag, schema: Mapping[str, Any]) -> str:
@@ -157,7 +164,7 @@ def _bounds(schema: Mapping[str, Any]) -> Iterator[str]:
     words = {"exclusiveMinimum": "above", "minimum": "from", "exclusiveMaximum": "below", "maximum": "to"}
     for key, word in words.items():
         bound = schema.get(key, MAX_INTEGER)
-        if bound != MAX_INTEGER:  # which only says that a message can hold it
+        if abs(bound) not in (MAX_INTEGER, sys.float_info.max):  # which only says that a message can hold it
             yield f"{word} {bound:,}" if isinstance(bound, int) else f"{word} {bound:g}"
 
 

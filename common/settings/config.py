@@ -7,8 +7,9 @@ from functools import cached_property, reduce
 from typing import Annotated, Any, Literal
 
 import tyro
-from pydantic import ConfigDict, Field
+from msgspec import Meta
 
+from coop.common.bounded import Counter, Real, Share
 from coop.common.bounds import (
     MAX_AHEAD,
     MAX_BATCH,
@@ -29,13 +30,11 @@ from coop.common.settings.environment import EnvSettings
 from coop.common.settings.fields import (
     NONE,
     SWITCH,
-    Counter,
     Decay,
     NonNegative,
     Positive,
     PositiveFloat,
     PositiveShare,
-    Share,
     Steps,
 )
 from coop.common.settings.methods import METHODS
@@ -50,17 +49,14 @@ OptimizerName = Literal["sgd", "rmsprop", "rmsprop-mnih", "adam"]
 OF_REGISTRIES = ("method", "replay.eviction", "replay.sampling")
 MAY_NAME_MODULES = ("env.id", "network.kind", *OF_REGISTRIES)  # as "module:name"
 
-_STRICT = ConfigDict(extra="forbid")
-
 
 @dataclass(frozen=True)
 class NetworkSettings:
     """The Q-network."""
 
-    __pydantic_config__ = _STRICT
-    kind: Annotated[str, Field(max_length=MAX_ENV_ID)] = "mlp"
+    kind: Annotated[str, Meta(max_length=MAX_ENV_ID)] = "mlp"
     """mlp, nature (3 convolutions + 2 linear), nips2013 (2 + 2), minatar (1 + 2), or your own module:function."""
-    hidden: Annotated[tuple[Positive, ...], Field(max_length=MAX_LAYERS)] = (128, 128, 128)
+    hidden: Annotated[tuple[Positive, ...], Meta(max_length=MAX_LAYERS)] = (128, 128, 128)
     """Widths of the mlp's hidden layers."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """bfloat16 applies to acting, targets and all passes of an update; parameters stay in float32."""
@@ -70,8 +66,7 @@ class NetworkSettings:
 class LearnerSettings:
     """The update of the acting network."""
 
-    __pydantic_config__ = _STRICT
-    batch_size: Annotated[int, Field(gt=0, le=MAX_BATCH)] = 32
+    batch_size: Annotated[int, Meta(gt=0, le=MAX_BATCH)] = 32
     """Transitions per update."""
     swap_every: Positive = 30
     """C: updates between swaps of the acting role."""
@@ -114,7 +109,7 @@ class LearnerSettings:
     """Smoothing constant of the squared gradients' running mean (adam)."""
     eps: PositiveFloat = 1e-8
     """Added to the optimizer's denominator; not for sgd."""
-    weight_decay: Annotated[tuple[NonNegative, ...], Field(max_length=MAX_LAYERS + 1)] = ()
+    weight_decay: Annotated[tuple[NonNegative, ...], Meta(max_length=MAX_LAYERS + 1)] = ()
     """lambda(i) of each layer, starting at the input; one value applies to all layers; empty means 0."""
     initial_networks: str = ""
     """Folder of a run, with whose newest networks this run begins; empty: random weights."""
@@ -124,7 +119,7 @@ class LearnerSettings:
     """Let a GPU's matrix units read float32 numbers with 10 bits of mantissa; not where exactness needs more."""
     threads: Positive = 1
     """CPU threads that PyTorch uses in the learner."""
-    prefetch: Annotated[int, Field(gt=0, le=MAX_AHEAD // 4)] = 8
+    prefetch: Annotated[int, Meta(gt=0, le=MAX_AHEAD // 4)] = 8
     """Batches that are asked for ahead."""
     mirror: Literal["auto", "off"] = "auto"
     """auto: keep copies of the table's frames, in at most a quarter of the memory, so that each is sent once."""
@@ -141,7 +136,6 @@ class LearnerSettings:
 class EdlSettings:
     """Error-driven learning: B = U (S + s I) V^T."""
 
-    __pydantic_config__ = _STRICT
     rate: NonNegative = 0.1
     """s at the first update, the paper's exploration rate; 0 gives the ordinary gradient."""
     decay: PositiveShare = 1.0
@@ -160,16 +154,15 @@ class EdlSettings:
 class ReplaySettings:
     """The replay table and its limiter."""
 
-    __pydantic_config__ = _STRICT
     capacity: Steps = 5000
     """Exact number of transitions in the full table."""
     learning_starts: Steps = 500
     """Transitions to collect before the first update; unless given, at most the capacity and a tenth of the run."""
-    ratio: Annotated[float, Field(gt=0, le=MAX_RATIO)] = 1.0
+    ratio: Annotated[float, Meta(gt=0, le=MAX_RATIO)] = 1.0
     """Updates per environment step."""
-    tolerance: Annotated[float, Field(gt=0, le=MAX_TOLERANCE)] = 64.0
+    tolerance: Annotated[float, Meta(gt=0, le=MAX_TOLERANCE)] = 64.0
     """Environment steps by which acting may be ahead of learning, or behind it."""
-    n_step: Annotated[int, Field(gt=0, le=MAX_N_STEP)] = 1
+    n_step: Annotated[int, Meta(gt=0, le=MAX_N_STEP)] = 1
     """Rewards that a transition sums before it bootstraps (1: the paper); fewer at the end of an episode."""
     eviction: EvictionName = "fifo"
     """Policy by which a full table evicts transitions; prioritized evicts the lowest priority."""
@@ -198,8 +191,7 @@ class ReplaySettings:
 class ActorSettings:
     """Exploration and segments."""
 
-    __pydantic_config__ = _STRICT
-    num_envs: Annotated[int, Field(gt=0, le=MAX_STREAMS)] = 1
+    num_envs: Annotated[int, Meta(gt=0, le=MAX_STREAMS)] = 1
     """Emulators in one actor process."""
     epsilon_start: Share = 1.0
     """Probability of a random action at the run's beginning."""
@@ -209,9 +201,9 @@ class ActorSettings:
     """Shape of the decay of epsilon."""
     epsilon_steps: Steps = 5000
     """Steps: time constant of the exponential decay, length of the linear one; default: total_steps / 10."""
-    segment_steps: Annotated[int, Field(gt=0, le=MAX_SEGMENT_STEPS)] = 16
+    segment_steps: Annotated[int, Meta(gt=0, le=MAX_SEGMENT_STEPS)] = 16
     """Steps of one emulator that are sent together."""
-    max_in_flight: Annotated[int, Field(gt=0, le=MAX_GAPS)] = 2
+    max_in_flight: Annotated[int, Meta(gt=0, le=MAX_GAPS)] = 2
     """Unacknowledged segments that an actor may have in flight, for each emulator; many actors get fewer."""
 
 
@@ -219,8 +211,7 @@ class ActorSettings:
 class RunConfig:
     """Everything that defines a run; the same fields in TOML files and as flags."""
 
-    __pydantic_config__ = _STRICT
-    run: Annotated[str, Field(pattern=RUN)] = "coop"
+    run: Annotated[str, Meta(pattern=RUN.replace("$", r"\Z"))] = "coop"
     """Name of the run: roles with the same name find each other."""
     method: MethodName = "coop"
     """Training method."""
@@ -232,13 +223,13 @@ class RunConfig:
     """Stop after this many updates; 0: no limit."""
     total_episodes: Counter = 0
     """Stop after this many finished episodes; 0: no limit."""
-    target_return: Annotated[Annotated[float, Field(allow_inf_nan=False)] | None, NONE] = None
+    target_return: Annotated[Real | None, NONE] = None
     """Stop once the mean return of the last 100 episodes reaches this."""
     checkpoint_every: Counter = 10_000
     """Updates between checkpoints of the whole system; 0: only at the end."""
     eval_every: Counter = 0
     """Environment steps between evaluations: the acting network plays full episodes greedily; 0: none."""
-    eval_episodes: Annotated[int, Field(gt=0, le=MAX_EVALUATED)] = 10
+    eval_episodes: Annotated[int, Meta(gt=0, le=MAX_EVALUATED)] = 10
     """Episodes of each evaluation."""
     video_every: Counter = 0
     """Environment steps between videos of an episode that the acting network plays greedily; 0: none."""

@@ -5,42 +5,41 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from msgspec import Meta
 
 from coop.common.bounds import MAX_ENV_ID, MAX_FRAME_SKIP, MAX_GAME_STEPS, MAX_NOOPS, MAX_SIDE, MAX_STACK
 from coop.common.settings.fields import NONE, Table
 
-Side = Annotated[int, Field(gt=0, le=MAX_SIDE)]
+Side = Annotated[int, Meta(gt=0, le=MAX_SIDE)]
 
 
 @dataclass(frozen=True)
 class EnvSettings:
     """The environment that the run plays."""
 
-    __pydantic_config__ = ConfigDict(extra="forbid")
-    id: Annotated[str, Field(min_length=1, max_length=MAX_ENV_ID)] = "CartPole-v0"
+    id: Annotated[str, Meta(min_length=1, max_length=MAX_ENV_ID)] = "CartPole-v0"
     """A gymnasium id ("CartPole-v0", "my_envs:Room-v0" of the module my_envs) or an ALE game ("breakout")."""
     kwargs: Table = field(default_factory=dict, hash=False)
     """Keyword arguments of the environment, a TOML table, such as {side = 12}; not for ALE games."""
-    noop_max: Annotated[int, Field(ge=0, le=MAX_NOOPS)] = 30
+    noop_max: Annotated[int, Meta(ge=0, le=MAX_NOOPS)] = 30
     """Largest number of no-ops at the start of a game, which is drawn from 0..noop_max; ALE only."""
     episodic_life: bool = False
     """Treat a lost life as terminal for learning while the game goes on (Mnih et al. 2015, training); ALE only."""
     clip_rewards: bool = False
     """Learn from rewards clipped to [-1, 1]; reported returns are unclipped."""
-    frame_skip: Annotated[int, Field(gt=0, le=MAX_FRAME_SKIP)] = 4
+    frame_skip: Annotated[int, Meta(gt=0, le=MAX_FRAME_SKIP)] = 4
     """Emulator frames per step, of which the last two are max-pooled; ALE only."""
-    stack: Annotated[int, Field(gt=0, le=MAX_STACK)] = 1
+    stack: Annotated[int, Meta(gt=0, le=MAX_STACK)] = 1
     """Frames per observation."""
     resize: Annotated[tuple[Side, Side] | None, NONE] = None
     """Height and width to which pictures are resized; ALE games always have 84 x 84."""
     grayscale: bool = False
     """Convert colour pictures to grayscale; ALE games always are."""
-    repeat_action_probability: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    repeat_action_probability: Annotated[float, Meta(ge=0, lt=1)] = 0.0
     """Probability that the emulator repeats the previous action (sticky actions); ALE only."""
     full_action_space: bool = False
     """Use all 18 actions instead of the game's minimal set; ALE only."""
-    max_episode_steps: Annotated[int, Field(ge=0, le=MAX_GAME_STEPS)] = 0
+    max_episode_steps: Annotated[int, Meta(ge=0, le=MAX_GAME_STEPS)] = 0
     """Truncate episodes after this many steps; 0 keeps the environment's own limit (ALE: 108,000 frames)."""
     time_limit_terminal: bool = False
     """Treat the time limit's end of an episode as terminal, as old gym did; otherwise the last state bootstraps."""

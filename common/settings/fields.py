@@ -1,29 +1,29 @@
-"""Types of single settings, with the bounds that pydantic checks."""
+"""Types of single settings, with the bounds ."""
 
 from __future__ import annotations
 
 import math
+import sys
 import tomllib
 from collections.abc import Sequence
 from typing import Annotated, Any
 
 import msgspec
 import tomli_w
-from pydantic import AfterValidator, BeforeValidator, Field
+from msgspec import Meta
 from tyro.constructors import PrimitiveConstructorSpec
 
 from coop.common.bounds import MAX_INTEGER, MAX_KWARGS, MAX_STEPS
+from coop.common.settings.reading import Read
 
-Positive = Annotated[int, Field(gt=0, le=MAX_INTEGER)]
-Counter = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
-Steps = Annotated[int, Field(gt=0, le=MAX_STEPS)]
-PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1)]
-PositiveShare = Annotated[float, Field(gt=0, le=1)]
-Decay = Annotated[float, Field(ge=0, lt=1)]
-SWITCH = BeforeValidator(lambda value: {True: "async", False: "off"}[value] if isinstance(value, bool) else value)
-NONE = BeforeValidator(lambda value: None if value in ("None", "none") else value)
+Positive = Annotated[int, Meta(gt=0, le=MAX_INTEGER)]
+Steps = Annotated[int, Meta(gt=0, le=MAX_STEPS)]
+PositiveFloat = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
+NonNegative = Annotated[float, Meta(ge=0, le=sys.float_info.max)]
+PositiveShare = Annotated[float, Meta(gt=0, le=1)]
+Decay = Annotated[float, Meta(ge=0, lt=1)]
+SWITCH = Read(lambda value: {True: "async", False: "off"}[value] if isinstance(value, bool) else value)
+NONE = Read(lambda value: None if isinstance(value, str) and value in ("None", "none") else value)
 """Lets an optional field be unset in TOML too, which has no null: "None"."""
 
 
@@ -43,8 +43,10 @@ def _show_table(table: dict[str, Any]) -> list[str]:
     return [tomli_w.dumps({"t": [table]}).split("[", 1)[1].rpartition("]")[0].strip().rstrip(",")]
 
 
-def _transferable(table: dict[str, Any]) -> dict[str, Any]:
+def _transferable(table: Any) -> Any:  # noqa: ANN401 (another type is refused with those of other fields)
     """Refuse values that a TOML file or a message could not carry."""
+    if not isinstance(table, dict):
+        return table
     _check_values(table)
     if (size := len(msgspec.msgpack.encode(table))) > MAX_KWARGS:
         raise ValueError(f"{size:,} bytes; allowed: at most {MAX_KWARGS:,}")
@@ -73,7 +75,7 @@ def _check_values(value: Any) -> None:  # noqa: ANN401 (whatever the table holds
 
 Table = Annotated[
     dict[str, Any],
-    AfterValidator(_transferable),
+    Read(_transferable),
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="TABLE",

@@ -5,21 +5,20 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import tyro
-from pydantic import AfterValidator
-from pydantic_core import PydanticCustomError
 
 from coop.common.registry import Registry
 from coop.common.settings.methods import METHODS
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
+from coop.common.settings.reading import Read
 
 
-def _known(registry: Registry[Any]) -> AfterValidator:
-    def check(name: str) -> str:
-        if not registry.knows(name):
-            raise PydanticCustomError("unknown_name", "{reason}", {"reason": registry.unknown(name)})
+def _known(registry: Registry[Any]) -> Read:
+    def check(name: Any) -> Any:  # noqa: ANN401 (another type is refused with those of other fields)
+        if isinstance(name, str) and not registry.knows(name):
+            raise ValueError(registry.unknown(name))
         return name
 
-    return AfterValidator(check)
+    return Read(check)
 
 
 def _shown(registry: Registry[Any]) -> object:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from coop.common.bounded import Share
 from coop.common.settings.conditions import Condition
-from coop.common.settings.fields import PositiveFloat, PositiveShare, Share
+from coop.common.settings.fields import PositiveFloat, PositiveShare
 from coop.common.settings.methods import Method
 
 

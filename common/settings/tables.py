@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import tomllib
 import zlib
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import pydantic
 import tomli_w
 
 from coop.common.errors import RunError, UsageError, not_among
@@ -18,12 +17,11 @@ from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.settings.overrides import merged, of_method
+from coop.common.settings.reading import checked, fields_of
 from coop.common.settings.rules import check_rules, fitted
 
-_ADAPTER = pydantic.TypeAdapter(RunConfig)
 CONFIG = "config.toml"
 _SEAL = "# crc32 "
-_FIELDS = [field.name for field in fields(RunConfig) if field.name != "method_settings"]
 
 
 def preset_names() -> list[str]:
@@ -121,13 +119,8 @@ def validated(
         UsageError: as `resolve`.
     """
     tables = to_tables(tables) if isinstance(tables, RunConfig) else dict(tables)
-    if "method_settings" in tables:
-        raise UsageError(_no_such_field("method_settings", tables["method_settings"], _FIELDS))
     settings = _settings_of_method(tables)
-    try:
-        config: RunConfig = replace(_ADAPTER.validate_python(tables), method_settings=settings)
-    except pydantic.ValidationError as error:
-        raise UsageError(first_problem(error, RunConfig())) from error
+    config = replace(checked(RunConfig, tables), method_settings=settings)
     config = config if given is None else fitted(config, given, lockstep=lockstep)
     check_rules(config)
     return config
@@ -140,15 +133,9 @@ def _settings_of_method(tables: dict[str, Any]) -> Any:  # noqa: ANN401 (an inst
     method = METHODS.get(name) if known else None
     if method is None or method.settings is None:
         return None
-    if method.table in _FIELDS:
+    if method.table in fields_of(RunConfig):
         raise UsageError(f"method = {name!r}: its settings can't be called {method.table!r}, as others are")
-    given, allowed = tables.pop(method.table, {}), [field.name for field in fields(method.settings)]
-    if isinstance(given, Mapping) and (unknown := given.keys() - set(allowed)):
-        raise UsageError(_no_such_field(f"{method.table}.{min(unknown)}", given[min(unknown)], allowed))
-    try:
-        return pydantic.TypeAdapter(method.settings).validate_python(given)
-    except pydantic.ValidationError as error:
-        raise UsageError(first_problem(error, method.settings(), f"{method.table}.")) from error
+    return checked(method.settings, tables.pop(method.table, {}), f"{method.table}.")
 
 
 def to_toml(config: RunConfig) -> str:
@@ -222,32 +209,3 @@ def _without_none(tables: Mapping[str, Any]) -> dict[str, Any]:
         for key, value in tables.items()
         if value is not None
     }
-
-
-def first_problem(
-    error: pydantic.ValidationError,
-    example: Any,  # noqa: ANN401 (any nested dataclasses)
-    prefix: str = "",
-) -> str:
-    """The first error that pydantic found, in one line: the field, the value and what is allowed.
-
-    example: an instance of the class that was being built, for the names of its fields. prefix: of these names.
-    """
-    first, *rest = error.errors(include_url=False)
-    name = (prefix + ".".join(str(part) for part in first["loc"])).removesuffix(".")
-    if first["type"] == "unexpected_keyword_argument":
-        text = _no_such_field(name, first["input"], _siblings(first["loc"], example))
-    else:
-        text = f"{name} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
-    return f"{text} (and {len(rest)} more)" if rest else text
-
-
-def _no_such_field(name: str, value: object, allowed: Sequence[str]) -> str:
-    return f"{name} = {value!r}: {not_among(allowed, name.rpartition('.')[2], 'no such field')}"
-
-
-def _siblings(path: tuple[int | str, ...], example: Any) -> list[str]:  # noqa: ANN401
-    """The fields allowed in place of the last name of `path`."""
-    for name in path[:-1]:
-        example = getattr(example, str(name))
-    return [field.name for field in fields(example) if field.name != "method_settings"]

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pydantic
-
 from coop.common.errors import CoopError, UsageError
 from coop.common.imports import check_extra
 from coop.common.numbers import RETURN_WINDOW
@@ -21,7 +19,7 @@ from coop.common.process.files import make_folder
 from coop.common.process.limits import cores
 from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.overrides import merged, nested
-from coop.common.settings.tables import first_problem
+from coop.common.settings.reading import checked
 from coop.records.following import EPISODES, Following
 from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import read_summary
@@ -100,9 +98,9 @@ class Space:
         try:
             tables = dict(grid) if isinstance(grid, Mapping) else tomllib.loads(read_text(Path(grid), MAX_SETTINGS))
             tables.pop("quick", None)
-            self.file = pydantic.TypeAdapter(GridFile).validate_python(tables)
-        except pydantic.ValidationError as error:
-            raise UsageError(f"grid: {first_problem(error, GridFile())}") from error
+            self.file = checked(GridFile, tables)
+        except UsageError as error:
+            raise UsageError(f"grid: {error}") from error
         except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise UsageError(f"grid {grid}: {getattr(error, 'strerror', None) or error}") from error
         self.axes = _axes(self.file.vary)

@@ -1,4 +1,4 @@
-"""The settings of a stack of runs, and its schedules as arrays; imports neither pydantic nor an environment."""
+"""The settings of a stack of runs, and its schedules as arrays; imports no environment."""
 
 from __future__ import annotations
 

@@ -12,21 +12,22 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import pydantic
 import tomli_w
-from pydantic import ConfigDict, Field
+from msgspec import Meta
 
+from coop.common.bounded import Counter
 from coop.common.envs.make import env_spec
 from coop.common.errors import UsageError, closest, refusal
 from coop.common.process.untrusted import check_run_name
 from coop.common.settings.config import RunConfig, check_distributed
 from coop.common.settings.environment import EnvSettings
-from coop.common.settings.fields import Counter, Positive
+from coop.common.settings.fields import Positive
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
+from coop.common.settings.reading import checked
 from coop.common.settings.starting import env_id_of, starting_tables, stated
-from coop.common.settings.tables import first_problem, load_tables, resolve, shortened, to_tables, validated
+from coop.common.settings.tables import load_tables, resolve, shortened, to_tables, validated
 
 FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 
@@ -35,9 +36,8 @@ FieldPath = tuple[str, ...]  # in nested tables: ("replay", "capacity")
 class GridFile:
     """The contents of a grid's file."""
 
-    __pydantic_config__ = ConfigDict(extra="forbid")
-    methods: Annotated[tuple[MethodName, ...], Field(min_length=1)] = ("coop",)
-    seeds: Annotated[tuple[Counter, ...], Field(min_length=1)] = (0,)
+    methods: Annotated[tuple[MethodName, ...], Meta(min_length=1)] = ("coop",)
+    seeds: Annotated[tuple[Counter, ...], Meta(min_length=1)] = (0,)
     title: str = ""
     """The grid's question, in one line."""
     preset: str = ""
@@ -130,11 +130,7 @@ def parse_grid(text: str, name: str, quick: bool = False, check: bool = True) ->
             if not isinstance(small, dict):
                 raise UsageError("--quick: it has no table [quick]")
             tables = merged(tables, small)
-        try:
-            file = pydantic.TypeAdapter(GridFile).validate_python(tables)
-        except pydantic.ValidationError as error:
-            raise UsageError(first_problem(error, GridFile())) from error
-        grid = Grid(file)
+        grid = Grid(checked(GridFile, tables))
         _ = grid.cells if check else grid.choices
         return grid
     except (tomllib.TOMLDecodeError, UsageError) as error:

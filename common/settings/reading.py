@@ -1,0 +1,81 @@
+"""Turns tables into dataclasses whose field types say what is allowed: msgspec checks them, as it checks messages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, is_dataclass
+from functools import cache
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+import msgspec
+
+from coop.common.errors import UsageError, not_among
+
+T = TypeVar("T")
+_PROBLEM = re.compile(r"^(?P<problem>.*?)(?: - at .*`\$(?P<path>[^`]*)`)?$", re.DOTALL)  # msgspec's error texts
+_WORDS = {"`": "", "object": "table", "array": "list", "null": "None", "<= 1.7976931348623157e+308": "that is finite"}
+
+
+@dataclass(frozen=True)
+class Read:
+    """Marks the type of a field: its values are read by a function, which raises ValueError with what is allowed."""
+
+    function: Callable[[Any], Any]
+
+
+def checked(kind: type[T], tables: Any, prefix: str = "") -> T:  # noqa: ANN401 (of a file, or of a user's code)
+    """An instance of nested dataclasses from nested tables; prefix: of the fields' names in errors.
+
+    Raises:
+        UsageError: an unknown field or a value that is not allowed, with the field, the value and what is allowed.
+    """
+    tables = _read(kind, tables, prefix)
+    try:
+        return msgspec.convert(tables, kind, strict=False)
+    except msgspec.ValidationError as error:
+        raise UsageError(_explained(error, kind, tables, prefix)) from error
+
+
+@cache
+def fields_of(kind: type[Any]) -> dict[str, Any]:
+    """The fields that tables may have, with their types."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hints[name] for name in kind.__dataclass_fields__ if name != "method_settings"}
+
+
+def _read(kind: Any, value: Any, place: str) -> Any:  # noqa: ANN401 (any type, any value)
+    base, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+    for mark in marks:
+        if isinstance(mark, Read):
+            try:
+                value = mark.function(value)
+            except ValueError as error:
+                raise UsageError(f"{place} = {value!r}: {error}") from error
+    if is_dataclass(base) and isinstance(value, Mapping):
+        place = place if not place or place.endswith(".") else f"{place}."
+        known = fields_of(base)  # type: ignore[arg-type] # a class
+        for name, each in value.items():
+            if name not in known:
+                raise UsageError(f"{place}{name} = {each!r}: {not_among(list(known), str(name), 'no such field')}")
+        return {name: _read(known[name], each, f"{place}{name}") for name, each in value.items()}
+    if get_origin(base) is tuple and isinstance(value, list | tuple):
+        return [_read(get_args(base)[0], each, f"{place}[{n}]") for n, each in enumerate(value)]
+    return value
+
+
+def _explained(error: msgspec.ValidationError, kind: Any, tables: Any, prefix: str) -> str:  # noqa: ANN401
+    """The field, its value and what is allowed, from a text such as "Expected `int` >= 1 - at `$.replay.capacity`"."""
+    found = _PROBLEM.match(str(error))
+    assert found is not None
+    path, problem = (found["path"] or "").removeprefix("."), found["problem"]
+    for part in re.findall(r"[^.\[\]]+", path):
+        if is_dataclass(kind) and isinstance(tables, Mapping):
+            kind, tables = fields_of(kind)[part], tables[part]  # type: ignore[arg-type] # a class
+        elif isinstance(tables, list) and part.isdigit():
+            tables = tables[int(part)]
+    if get_origin(kind) is Literal:
+        problem = f"allowed: {', '.join(map(repr, get_args(kind)))}"
+    for word, ours in _WORDS.items():
+        problem = problem.replace(word, ours)
+    return f"{f'{prefix}{path}'.rstrip('.')} = {tables!r}: {problem[0].lower()}{problem[1:]}"
