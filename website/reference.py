@@ -16,7 +16,6 @@ from coop.common.metrics import METRICS
 from coop.common.process.flags import Flag, sections
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS, table_of
-from coop.common.settings.reading import fields_of
 from coop.common.settings.tables import load_tables, preset_names, resolve
 from coop.deploy.local import LocalOptions
 from coop.deploy.router import RouterOptions
@@ -118,22 +117,17 @@ def _last(name: str) -> str:
 
 def _schemas() -> dict[str, Mapping[str, Any]]:
     """JSON schemas of the settings' fields, by section and field; those of the run itself are in section ""."""
+    whole = msgspec.json.schema(RunConfig)["$defs"]
     found: dict[str, Mapping[str, Any]] = {"": {}}
-    for name, schema in _properties(RunConfig).items():
-        kind = fields_of(RunConfig)[name] if "$ref" in schema else None
-        if kind is not None:
-            found[name] = _properties(kind)
+    for name, schema in whole["RunConfig"]["properties"].items():
+        if "$ref" in schema:
+            found[name] = whole[schema["$ref"].rpartition("/")[2]]["properties"]
         elif name not in ("method_settings", "methods"):
             found[""] = {**found[""], name: schema}
     for method in map(METHODS.get, METHODS.names()):
-        if method.settings is not None:
-            found[table_of(method.name)] = _properties(method.settings)
+        if (kind := method.settings) is not None:
+            found[table_of(method.name)] = msgspec.json.schema(kind)["$defs"][kind.__name__]["properties"]
     return found
-
-
-def _properties(kind: type[Any]) -> Mapping[str, Any]:
-    fields: Mapping[str, Any] = msgspec.json.schema(kind)["$defs"][kind.__name__]["properties"]
-    return fields
 
 
 def _allowed(flag: Flag, schema: Mapping[str, Any]) -> str:
