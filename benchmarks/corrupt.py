@@ -120,8 +120,7 @@ def main() -> None:
 def prepare(folder: Path) -> dict[str, tuple[Reader, ...]]:
     """Make the subjects and others of their kind; return the readers of each."""
     for name, seed in (("lockstep", "0"), ("lockstep-other", "1")):
-        with contextlib.redirect_stdout(io.StringIO()):
-            start("coop-lockstep", [*RUN, *SIZED, f"--seed={seed}", f"--run-dir={folder / name}"])
+        call("coop-lockstep", *RUN, *SIZED, f"--seed={seed}", f"--run-dir={folder / name}")
     for name, seed in (("distributed", "0"), ("distributed-other", "1")):
         flags = (*RUN, *SIZED[:1], f"--seed={seed}", f"--run-dir={folder / name}", "--actors=1")
         call("coop-local", *flags, "--replay.journal", "--replay.journal-keep")

@@ -5,6 +5,7 @@ The tests of whole commands share one run; each works on a copy.
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -596,6 +597,7 @@ def test_damage_on_purpose() -> None:
     command = [sys.executable, str(ROOT / "benchmarks" / "corrupt.py"), "--mutations", "60", "--seed", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=880)
     assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"^60 mutations in \d+ s: 0 silent", done.stdout, re.MULTILINE)
 
 
 def test_a_copy_of_a_run_is_no_further_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
