@@ -133,12 +133,12 @@ class Worker:
 
     def __init__(self, name: str) -> None:
         self._thread = ThreadPoolExecutor(1, name)
-        self._job: Future[None] | None = None
+        self._job: Future[None] = self._thread.submit(lambda: None)  # starts the thread
 
     @property
     def busy(self) -> bool:
         """True while a job is being done."""
-        return self._job is not None and not self._job.done()
+        return not self._job.done()
 
     def begin(self, job: Callable[[], None]) -> None:
         """Begin a job."""
@@ -146,8 +146,7 @@ class Worker:
 
     def wait(self, seconds: float | None = None) -> None:
         """Wait until the job is done, at most `seconds`."""
-        if self._job is not None:
-            wait([self._job], seconds)
+        wait([self._job], seconds)
 
 
 def _reported(job: Callable[[], None]) -> None:
