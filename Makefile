@@ -44,7 +44,7 @@ netns: $(READY)
 	@$(BIN)/python benchmarks/netns.py
 
 chaos: $(READY)
-	@$(BIN)/python benchmarks/chaos.py --run-dir runs/chaos-$(STAMP)
+	@$(BIN)/python benchmarks/$(if $(KILLS),storm.py --kills $(KILLS),chaos.py --run-dir runs/chaos-$(STAMP))
 
 soak: $(READY)
 	@$(BIN)/python benchmarks/soak.py

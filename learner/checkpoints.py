@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -15,6 +14,7 @@ from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.messaging.wire import Message
 from coop.common.process.files import FileDigest
+from coop.common.process.lifecycle import Worker
 from coop.learner.shared_checkpoints import SharedCheckpoints
 from coop.records.checkpoints import DONE, KEPT, checkpoint_numbers
 from coop.records.learner_checkpoints import save_checkpoint
@@ -48,15 +48,14 @@ class Checkpoints:
         self._event = event
         self._samples = samples
         self._shared = shared
-        self._writer: threading.Thread | None = None
+        self._writer = Worker("checkpoints")
 
     def begin(self, state: Callable[[], dict[str, Any]]) -> bool:
         """Begin a checkpoint between two updates; do nothing and return False while the last one is being written."""
-        if self._writing():
+        if self._writer.busy:
             return False
         number, frozen, records = self._samples.pin(), state(), self._directory.records()
-        self._writer = threading.Thread(target=self._try, args=(number, frozen, records), name=f"checkpoint {number}")
-        self._writer.start()
+        self._writer.begin(lambda: self._try(number, frozen, records))
         return True
 
     def save(self, state: dict[str, Any]) -> None:
@@ -70,11 +69,7 @@ class Checkpoints:
 
     def wait(self) -> None:
         """Wait for the checkpoint being written, if there is one."""
-        if self._writer is not None:
-            self._writer.join()
-
-    def _writing(self) -> bool:
-        return self._writer is not None and self._writer.is_alive()
+        self._writer.wait()
 
     def _try(self, number: int, state: dict[str, Any], records: dict[str, FileDigest]) -> None:
         try:

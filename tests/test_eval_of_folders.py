@@ -230,6 +230,10 @@ def test_a_gif_for_tensorboard_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     content = short_gif(Film(lambda obs: np.array([0]), EnvSettings(id="coop/Catch-v0"), 0))
     with Image.open(io.BytesIO(content)) as gif:
         assert gif.n_frames == 4
+    monkeypatch.setattr("coop.evaluation.film.MAX_VIDEO", len(content) - 1)
+    content = short_gif(Film(lambda obs: np.array([0]), EnvSettings(id="coop/Catch-v0"), 0))
+    with Image.open(io.BytesIO(content)) as gif:
+        assert gif.n_frames == 2, "half of what would be too large to send"
 
 
 @pytest.mark.parametrize("name", ["coop/Catch-v0", "CartPole-v0"])

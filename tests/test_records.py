@@ -100,8 +100,9 @@ def test_tensorboard_is_cut_back_with_the_records(tmp_path: Path) -> None:
     rows = [json.loads(line)["env_step"] for line in (path / "metrics.jsonl").read_text().splitlines()]
     assert theirs.read_bytes() == b"not a run's"
     theirs.unlink()
-    board = EventAccumulator(str(path / "tb"), purge_orphaned_data=False).Reload()
+    board = EventAccumulator(str(path / "tb"), {"histograms": 0}, purge_orphaned_data=False).Reload()
     assert [each.step for each in board.Scalars("charts/episodic_return")] == ends
     assert [each.step for each in board.Scalars("losses/td_error")] == rows
+    assert [each.step for each in board.Histograms("replay/reuse")] == rows
     kept = [each.step for each in EventAccumulator(str(mine)).Reload().Scalars("charts/episodic_return")]
     assert kept == before[: len(kept)] != before, "nothing behind the checkpoint is left in the old file"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from coop.common.errors import RunError
 from coop.common.process.files import aside_folder, move_aside
+from coop.common.process.lifecycle import Worker
 from coop.records.checkpoints import (
     DONE,
     FOLDER,
@@ -32,7 +33,7 @@ class ReplayCheckpoints:
         self._folder = folder
         self._run_id = run_id
         self._journal = journal
-        self._writer: threading.Thread | None = None
+        self._writer = Worker("checkpoints")
         self._number = -1
         self._on_disk = False
         self._problem = ""
@@ -45,7 +46,7 @@ class ReplayCheckpoints:
         Raises:
             RunError: another checkpoint is being written, or there is no space for the journal.
         """
-        if self._writer is not None and self._writer.is_alive():
+        if self._writer.busy:
             if number == self._number:
                 return
             raise RunError(f"checkpoint {number}: checkpoint {self._number} is still being written")
@@ -71,8 +72,7 @@ class ReplayCheckpoints:
                 raise
 
         self._number, self._on_disk, self._problem = number, False, ""
-        self._writer = threading.Thread(target=write, name=f"checkpoint {number}")
-        self._writer.start()
+        self._writer.begin(write)
 
     def written(self, number: int, seconds: float) -> bool:
         """Wait up to `seconds`; return whether the part of checkpoint `number` is on disk (False: it is being written).
@@ -80,10 +80,10 @@ class ReplayCheckpoints:
         Raises:
             RunError: it was not begun or could not be written.
         """
-        if number != self._number or self._writer is None:
+        if number != self._number:
             raise RunError(f"checkpoint {number} was not begun")
-        self._writer.join(seconds)
-        if self._writer.is_alive():
+        self._writer.wait(seconds)
+        if self._writer.busy:
             return False
         if not self._on_disk:
             raise RunError(self._problem or f"{part_path(self._folder, number)}: the writer ended without a result")
@@ -150,8 +150,7 @@ class ReplayCheckpoints:
 
     def close(self) -> None:
         """Wait for the part being written, and end the journal."""
-        if self._writer is not None:
-            self._writer.join()
+        self._writer.wait()
         if self._journal is not None:
             with contextlib.suppress(OSError):  # the next process reads it like one that was killed
                 self._journal.close()
