@@ -71,6 +71,7 @@ class LockstepRun:
             self._lock.sign()
             if self._found.newest is None:
                 load_initial_networks(self.run.agent)
+                self.notices += self.run.memory.preload(config)
             else:
                 self.run.restore(self._found.newest, replaying)
                 self._found.newest.state.clear()  # only its memory

@@ -134,7 +134,7 @@ def read_transitions(path: Path, number: int) -> tuple[EnvSpec, dict[str, Array]
         slots, frames = arrays["slots"][order], arrays["frames"]  # mapped: each is read from the disk as it is copied
         for name, index in (("obs", slots[:, : spec.stack]), ("next_obs", slots[:, spec.stack :])):
             found[name] = frames[index].reshape(-1, *spec.obs_shape)
-        return spec, {**found, "age": meta["inserted"] - 1 - found["ids"]}
+        return spec, {**found, "age": meta["preloaded"][0] + meta["inserted"] - 1 - found["ids"]}
 
 
 def _read(path: Path, number: int, run_id: int | None) -> tuple[Manifest, dict[str, Any], dict[str, Array]]:
