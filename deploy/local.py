@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from coop.common.envs.make import check_filmed, env_spec
@@ -37,7 +37,7 @@ class LocalOptions(LearnerRunOptions):
     """Flags of `coop-local`."""
 
     actors: int = 1
-    """Actor processes; 0 with --listen, for actors that all run elsewhere."""
+    """Actor processes; 0 with --listen, for actors that all run elsewhere, or to learn from --replay.preload alone."""
     listen: str | None = None
     """Endpoint of the learner, for actors on other machines; a free port on loopback if not given."""
     web: HttpAddress = ""
@@ -77,7 +77,7 @@ class Topology:
         self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]
         self._others += [
             ChildProcess(f"actor process {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")
-            for number in range(1, options.actors + 1)
+            for number in range(1, 1 + (0 if config.replay.offline else options.actors))
         ]
         if config.eval_every or config.video_every:
             evaluating = command("coop-eval", *playing)
@@ -160,8 +160,10 @@ def main() -> None:
 
 def _run() -> None:
     options = parse_run(LocalOptions, "coop-local", "Run a learner, a replay service and actors on this machine.")
-    if options.actors < (0 if options.listen else 1):
-        raise UsageError(f"--actors {options.actors}: must be at least 1, or 0 with --listen")
+    if options.actors == 0 and options.replay.preload and not options.listen:
+        options = replace(options, replay=replace(options.replay, offline=True))
+    if options.actors < (0 if options.listen or options.replay.offline else 1):
+        raise UsageError(f"--actors {options.actors}: must be at least 1, or 0 with --listen or --replay.preload")
     config = options.run_config()
     check_distributed(config)
     check_loopback()

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from coop.common.bounds import MAX_STREAMS
 from coop.common.errors import BadMessage, UsageError
 from coop.common.messaging.messages.insert import check_values
 from coop.common.places import absolute, shown
@@ -14,9 +13,8 @@ from coop.common.settings.config import RunConfig
 from coop.common.transitions import IN_SEGMENT, Segment, filled
 from coop.common.types import EnvSpec, EpisodeEnd
 from coop.records.datasets import Rows, read_rows
+from coop.replay.table.streams import PRELOADED
 from coop.replay.table.table import Table
-
-STREAM = MAX_STREAMS - 1  # of no emulator
 
 
 def preload(table: Table, config: RunConfig) -> list[str]:
@@ -62,4 +60,4 @@ def as_segment(rows: Rows, spec: EnvSpec, sequence: int, *, clip: bool) -> Segme
     check_values(spec, {"frames": frames[first], **columns})
     ends = tuple(EpisodeEnd(int(step), 0.0, 1, 0.0, 0.0, 0.0, 0) for step in np.flatnonzero(rows.ends))
     fields: dict[str, Any] = {"frames": frames[first], **columns}
-    return Segment(incarnation=0, stream=STREAM, sequence=sequence, episodes=ends, **fields)
+    return Segment(incarnation=0, stream=PRELOADED, sequence=sequence, episodes=ends, **fields)
