@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import runpy
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -394,6 +395,15 @@ def test_a_discrete_space_may_begin_elsewhere(tmp_path: Path) -> None:
     (rows,) = datasets.read_rows(folder, env_spec(config_of(folder).env), "x")
     assert rows.actions.tolist() == [0, 1, 1]
     assert rows.ends.tolist() == [False, False, True]
+
+
+def test_the_example_trains_offline_from_its_own_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["offline.py", f"--folder={tmp_path}", "--steps=400"])
+    runpy.run_path(str(Path(__file__).parents[1] / "examples" / "offline.py"), run_name="__main__")
+    summary = coop.load(tmp_path / "offline").summary
+    assert summary is not None
+    assert (summary["env_steps"], summary["updates"], summary["exit"]) == (0, 400, "complete")
+    assert len(coop.load(tmp_path / "offline").evaluations) == 4
 
 
 def test_settings_that_contradict_each_other_are_refused(data: Path, tmp_path: Path) -> None:
