@@ -9,7 +9,7 @@ from pathlib import Path
 from coop.common.envs.make import check_filmed, env_spec
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.transport import new_incarnation
-from coop.common.places import shown
+from coop.common.places import absolute, shown
 from coop.common.process.console import say, stamped
 from coop.common.process.files import make_folder, write_atomic
 from coop.common.process.flags import HttpAddress
@@ -22,6 +22,7 @@ from coop.common.settings.resuming import settings_digest
 from coop.common.settings.tables import to_toml
 from coop.deploy.supervisor import RestartPolicy
 from coop.monitor.watch import Display, Page, RunStatus, live_page
+from coop.records.datasets import check_data_set
 from coop.records.growing import Evaluations
 from coop.records.locks import RunLock
 from coop.records.run_options import LearnerRunOptions, parse_run
@@ -170,6 +171,8 @@ def _run() -> None:
     spec = env_spec(config.env)  # refuses invalid environments before anything starts
     check_memory(config, spec)
     check_messages(config, spec)
+    if (given := config.replay.preload) and not options.start.goes_on:
+        check_data_set(absolute(given, "replay.preload"), spec, f"replay.preload = {given!r}")
     if config.video_every:
         check_filmed(config.env)
     directory = options.directory()

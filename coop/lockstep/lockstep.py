@@ -54,7 +54,8 @@ class Lockstep:
 
     def play(self) -> Iterator[Effects]:
         """Run one iteration of Algorithm 1's inner loop, offline without acting; yields the effects of each update."""
-        learner, turn = self.config.learner, None
+        learner = self.config.learner
+        turn: Turn | None = None
         if not self.config.replay.offline:
             self._policy.acting = self.agent.acting
             self._player.send(self.step, self.agent.updates)

@@ -67,13 +67,14 @@ class LockstepRun:
             raise
         try:
             settings = settings_digest(config)
+            begun = [] if start.goes_on else self.run.memory.preload(config)  # before an older run is moved
             self._found, self.notices = start.prepare(
                 path, replay=not config.streaming, settings=settings, load=load_learner
             )
             self._lock.sign()
             if self._found.newest is None:
                 load_initial_networks(self.run.agent)
-                self.notices += self.run.memory.preload(config)
+                self.notices += begun or self.run.memory.preload(config)
             else:
                 self.run.restore(self._found.newest, replaying)
                 self._found.newest.state.clear()  # only its memory

@@ -70,8 +70,13 @@ def read_rows(path: Path, spec: EnvSpec, source: str) -> Iterator[Rows]:
         yield from _rows(path, spec, source)
     except CoopError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError, RuntimeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
         raise UsageError(f"{source}: {first_line(error)}") from error  # pyarrow's and h5py's are of these
+
+
+def check_data_set(path: Path, spec: EnvSpec, source: str) -> None:
+    """Read the beginning of a data set; raises as `read_rows`."""
+    next(read_rows(path, spec, source), None)
 
 
 def _rows(path: Path, spec: EnvSpec, source: str) -> Iterator[Rows]:
@@ -101,8 +106,16 @@ def _of_parquet(path: Path, spec: EnvSpec) -> Iterator[Rows]:
             raise ValueError(f"has no column {missing[0]}; needed: {', '.join(_COLUMNS)}")
         names = [*_COLUMNS, *(name for name in _OPTIONAL if name in there)]
         _check_groups(file, content, names)
+        before: Rows | None = None
+        episode = None  # of the last transition
         for batch in file.iter_batches(ROWS, columns=names):
-            yield _checked({name: _values(name, batch.column(name), spec) for name in names}, spec)
+            columns = {name: _values(name, batch.column(name), spec) for name in names}
+            if before is not None:
+                before.ends[-1] |= "episode" in columns and columns["episode"][0] != episode
+                yield before
+            before, episode = _checked(columns, spec), columns.get("episode", [None])[-1]
+        if before is not None:
+            yield before
 
 
 def _check_groups(file: Any, content: mmap.mmap, names: Iterable[str]) -> None:  # noqa: ANN401 (a ParquetFile)
@@ -130,9 +143,10 @@ def _values(name: str, column: pa.Array, spec: EnvSpec) -> Array:
     if column.null_count:
         raise ValueError(f"column {name}: has rows without a value")
     if shape and not pa.types.is_primitive(column.type):
-        if not (pa.types.is_fixed_size_list(column.type) or pa.types.is_list(column.type)):
+        any_length = pa.types.is_list(column.type) or pa.types.is_large_list(column.type)
+        if not (any_length or pa.types.is_fixed_size_list(column.type)):
             raise ValueError(f"column {name}: {column.type}; allowed: lists of numbers")
-        lengths = column.value_lengths() if pa.types.is_list(column.type) else None
+        lengths = column.value_lengths() if any_length else None
         held = {column.type.list_size} if lengths is None else {*lengths.unique().to_pylist()}
         if held != {math.prod(shape)}:
             raise ValueError(f"column {name}: rows of {min(held)} values; an observation of {spec.env_id} has {shape}")
@@ -160,7 +174,7 @@ def _of_minari(folder: Path, spec: EnvSpec) -> Iterator[Rows]:
                 arrays[key] = array = _within(h5py, episode, key, h5py.Dataset)
                 expected = shapes.get(key, (steps,))
                 if array.shape != expected or array.dtype.kind not in "biuf":
-                    hint = "; pictures as JPEG are not read, see jpeg_encoding=False" if jpeg else ""
+                    hint = "; pictures as JPEG are not read" if jpeg and len(spec.frame_shape) > 1 else ""
                     raise ValueError(f"{name}/{key}: {array.dtype} {array.shape}; {spec.env_id}: {expected}{hint}")
             for start in range(0, steps, ROWS):
                 rows = slice(start, min(start + ROWS, steps))
@@ -168,7 +182,8 @@ def _of_minari(folder: Path, spec: EnvSpec) -> Iterator[Rows]:
                 columns = {key: arrays[key][rows] for key in ("actions", "rewards", "terminations", "truncations")}
                 columns |= {"observations": obs[:-1], "next_observations": obs[1:]}
                 columns["terminated"], columns["truncated"] = columns.pop("terminations"), columns.pop("truncations")
-                columns["actions"] = columns["actions"] - first
+                if first and columns["actions"].dtype.kind in "iu":
+                    columns["actions"] = columns["actions"].astype(np.int64) - first
                 last = np.arange(rows.start, rows.stop) == steps - 1
                 yield _checked({**columns, "last": last}, spec)
 

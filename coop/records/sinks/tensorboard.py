@@ -15,8 +15,7 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import HistogramProto, Summary, SummaryMetadata
 from tensorboard.compat.proto.tensor_pb2 import TensorProto
 from tensorboard.compat.proto.types_pb2 import DT_STRING
-from tensorboard.plugins.hparams import api_pb2
-from tensorboard.plugins.hparams.summary import session_end_pb
+from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from tensorboard.summary.writer.record_writer import RecordWriter
 
@@ -75,8 +74,12 @@ class TensorBoardSink(ScalarSink):
         """Add what the run has reached, and, for HParams, how it has ended."""
         super().conclude(summary)
         whole = str(summary["exit"]).startswith("complete")
-        end = session_end_pb(api_pb2.STATUS_SUCCESS if whole else api_pb2.STATUS_FAILURE)
-        self._summary(0, *end.value)
+        status = api_pb2.STATUS_SUCCESS if whole else api_pb2.STATUS_FAILURE
+        told = plugin_data_pb2.HParamsPluginData(
+            session_end_info=plugin_data_pb2.SessionEndInfo(status=status, end_time_secs=time.time())
+        )
+        about = metadata.create_summary_metadata(told)
+        self._summary(0, Summary.Value(tag=metadata.SESSION_END_INFO_TAG, metadata=about, tensor=metadata.NULL_TENSOR))
 
     def film(self, gif: bytes, env_step: int) -> None:
         """See `Sink`."""
