@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 import shutil
 from collections.abc import Iterator
@@ -122,7 +123,7 @@ def _env_spec(run: SavedRun) -> Any:  # noqa: ANN401 (gymnasium's EnvSpec)
     settings = run.config.env
     if settings.atari or settings.id not in gym.registry:
         return None
-    spec = gym.spec(settings.id)
+    spec = copy.deepcopy(gym.spec(settings.id))
     spec.kwargs = {**spec.kwargs, **settings.kwargs}
     return spec
 

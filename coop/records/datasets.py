@@ -71,7 +71,8 @@ def read_rows(path: Path, spec: EnvSpec, source: str) -> Iterator[Rows]:
     except CoopError:
         raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
-        raise UsageError(f"{source}: {first_line(error)}") from error  # pyarrow's and h5py's are of these
+        ours = type(error) is ValueError and str(error)  # pyarrow's and h5py's are of these, too
+        raise UsageError(f"{source}: {str(error).splitlines()[0] if ours else first_line(error)}") from error
 
 
 def check_data_set(path: Path, spec: EnvSpec, source: str) -> None:
