@@ -417,7 +417,7 @@ def test_settings_that_contradict_each_other_are_refused(data: Path, tmp_path: P
         coop.train(distributed=True, actors=0, run_dir=tmp_path / "b")
     config = resolve({"replay": {"preload": str(data)}})
     assert config.replay.learning_starts == 1
-    with pytest.warns(UserWarning, match=r"actor.epsilon_start has no effect: nobody acts, replay.offline"):
+    with pytest.warns(UserWarning, match=r"actor.epsilon-start has no effect: nobody acts, replay.offline"):
         run = coop.train(
             actors=0,
             total_steps=40,
