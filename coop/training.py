@@ -25,6 +25,9 @@ from coop.common.settings.overrides import leaves, merged
 from coop.common.settings.resuming import settings_digest
 from coop.common.settings.starting import env_id_of, stated
 from coop.common.settings.tables import to_tables, to_toml, validated
+from coop.evaluation.buffer import Buffer, ask_and_wait
+from coop.evaluation.notebook import table_html
+from coop.evaluation.saved import load
 from coop.lockstep.run import LockstepRun
 from coop.records.following import Callback, Callbacks, MetricsFollowing
 from coop.records.locks import RunLock
@@ -60,6 +63,11 @@ class TrainingRun:
         state = "running" if self.running else "failed" if self._failure else "ended"
         return f"<run {str(self.directory)!r}: {self.config.env.id}, {self.config.method}, {state}>"
 
+    def _repr_html_(self) -> str:
+        if not (self.directory / "config.toml").exists():  # its process has not begun
+            return table_html({"run": repr(self).strip("<>")})
+        return load(self.directory)._repr_html_()
+
     @property
     def running(self) -> bool:
         """True until the run has ended and its files are complete."""
@@ -87,6 +95,17 @@ class TrainingRun:
                 break
             self._thread.join(POLL)
         self.wait()
+
+    def buffer(self, timeout: float = 60.0) -> Buffer:
+        """The transitions that the replay table holds now: the run saves a checkpoint for it, and goes on.
+
+        Raises:
+            UsageError: the run has no table, or has ended without a checkpoint.
+            RunError: it saved none within `timeout` seconds, for instance because it waits before its first update.
+        """
+        if self.running and not self.config.streaming:
+            ask_and_wait(self.directory, timeout, lambda: self.running)
+        return load(self.directory).buffer()
 
     def stop(self) -> dict[str, Any] | None:
         """Stop the run cleanly, with a closing checkpoint from which `resume=True` goes on; returns as `wait`."""
@@ -154,7 +173,8 @@ def train(
         run_dir: folder for the run's files; runs/ENV-METHOD-sSEED-TIME if not given.
         distributed: run a learner, a replay service and `actors` actors as processes of this machine; otherwise the
             run is one of `coop-lockstep`, in a thread of this process.
-        actors: actor processes of a distributed run.
+        actors: actor processes of a distributed run; 0 for a run that learns from the data set `replay.preload` alone,
+            of either kind (`replay.offline`).
         resume: continue the run in `run_dir`, from its newest whole checkpoint; start it if there is none yet.
         resume_from: as `resume`, but go back to the checkpoint with this number first.
         overwrite: start over where `run_dir` holds a run, which is moved to its folder aside/.
@@ -174,6 +194,9 @@ def train(
     callbacks = Callbacks({"on_metrics": on_metrics, "on_episode": on_episode, "on_evaluation": on_evaluation})
     named, names = [*allow_import, *_named({"method": method, **settings})], chosen_sinks(log)
     permit(named)
+    replay = settings.get("replay", {})
+    if actors == 0 and isinstance(replay, Mapping) and replay.get("preload"):
+        settings["replay"] = {**replay, "offline": True}
     given = stated(settings)
     start = Start(resume, resume_from, overwrite)
     options = _options(preset, method, config, run_dir, start, settings, given, lockstep=not distributed)
@@ -182,15 +205,15 @@ def train(
         warnings.warn(line, stacklevel=2)
     say(options.settings)
     if not distributed:
-        if actors != 1:
+        if actors != 1 and not run_config.replay.offline:
             raise UsageError(f"actors = {actors}: in distributed runs only; a lockstep run is one process")
         directory = options.directory()
         run = LockstepRun(run_config, directory, "coop.train", options.start, log=names)
         for line in run.notices:
             say(line)
         return TrainingRun(run_config, directory, lambda stop: _play(run, stop, callbacks))
-    if actors < 1:
-        raise UsageError(f"actors = {actors}: must be at least 1")
+    if actors < (0 if run_config.replay.offline else 1):
+        raise UsageError(f"actors = {actors}: must be at least 1, or 0 with replay.preload")
     check_distributed(run_config)
     topology = _topology(run_config, options.directory(), actors, options.start, named, names)
     return TrainingRun(run_config, topology.directory, lambda stop: topology.play(stop, callbacks))

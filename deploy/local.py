@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from coop.common.envs.make import check_filmed, env_spec
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.transport import new_incarnation
-from coop.common.places import shown
+from coop.common.places import absolute, shown
 from coop.common.process.console import say, stamped
 from coop.common.process.files import make_folder, write_atomic
 from coop.common.process.flags import HttpAddress
@@ -22,6 +22,7 @@ from coop.common.settings.resuming import settings_digest
 from coop.common.settings.tables import to_toml
 from coop.deploy.supervisor import RestartPolicy
 from coop.monitor.watch import Display, Page, RunStatus, live_page
+from coop.records.datasets import check_data_set
 from coop.records.growing import Evaluations
 from coop.records.locks import RunLock
 from coop.records.run_options import LearnerRunOptions, parse_run
@@ -37,7 +38,7 @@ class LocalOptions(LearnerRunOptions):
     """Flags of `coop-local`."""
 
     actors: int = 1
-    """Actor processes; 0 with --listen, for actors that all run elsewhere."""
+    """Actor processes; 0 with --listen, for actors that all run elsewhere, or to learn from --replay.preload alone."""
     listen: str | None = None
     """Endpoint of the learner, for actors on other machines; a free port on loopback if not given."""
     web: HttpAddress = ""
@@ -77,7 +78,7 @@ class Topology:
         self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]
         self._others += [
             ChildProcess(f"actor process {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")
-            for number in range(1, options.actors + 1)
+            for number in range(1, 1 + (0 if config.replay.offline else options.actors))
         ]
         if config.eval_every or config.video_every:
             evaluating = command("coop-eval", *playing)
@@ -160,14 +161,18 @@ def main() -> None:
 
 def _run() -> None:
     options = parse_run(LocalOptions, "coop-local", "Run a learner, a replay service and actors on this machine.")
-    if options.actors < (0 if options.listen else 1):
-        raise UsageError(f"--actors {options.actors}: must be at least 1, or 0 with --listen")
+    if options.actors == 0 and options.replay.preload and not options.listen:
+        options = replace(options, replay=replace(options.replay, offline=True))
+    if options.actors < (0 if options.listen or options.replay.offline else 1):
+        raise UsageError(f"--actors {options.actors}: must be at least 1, or 0 with --listen or --replay.preload")
     config = options.run_config()
     check_distributed(config)
     check_loopback()
     spec = env_spec(config.env)  # refuses invalid environments before anything starts
     check_memory(config, spec)
     check_messages(config, spec)
+    if (given := config.replay.preload) and not options.start.goes_on:
+        check_data_set(absolute(given, "replay.preload"), spec, f"replay.preload = {given!r}")
     if config.video_every:
         check_filmed(config.env)
     directory = options.directory()

@@ -129,7 +129,7 @@ def _mirror(config: RunConfig, spec: EnvSpec, device: torch.device, console: Con
         if slots <= room:
             return DeviceMirror(spec, slots, device)
         console.event(f"the mirror of the table is in the host's memory; the GPU has room for {room:,.0f} of {slots:,}")
-    slots, most = mirror_slots(config, spec), min(config.replay.capacity, config.total_steps)
+    slots, most = mirror_slots(config, spec), config.most_held
     if slots < most:
         console.event(f"the mirror of the table has room for {slots:,} of {most:,} frames")
     return FrameMirror(spec, slots) if slots else None

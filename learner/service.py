@@ -23,6 +23,7 @@ from coop.learner.join_service import JoinService
 from coop.learner.status import StatusReporter
 from coop.learner.summary import summarise
 from coop.learner.trainer import Effects, Trainer
+from coop.records.checkpoints import take_request
 from coop.records.run_directory import RunDirectory
 from coop.records.summaries import Summary
 
@@ -132,6 +133,8 @@ class LearnerService:
         """Publish the status for displays, and repeat the role for actors that missed it."""
         now = time.monotonic()
         self._status_due = now + STATUS_EVERY
+        if take_request(self._directory.path):
+            self._trainer.ask_checkpoint()
         self._broadcaster.publish_role()
         status = self._reporter.publish(now)
         self._console.progress(status.updates, status.waiting, lambda: progress_line(msgspec.structs.asdict(status)))

@@ -11,6 +11,7 @@ def summarise(
 ) -> Summary:
     """Summarise a run that ends at `now`, in seconds of the trainer's clock."""
     config, telemetry = trainer.config, trainer.telemetry
+    env_steps = 0 if config.replay.offline else env_steps
     return Summary(
         method=config.method,
         env=config.env.id,

@@ -131,6 +131,10 @@ class Trainer:
         """True if a checkpoint should begin now; it stays due until `checkpoint_begun`."""
         return self.agent.updates >= self._next_checkpoint and self.saveable()
 
+    def ask_checkpoint(self) -> None:
+        """Make a checkpoint due after the next update."""
+        self._next_checkpoint = min(self._next_checkpoint, self.agent.updates + 1)
+
     def checkpoint_begun(self) -> None:
         """Count updates to the next checkpoint from here."""
         self._next_checkpoint = self.agent.updates + self._checkpoint_every

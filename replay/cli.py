@@ -28,6 +28,7 @@ from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.folder import ReplayFolder
 from coop.replay.persistence.journal import Journal
 from coop.replay.persistence.recovery import recover
+from coop.replay.preload import preload
 from coop.replay.service import ReplayService
 
 
@@ -116,7 +117,7 @@ def _service(
 
     Raises:
         RunError: the folder belongs to another run, or the journal cannot be read or written.
-        UsageError: the folder's table has other settings.
+        UsageError: the folder's table has other settings, or the data set of `replay.preload` can't be used.
     """
     if reply.run_id != folder.run_id:
         raise RunError(f"another learner of run {node.run!r} has begun while this one joined")
@@ -128,6 +129,8 @@ def _service(
         raise RunError(f"{folder.path}: {error.strerror or error}") from error
     first, found = checkpoints.restore(core, reply.checkpoint)
     for line in filter(None, (aside, found)):
+        console.event(line)
+    for line in () if core.table.preloaded else preload(core.table, reply.config):
         console.event(line)
     settings, synced = reply.config.replay, None
     if settings.journal != "off":

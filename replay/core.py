@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
@@ -72,15 +73,12 @@ class ReplayCore:
     def __init__(
         self, config: RunConfig, spec: EnvSpec, recorder: Recorder | None = None, *, shared_memory: bool = False
     ) -> None:
-        settings = config.replay
         self.table = make_table(config, spec, shared_memory=shared_memory)
-        self.limiter = RateLimiter(
-            settings.ratio, settings.learning_starts, settings.tolerance, config.total_steps, settings.capacity
-        )
+        self.limiter = make_limiter(config)
         self.recorder: Recorder = recorder or NullRecorder()
         self.batch_size = config.learner.batch_size
         self.segment_steps = config.actor.segment_steps
-        self._total_steps = config.total_steps
+        self._total_steps, self._offline = config.total_steps, config.replay.offline
         self.drawn = 0
         self.mirrored = MirroredFrames()
         self.duplicates = 0
@@ -206,7 +204,7 @@ class ReplayCore:
         first, episodes = self._episodes.since(request.episodes_from, MAX_EPISODES)
         drawn = Drawn(
             sequence=request.sequence,
-            inserted=table.inserted,
+            inserted=self._stood_for() if self._offline else table.inserted,
             size=len(table),
             evicted=table.evicted,
             evicted_unsampled=table.evicted_unsampled,
@@ -219,14 +217,22 @@ class ReplayCore:
         self._replies[request.sequence] = reply = Reply(batch, drawn)
         return reply
 
+    def _stood_for(self) -> int:
+        """The steps of an offline run that the batches drawn so far stand for."""
+        last = self.drawn >= (self.limiter.draws_total or 0)
+        return self._total_steps if last else math.ceil((self.drawn - 0.5) / self.limiter.ratio)
+
     def limit(self, limiter: RateLimiter) -> None:
-        """Change the limiter's settings; raises OSError if they cannot be recorded."""
+        """Change the limiter's settings; raises OSError if they cannot be recorded, RunError if there is no ratio."""
+        if self._offline:
+            raise RunError("an offline run has no steps, and so no ratio to keep")
         self.recorder.limit(limiter)
         self.limiter = limiter
 
     def restore_limiter(self, limiter: RateLimiter) -> None:
         """Restore earlier settings, with the run's present length, which may have grown."""
-        self.limiter = replace(limiter, total=self._total_steps)
+        if not self._offline:
+            self.limiter = replace(limiter, total=self._total_steps)
 
     def snapshot(self, base: int, keep: Sequence[int] = ()) -> CoreSnapshot:
         """Take a snapshot that can serve a learner restored at `base` updates.
@@ -293,6 +299,14 @@ class ReplayCore:
             reply = self._replies.pop(sequence, None)
             if reply is not None:
                 reply.batch.frames.release()
+
+
+def make_limiter(config: RunConfig) -> RateLimiter:
+    """The limiter of a run; that of an offline one admits no insert, and every planned draw from the start on."""
+    replay = config.replay
+    if replay.offline:
+        return RateLimiter(replay.ratio, 0, replay.tolerance, 0, replay.capacity, (0, config.planned_updates))
+    return RateLimiter(replay.ratio, replay.learning_starts, replay.tolerance, config.total_steps, replay.capacity)
 
 
 def make_table(config: RunConfig, spec: EnvSpec, *, shared_memory: bool = False) -> Table:

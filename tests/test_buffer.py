@@ -66,15 +66,51 @@ def test_it_holds_what_the_table_draws(
     assert all(before[number] + draws[number] == reuse for number, reuse in zip(batch.ids, batch.reuse, strict=True))
     assert buffer.reuse.sum() > 0
     prioritized, by_episode = "sampling" in replay, "BestReturns" in replay["eviction"]
-    assert (buffer.priority is not None, buffer.episode is not None) == (prioritized, by_episode)
+    assert (buffer.priority is not None) == prioritized
     if buffer.priority is not None:
         assert len(np.unique(buffer.priority)) > 5
-    if buffer.episode is not None:
-        assert len(np.unique(buffer.episode)) > 3
+    records = coop.load(tmp_path).episodes
+    ends = records["env_step"].to_numpy()
+    assert buffer.episode is not None
+    assert buffer.episode.tolist() == [int((ends <= number).sum()) for number in buffer.ids]
+    assert len(np.unique(buffer.episode)) > (3 if by_episode else 1)
+    over = buffer.ids < ends[-1]
+    assert not (buffer.terminated[~over]).any()
+    assert buffer.truncated is not None
+    assert not buffer.truncated.any(), "these games end by themselves"
     frame = buffer.frame()
     assert list(frame) == list(buffer.columns())
     np.testing.assert_array_equal(np.stack(list(frame["observations"])), buffer.observations)
     assert frame["actions"].tolist() == buffer.actions.tolist()
+
+
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_it_says_which_transitions_were_truncated(n_step: int, tmp_path: Path) -> None:
+    replay = {**SMALL, "capacity": 100, "n_step": n_step}
+    saved(tmp_path, env={"id": "CartPole-v1", "max_episode_steps": 7}, replay=replay)
+    buffer = coop.load(tmp_path).buffer()
+    assert buffer.truncated is not None
+    assert buffer.length is not None
+    ends = coop.load(tmp_path).episodes["env_step"].to_numpy()
+    assert len(ends) >= 9
+    assert ends[:3].tolist() == [7, 14, 21], "too short to fall"
+    cut = [number for number in buffer.ids if any(0 < end - number <= n_step for end in ends)]
+    assert buffer.ids[buffer.truncated].tolist() == cut
+    assert set(buffer.length[buffer.ids < ends[-1]]) == {7}
+
+
+def test_a_running_run_gives_its_buffer_and_goes_on(tmp_path: Path) -> None:
+    run = coop.train(method="dqn", total_steps=10**6, run_dir=tmp_path, replay={**SMALL, "capacity": 10**6})
+    try:
+        first = run.buffer()
+        again = coop.load(tmp_path).buffer(live=True)
+        assert run.running
+        assert len(again) > len(first) >= SMALL["learning_starts"]
+        np.testing.assert_array_equal(again.observations[: len(first)], first.observations)
+        assert not (tmp_path / "checkpoints" / "ASKED").exists()
+    finally:
+        run.stop()
+    assert len(run.buffer()) == len(coop.load(tmp_path).buffer(live=True)) >= len(again), "of the closing checkpoint"
 
 
 def test_a_run_without_a_whole_table_is_refused(tmp_path: Path) -> None:

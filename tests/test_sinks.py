@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
 from tensorboard.context import RequestContext
 from tensorboard.plugins.base_plugin import TBContext
-from tensorboard.plugins.hparams import api_pb2, get_experiment
+from tensorboard.plugins.hparams import api_pb2, get_experiment, list_session_groups
 from tensorboard.plugins.hparams.backend_context import Context
 from test_screen import STATUS
 
@@ -37,6 +37,13 @@ from coop.records.run_options import base_config
 from coop.records.sinks import Kept, Sink, chosen_sinks
 from website.assemble import assembled
 
+GRID = {
+    "methods": ["dqn"],
+    "seeds": [3],
+    "preset": "cartpole",
+    "fixed": {"total_steps": 300, "network": {"hidden": [8]}, "replay": {"learning_starts": 50}},
+    "vary": {"replay": {"capacity": [60, 90]}},
+}
 PAGE = assembled("docs/watching.md")
 BLOCK, HEADER = 32768, 7  # bytes, of the log in which wandb keeps its records
 
@@ -169,9 +176,7 @@ def mlflow_store(folder: Path) -> Any:
 
 def test_the_runs_of_a_sweep_are_an_experiment(tmp_path: Path) -> None:
     pytest.importorskip("mlflow", reason="needs the extra mlflow")
-    config = {"total_steps": 300, "replay": {"learning_starts": 50}}
-    grid = {"preset": "cartpole", "mode": "lockstep", "config": config, "vary": {"seed": [0, 1]}}
-    done = coop.sweep(grid, tmp_path / "study", jobs=2, log=["mlflow"])
+    done = coop.sweep(GRID, tmp_path / "study", jobs=2, stack=1, log=["mlflow"])
     assert not done.failed
     assert not list((tmp_path / "study").glob("*/tb")), "which --log does not name"
     store = mlflow_store(tmp_path / "study" / "mlruns")
@@ -179,7 +184,51 @@ def test_the_runs_of_a_sweep_are_an_experiment(tmp_path: Path) -> None:
     runs = store.search_runs([experiment.experiment_id])
     assert experiment.name == "study"
     assert {each.info.run_name for each in runs} == set(done.runs.index)
-    assert {each.data.params["seed"] for each in runs} == {"0", "1"}
+    assert {each.data.params["replay.capacity"] for each in runs} == {"60", "90"}
+    assert {each.data.tags["coop.replay.capacity"] for each in runs} == {"60", "90"}
+    means = done.runs["return_mean_100"].to_dict()
+    assert {each.info.run_name: each.data.metrics["final/return_mean_100"] for each in runs} == pytest.approx(means)
+
+
+def test_the_runs_of_a_sweep_are_a_group_with_tags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("wandb", reason="needs the extra wandb")
+    from wandb.proto.wandb_internal_pb2 import Record  # noqa: PLC0415
+
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_TAGS", "mine")
+    done = coop.sweep(GRID, tmp_path / "study", jobs=1, stack=1, log="wandb")
+    assert not done.failed
+    for name, row in done.runs.iterrows():
+        (file,) = (tmp_path / "study" / str(name)).glob("wandb/offline-run-*/*.wandb")
+        found = [Record.FromString(data) for data in records(file)]
+        (run,) = [record.run for record in found if record.HasField("run")][:1]
+        assert (run.run_group, run.display_name) == ("study", name)
+        assert {*run.tags} == {"mine", "method=dqn", "seed=3", f"replay.capacity={row['replay.capacity']}"}
+        final = {item.key or item.nested_key[0]: item.value_json for each in found for item in each.history.item}
+        assert json.loads(final["final/return_mean_100"]) == pytest.approx(row["return_mean_100"])
+
+
+def test_hparams_compare_the_cells_of_a_grid(tmp_path: Path) -> None:
+    done = coop.sweep(GRID, tmp_path, jobs=1, stack=1)
+    multiplexer = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
+    context = Context(TBContext(data_provider=MultiplexerDataProvider(multiplexer, str(tmp_path))))
+    asked = api_pb2.GetExperimentRequest(experiment_name="", include_metrics=True)
+    shown = get_experiment.Handler(RequestContext(), context, "", asked).run()
+    assert {each.name for each in shown.hparam_infos} == {"method", "seed", "replay.capacity"}
+    assert "final/return_mean_100" in {each.name.tag for each in shown.metric_infos}
+    statuses = [api_pb2.STATUS_UNKNOWN, api_pb2.STATUS_SUCCESS, api_pb2.STATUS_FAILURE, api_pb2.STATUS_RUNNING]
+    request = api_pb2.ListSessionGroupsRequest(
+        experiment_name="", allowed_statuses=statuses, start_index=0, slice_size=10, include_metrics=True
+    )
+    for info in shown.metric_infos:
+        request.col_params.add(metric=info.name)
+    rows = list_session_groups.Handler(RequestContext(), context, "", request).run().session_groups
+    found = {}
+    for row in rows:
+        values = {each.name.tag: each.value for each in row.metric_values}
+        found[int(row.hparams["replay.capacity"].number_value)] = values["final/return_mean_100"]
+        assert row.sessions[0].status == api_pb2.STATUS_SUCCESS
+    assert found == pytest.approx(done.runs.set_index("replay.capacity")["return_mean_100"].to_dict())
 
 
 def test_tensorboards_hparams_show_settings_and_metrics(tmp_path: Path) -> None:

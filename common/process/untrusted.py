@@ -7,6 +7,7 @@ compared with the bytes that are there before memory is taken for it.
 from __future__ import annotations
 
 import io
+import mmap
 import os
 import pickle
 import re
@@ -228,7 +229,7 @@ def _nothing(*_: Any) -> None:  # noqa: ANN401 (the arguments that make a tensor
     return None
 
 
-def page_sizes(content: bytes, start: int, length: int) -> Iterator[tuple[int, int]]:
+def page_sizes(content: bytes | mmap.mmap, start: int, length: int) -> Iterator[tuple[int, int]]:
     """Bytes, once decompressed, and values of each page of a column in a Parquet file, as the page declares them.
 
     start, length: of the column's pages in the file, in bytes. The file's footer says the same of whole columns, but
@@ -255,7 +256,7 @@ def page_sizes(content: bytes, start: int, length: int) -> Iterator[tuple[int, i
     raise ValueError(f"more than {MAX_ENTRIES:,} pages in a column")
 
 
-def _thrift(content: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+def _thrift(content: bytes | mmap.mmap, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
     """The fields of a structure in Thrift's compact protocol, by number, and the place after it.
 
     Integers and structures only: texts, which statistics have, are passed over, and lists no page's header has.
@@ -283,7 +284,7 @@ def _thrift(content: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], in
     return fields, at + 1
 
 
-def _varint(content: bytes, at: int) -> tuple[int, int]:
+def _varint(content: bytes | mmap.mmap, at: int) -> tuple[int, int]:
     value = shift = 0
     while shift < 64:
         byte = content[at]
@@ -293,6 +294,6 @@ def _varint(content: bytes, at: int) -> tuple[int, int]:
     raise ValueError("a number without an end")
 
 
-def _zigzag(content: bytes, at: int) -> tuple[int, int]:
+def _zigzag(content: bytes | mmap.mmap, at: int) -> tuple[int, int]:
     value, at = _varint(content, at)
     return value >> 1 ^ -(value & 1), at

@@ -48,17 +48,18 @@ def mirror_slots(config: RunConfig, spec: EnvSpec) -> int:
 
 def table_slots(config: RunConfig, spec: EnvSpec) -> int:
     """Slots that a run's full table may come to use, and some for frames of batches that are on their way."""
-    return int(1.25 * min(config.replay.capacity, config.total_steps) * _copies(config, spec)) + SPARE_SLOTS
+    return int(1.25 * config.most_held * _copies(config, spec)) + SPARE_SLOTS
 
 
 def _most_bytes(config: RunConfig, spec: EnvSpec) -> int:
     """Bytes of a run's full table."""
-    return estimated_bytes(spec, min(config.replay.capacity, config.total_steps)) * _copies(config, spec)
+    return estimated_bytes(spec, config.most_held) * _copies(config, spec)
 
 
 def _copies(config: RunConfig, spec: EnvSpec) -> int:
-    """Frames per transition: policies that do not evict in order may keep stack + 1."""
-    return 1 if EVICTIONS.get(config.replay.eviction).in_order else spec.stack + 1
+    """Frames per transition: policies that do not evict in order, and data sets, may keep stack + 1."""
+    in_order = EVICTIONS.get(config.replay.eviction).in_order and not config.replay.preload
+    return 1 if in_order else spec.stack + 1
 
 
 def check_messages(config: RunConfig, spec: EnvSpec) -> None:

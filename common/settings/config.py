@@ -157,7 +157,8 @@ class ReplaySettings:
     capacity: Steps = 5000
     """Exact number of transitions in the full table."""
     learning_starts: Steps = 500
-    """Transitions to collect before the first update; unless given, at most the capacity and a tenth of the run."""
+    """Transitions to collect before the first update; unless given, at most the capacity and a tenth of the run, and as
+    few as possible with `preload`."""
     ratio: Annotated[float, Meta(gt=0, le=MAX_RATIO)] = 1.0
     """Updates per environment step."""
     tolerance: Annotated[float, Meta(gt=0, le=MAX_TOLERANCE)] = 64.0
@@ -180,6 +181,12 @@ class ReplaySettings:
     segments are on the disk before they are acknowledged."""
     journal_keep: bool = False
     """Keep journal files that a checkpoint has made redundant: the run can then be re-executed from its beginning."""
+    preload: str = ""
+    """Transitions that the table holds before the first step: a Parquet file of coop-export, or the folder of a Minari
+    data set; the process of the table reads it."""
+    offline: bool = False
+    """Learn from `preload` alone: no emulator plays, and total_steps counts the steps that updates stand for, by the
+    ratio."""
 
     @cached_property
     def prioritized(self) -> bool:
@@ -255,7 +262,13 @@ class RunConfig:
     @cached_property
     def planned_updates(self) -> int:
         """Updates of a run of all `total_steps`: the ratio applies from `learning_starts` on."""
-        return updates_due(self.replay.ratio, self.total_steps - self.replay.learning_starts)
+        start = 0 if self.replay.offline else self.replay.learning_starts
+        return updates_due(self.replay.ratio, self.total_steps - start)
+
+    @cached_property
+    def most_held(self) -> int:
+        """The most transitions that the table of this run can hold."""
+        return self.replay.capacity if self.replay.preload else min(self.replay.capacity, self.total_steps)
 
     @cached_property
     def two_networks(self) -> bool:

@@ -50,6 +50,7 @@ _CONDITIONS = (
         lambda c: SAMPLERS.get(c.replay.sampling).priorities,
         "replay.sampling = {c.replay.sampling!r}",
     ),
+    Condition(("actor.", "replay.learning_starts"), lambda c: not c.replay.offline, "nobody acts, replay.offline"),
     Condition(
         ("actor.epsilon_steps", "actor.epsilon_decay"),
         lambda c: c.actor.epsilon_start != c.actor.epsilon_final,

@@ -25,13 +25,16 @@ def check_rules(config: RunConfig) -> None:
 def fitted(config: ConfigT, given: Collection[str], *, lockstep: bool = False) -> ConfigT:
     """The config in which what nobody has asked for gives way to what somebody has.
 
-    Learning starts with a full table at the latest, and a lockstep run plays one emulator.
+    Learning starts with a full table at the latest, at once if the table is full from the start on, and a lockstep run
+    plays one emulator.
 
     given: the settings asked for, as dotted names; those of a preset or a file are not among them.
     """
     replay, actor = config.replay, config.actor
-    if "replay.learning_starts" not in given and replay.learning_starts > replay.capacity:
-        config = replace(config, replay=replace(replay, learning_starts=max(replay.n_step, replay.capacity)))
+    if "replay.learning_starts" not in given:
+        latest = 1 if "replay.preload" in given and replay.preload else replay.capacity
+        if replay.learning_starts > latest:
+            config = replace(config, replay=replace(replay, learning_starts=max(replay.n_step, latest)))
     if lockstep and "actor.num_envs" not in given and actor.num_envs != 1:
         config = replace(config, actor=replace(actor, num_envs=1))
     return config
@@ -43,7 +46,7 @@ def _problems(config: RunConfig) -> Iterator[str]:
         kinds = ", ".join(NETWORK_KINDS)
         yield f"network.kind = {config.network.kind!r}: allowed: {kinds}, or module:function"
     for name, most in (("replay.capacity", replay.capacity), ("total_steps", config.total_steps)):
-        if replay.learning_starts > most:
+        if replay.learning_starts > most and not replay.offline:
             yield f"replay.learning_starts = {replay.learning_starts}: must not exceed {name} = {most}"
     if replay.learning_starts < replay.n_step:
         yield f"replay.learning_starts = {replay.learning_starts}: allowed: at least replay.n_step = {replay.n_step}"
@@ -52,7 +55,7 @@ def _problems(config: RunConfig) -> Iterator[str]:
         asked = f"actor.segment_steps = {config.actor.segment_steps}"
         yield f"{asked}: allowed: at most {most} with replay.n_step = {replay.n_step}"
     if config.planned_updates < 1:
-        least = replay.learning_starts + math.ceil(0.5 / replay.ratio)
+        least = (0 if replay.offline else replay.learning_starts) + math.ceil(0.5 / replay.ratio)
         yield (
             f"total_steps = {config.total_steps}: plans no update; allowed: at least {least} "
             f"with replay.learning_starts = {replay.learning_starts} and replay.ratio = {replay.ratio:g}"
@@ -76,3 +79,7 @@ def _replay_problems(config: RunConfig) -> Iterator[str]:
         yield f"replay.sampling = {replay.sampling!r}: allowed: {able} with replay.replacement = False"
     if replay.journal_keep and replay.journal == "off":
         yield "replay.journal_keep = True: needs replay.journal = 'async' or 'sync'"
+    if replay.offline and not replay.preload:
+        yield "replay.offline = True: needs the data set that the run learns from, replay.preload"
+    if replay.preload and config.streaming:
+        yield f"replay.preload = {replay.preload!r}: not for method {config.method!r}, which has no replay buffer"

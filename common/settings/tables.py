@@ -82,7 +82,7 @@ def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     """Turn tables into a checked config; a `[methods.NAME]` table overrides the rest for that method.
 
     Two defaults follow from other fields: epsilon falls over a tenth of the run, and learning starts with 500
-    transitions, or with fewer where the table holds fewer or a tenth of the run is shorter.
+    transitions, or with fewer where the table holds fewer or a tenth of the run is shorter; at once behind a data set.
 
     Raises:
         UsageError: an unknown field or a value out of range; names the field, the value and what is allowed.
@@ -99,7 +99,7 @@ def _completed(tables: dict[str, Any]) -> dict[str, Any]:
     tenth, capacity = max(1, int(steps) // 10), replay.get("capacity", ReplaySettings.capacity)
     if "learning_starts" not in replay and _whole(capacity):
         least = replay.get("n_step", ReplaySettings.n_step)
-        start = min(ReplaySettings.learning_starts, int(capacity), tenth)
+        start = 1 if replay.get("preload") else min(ReplaySettings.learning_starts, int(capacity), tenth)
         replay = {**replay, "learning_starts": max(start, least) if isinstance(least, int) else start}
     return {**tables, "replay": replay, "actor": {"epsilon_steps": tenth, **actor}}
 

@@ -1,4 +1,4 @@
-"""Writes a buffer to a Parquet file, one row a transition."""
+"""Writes a buffer to a Parquet file, one row a transition, or whole episodes to a Minari data set."""
 
 from __future__ import annotations
 
@@ -7,11 +7,42 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from coop.common.errors import RunError, UsageError
+from coop.common.imports import check_extra
+from coop.common.places import shown
 from coop.common.process.files import make_folder, sync_file, sync_folder
 from coop.evaluation.buffer import Buffer
+from coop.evaluation.minari import NotWholeError, export_minari
 from coop.evaluation.saved import SavedRun
+from coop.records.datasets import TRANSITIONS
 
 ROWS_AT_ONCE = 1024  # in memory as Arrow's arrays, and a row group of the file
+GROUP_BYTES = 1 << 26  # of a row group, in which pictures are fewer
+
+
+def export_to(run_dir: Path, path: Path) -> str:
+    """Write a run's transitions to a file that ends in .parquet, or to a new folder; return what was written, in words.
+
+    A folder gets a Minari data set of whole episodes, or a Parquet file where the run has none.
+
+    Raises:
+        UsageError: the run has no transitions here, or `path` exists.
+        RunError: a library is not installed, or `path` cannot be written.
+    """
+    if path.suffix == ".parquet":
+        buffer, why = export_dataset(run_dir, path), ""
+        return f"checkpoint {buffer.checkpoint} in {shown(run_dir)}: {len(buffer):,} transitions in {shown(path)}"
+    if path.exists() or path.is_symlink():
+        raise UsageError(f"--dataset {path}: exists already; name a new folder")
+    try:
+        check_extra("a Minari data set", "minari", "h5py")
+        check_extra("a Minari data set", "minari", "minari")
+        return f"{shown(run_dir)}: {export_minari(run_dir, path)} in {shown(path)}"
+    except (NotWholeError, UsageError) as error:
+        why = str(error)
+    buffer = export_dataset(run_dir, path / TRANSITIONS)
+    place = shown(path / TRANSITIONS)
+    told = f"checkpoint {buffer.checkpoint} in {shown(run_dir)}: {len(buffer):,} transitions in {place}"
+    return f"{told}, not as episodes of Minari: {why}"
 
 
 def export_dataset(run_dir: Path, file: Path) -> Buffer:
@@ -55,8 +86,10 @@ def _write(buffer: Buffer, path: Path) -> None:
         fields.append(pa.field(name, stored, nullable=False, metadata={"shape": str(shape)}))
     schema = pa.schema(fields, {"env_id": buffer.spec.env_id, "checkpoint": str(buffer.checkpoint)})
     with path.open("xb") as file, pq.ParquetWriter(file, schema) as writer:
-        for start in range(0, len(buffer), ROWS_AT_ONCE):
-            rows = slice(start, start + ROWS_AT_ONCE)
+        row_bytes = sum(array[:1].nbytes for array in columns.values())
+        at_once = max(1, min(ROWS_AT_ONCE, GROUP_BYTES // max(1, row_bytes)))
+        for start in range(0, len(buffer), at_once):
+            rows = slice(start, start + at_once)
             arrays = [pa.array(array[rows].ravel()) for array in columns.values()]
             lists = [
                 pa.FixedSizeListArray.from_arrays(array, type=field.type)

@@ -6,9 +6,10 @@ import hashlib
 import importlib.util
 import io
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -114,19 +115,23 @@ class Exported:
     without_onnx: str
 
 
-def export(run_dir: Path, out: Path) -> Exported:
+def export(
+    run_dir: Path, out: Path, flag: str = "--out", also: Mapping[str, bytes | None] = MappingProxyType({})
+) -> Exported:
     """Write both networks as safetensors and ONNX, and card.json, which says what they are, to the folder `out`.
 
     A folder with card.json is complete. An earlier export there is replaced.
+
+    flag: what has named the folder. also: other files, by name; None for one that an earlier export may have left.
 
     Raises:
         UsageError: the run has no checkpoint, or `out` is no folder, or has other files.
         RunError: `out` cannot be written; an earlier export stays as it was, or loses its card.
     """
     run = SavedRun(run_dir)
-    _check_folder(out)
+    check_folder(out, flag, also)
     checkpoint = run.checkpoint()
-    contents, without_onnx = {}, ""
+    contents, without_onnx = {name: data for name, data in also.items() if data is not None}, ""
     for number, network in enumerate(checkpoint.networks, 1):
         contents[f"network-{number}.safetensors"] = save(network.views(network.snapshot()))
         try:
@@ -136,7 +141,7 @@ def export(run_dir: Path, out: Path) -> Exported:
     sums = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
     contents[CARD] = f"{strict_json({**_card(run.config, checkpoint), 'sha256': sums}, indent=2)}\n".encode()
     try:
-        _write(out, contents)
+        _write(out, contents, also)
     except OSError as error:
         raise RunError(f"{error.filename or out}: {error.strerror or error}") from error
     return Exported(list(contents), checkpoint.number, checkpoint.acting + 1, without_onnx)
@@ -172,18 +177,19 @@ def _arguments(layer: nn.Module) -> dict[str, Any]:
     return {**arguments, "bias": layer.bias is not None} if hasattr(layer, "bias") else arguments
 
 
-def _check_folder(out: Path) -> None:
+def check_folder(out: Path, flag: str, also: Iterable[str] = ()) -> None:
+    """Raise UsageError for a folder with other files than those of an export, and those that come along with it."""
     if not out.exists():
         return
     if not out.is_dir():
-        raise UsageError(f"--out {out}: is no folder")
-    own = {CARD, *(f"network-{number}.{kind}" for number in (1, 2) for kind in ("safetensors", "onnx"))}
+        raise UsageError(f"{flag} {out}: is no folder")
+    own = {CARD, *also, *(f"network-{number}.{kind}" for number in (1, 2) for kind in ("safetensors", "onnx"))}
     other = sorted(path.name for path in out.iterdir() if path.name.removesuffix(".part") not in own)
     if other:
-        raise UsageError(f"--out {out}: has other files, such as {other[0]}; name an empty or a new folder")
+        raise UsageError(f"{flag} {out}: has other files, such as {other[0]}; name an empty or a new folder")
 
 
-def _write(out: Path, contents: Mapping[str, bytes]) -> None:
+def _write(out: Path, contents: Mapping[str, bytes], also: Iterable[str]) -> None:
     """Write all files, the last one only when all others have their place."""
     make_folder(out)
     parts = {name: out / f"{name}.part" for name in contents}
@@ -191,7 +197,7 @@ def _write(out: Path, contents: Mapping[str, bytes]) -> None:
         for name, data in contents.items():
             with SyncedFile(parts[name]) as file:
                 file.write(data)
-        for stale in (CARD, "network-1.onnx", "network-2.onnx"):
+        for stale in (CARD, "network-1.onnx", "network-2.onnx", *also):
             (out / stale).unlink(missing_ok=True)
         for name, part in parts.items():
             part.replace(out / name)

@@ -26,7 +26,11 @@ class ExportOptions:
     out: Path | None = None
     """Folder for the networks' files: new, empty, or with an earlier export, which is replaced."""
     dataset: Path | None = None
-    """New Parquet file for the transitions of the replay table, one row each."""
+    """New file NAME.parquet for the transitions of the replay table, one row each; or a new folder, for a Minari data
+    set of the run's whole episodes, or such a file where it has none."""
+    hub: Path | None = None
+    """Folder for a model repository as the Hugging Face Hub takes it: a model card, networks, the run's config and a
+    film; new, empty, or with an earlier one, which is replaced. Uploading is a command of its own."""
     allow_import: tuple[str, ...] = ()
     """Modules, such as my_envs, that may be imported even if they lie in the run's folder or beside it."""
 
@@ -40,12 +44,12 @@ def main() -> None:
 def _run() -> None:
     about = (
         "Write both networks of a run's newest checkpoint as safetensors and ONNX, with a card that describes them, or "
-        "the transitions of its replay table as Parquet."
+        "its transitions as Parquet or as a Minari data set, or a repository of the model."
     )
     options = parse(ExportOptions, "coop-export", about)
-    if options.out is None and options.dataset is None:
-        raise UsageError("missing: --out for the networks, or --dataset for the buffer")
-    from coop.evaluation.dataset import export_dataset  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
+    if options.out is None and options.dataset is None and options.hub is None:
+        raise UsageError("missing: --out for the networks, --dataset for the buffer, or --hub for a model repository")
+    from coop.evaluation.dataset import export_to  # noqa: PLC0415 (torch takes seconds; wrong flags should not)
     from coop.evaluation.export import export  # noqa: PLC0415
 
     permit(options.allow_import)
@@ -56,7 +60,9 @@ def _run() -> None:
         print(f"{where}, network {done.acting} acts: {', '.join(done.names)}", file=out())
         if done.without_onnx:
             print(f"no ONNX files: {done.without_onnx}", file=out())
+    if options.hub is not None:
+        from coop.evaluation.hub import export_hub  # noqa: PLC0415
+
+        print(export_hub(options.run_dir, options.hub), file=out())
     if options.dataset is not None:
-        buffer = export_dataset(options.run_dir, options.dataset)
-        rows = f"{len(buffer):,} transitions in {shown(options.dataset)}"
-        print(f"checkpoint {buffer.checkpoint} in {place}: {rows}", file=out())
+        print(export_to(options.run_dir, options.dataset), file=out())

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import io
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 
@@ -12,9 +14,10 @@ from numpy.typing import NDArray
 
 from coop.common.bounds import MAX_VIDEO
 from coop.common.envs.make import make_filmed_env
-from coop.common.errors import UsageError
+from coop.common.errors import RunError, UsageError
 from coop.common.settings.environment import EnvSettings
 from coop.evaluation.episodes import Acting, chosen
+from coop.evaluation.notebook import image_html
 
 Picture = NDArray[np.uint8]
 """uint8 [height, width, 3]."""
@@ -52,6 +55,41 @@ class Film:
                 self.episode_return += float(steps.raw_rewards[0])
         finally:
             self._env.close()
+
+
+@dataclass(frozen=True, repr=False)
+class Clip:
+    """A film of an episode.
+
+    Attributes:
+        gif: an animated GIF.
+        steps, episode_return: of what has been filmed. over: the episode has ended within it.
+    """
+
+    gif: bytes
+    steps: int
+    episode_return: float
+    over: bool
+
+    @classmethod
+    def of(cls, film: Film) -> Clip:
+        """Play a film."""
+        gif = short_gif(film)
+        return cls(gif, film.steps, film.episode_return, film.over)
+
+    def save(self, path: str | Path) -> None:
+        """Write the GIF to a file; raises RunError."""
+        try:
+            Path(path).write_bytes(self.gif)
+        except OSError as error:
+            raise RunError(f"{path}: {error.strerror or error}") from error
+
+    def __repr__(self) -> str:
+        how = "" if self.over else ", which goes on"
+        return f"<film of {self.steps:,} steps, return {self.episode_return:g}{how}>"
+
+    def _repr_html_(self) -> str:
+        return f"{image_html(self.gif, 'gif')}<br>{html.escape(repr(self).strip('<>'))}"
 
 
 def check_video(path: Path) -> None:

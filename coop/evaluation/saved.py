@@ -23,10 +23,13 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.resuming import settings_digest
 from coop.common.types import Array, EnvSpec
-from coop.evaluation.buffer import Buffer, read_buffer
+from coop.evaluation.buffer import Buffer, ask_and_wait, read_buffer
+from coop.evaluation.film import Clip, Film
+from coop.evaluation.notebook import run_html
 from coop.learner.qnetwork import make_network
 from coop.records.checkpoints import EVALUATIONS, RECORDS
 from coop.records.learner_checkpoints import fitting, newest_checkpoint
+from coop.records.locks import holder
 from coop.records.reading import check_records, read_frame, read_jsonl, read_run_config
 from coop.records.summaries import read_summary
 
@@ -166,12 +169,17 @@ class SavedRun:
             steps, returns = state["drawn"]["inserted"], state["telemetry"]["returns"]
             return Checkpoint(checkpoint.number, spec, (first, second), state["agent"]["acting"], steps, returns)
 
-    def buffer(self) -> Buffer:
+    def buffer(self, *, live: bool = False, timeout: float = 60.0) -> Buffer:
         """The transitions that the replay table held at the newest whole checkpoint; env and network are not needed.
+
+        live: have the run save a checkpoint first, if it goes on; it is waited for `timeout` seconds at most.
 
         Raises:
             UsageError: the run keeps no table, or has no checkpoint here that holds one.
+            RunError: the run saved no checkpoint in that time.
         """
+        if live and not self.config.streaming:
+            ask_and_wait(self.path, timeout, lambda: holder(self.path)[1])
         return read_buffer(self.path, self.config)
 
     def policy(self, network: NetworkChoice = "mean") -> SavedPolicy:
@@ -190,6 +198,18 @@ class SavedRun:
         both = (first, second) if self.config.two_networks else (first,)
         chosen = both if network == "mean" else ((first, second)[network - 1],)
         return SavedPolicy(self.config.env, checkpoint.spec, chosen)
+
+    def film(self, network: NetworkChoice = "mean", *, seed: int = 0) -> Clip:
+        """An episode that `policy(network)` plays, as an animated GIF that a notebook shows; a long one is cut.
+
+        Raises:
+            UsageError: as `policy`, or the environment can't be filmed.
+        """
+        policy = self.policy(network)
+        return Clip.of(Film(policy, self.config.env, seed))
+
+    def _repr_html_(self) -> str:
+        return run_html(self)
 
     def q_values(self, obs: ArrayLike, network: NetworkChoice = "mean") -> NDArray[np.float32]:
         """Q-values of `policy(network)`, float32 [actions] or [batch, actions]; for many calls, keep the policy."""

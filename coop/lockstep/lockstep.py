@@ -53,25 +53,29 @@ class Lockstep:
         self.memory.begin(first_obs)
 
     def play(self) -> Iterator[Effects]:
-        """Run one iteration of Algorithm 1's inner loop; yields the effects of each update."""
+        """Run one iteration of Algorithm 1's inner loop, offline without acting; yields the effects of each update."""
         learner = self.config.learner
-        self._policy.acting = self.agent.acting
-        self._player.send(self.step, self.agent.updates)
-        turn = self._player.recv()
-        self._follow(turn)
+        turn: Turn | None = None
+        if not self.config.replay.offline:
+            self._policy.acting = self.agent.acting
+            self._player.send(self.step, self.agent.updates)
+            turn = self._player.recv()
+            self._follow(turn)
         self.step += 1
-        self.memory.add(turn, self.step)
+        if turn is not None:
+            self.memory.add(turn, self.step)
         drawn = msgspec.structs.replace(self.trainer.drawn, inserted=self.step, **self.memory.counters())
         for batch in self.memory.batches(self.step):
             effects = self.trainer.train(batch, drawn, time.monotonic())
             if effects.ids is not None and effects.priorities is not None:
                 self.memory.update_priorities(effects.ids, effects.priorities)
             yield effects
-        ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in turn.ended.items())
+        ends = turn.ended if turn is not None else {}
+        ended = tuple(EpisodeRecord(self.step, 0, stream, end) for stream, end in ends.items())
         yield self.trainer.receive(msgspec.structs.replace(drawn, episodes=ended))
         if learner.swap_unit == "steps" and self.step % self.config.swap_period == 0:
             self.agent.swap()
-        if learner.reset_role_at_episode and turn.ended and self.agent.acting:
+        if learner.reset_role_at_episode and ends and self.agent.acting:
             self.agent.swap()
 
     def _follow(self, turn: Turn) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from coop.actors.player import Turn
 from coop.actors.segments import SegmentAssembler
 from coop.common.errors import RunError, UsageError
+from coop.common.numbers import updates_due
 from coop.common.registry import loaded
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
@@ -24,10 +25,14 @@ from coop.learner.protocol import AnyAgent
 from coop.records.checkpoints import Damaged
 from coop.replay.core import ReplayCore
 from coop.replay.persistence.storage import Mark, load_snapshot, save_snapshot
+from coop.replay.preload import preload
 
 
 class Experience(Protocol):
     """The way from steps to batches."""
+
+    def preload(self, config: RunConfig) -> list[str]:
+        """Store the data set with which a run begins; return lines to say. Raises UsageError as `preload`."""
 
     def begin(self, obs: Array) -> None:
         """Store the run's first observation, <frame_dtype>[1, *obs_shape]."""
@@ -76,9 +81,13 @@ class TableMemory:
         )
         self._core = ReplayCore(config, spec)
         self.table = self._core.table
-        self._eviction = config.replay.eviction
+        self._eviction, self._offline = config.replay.eviction, config.replay.offline
         self.update_priorities = self.table.update_priorities
         self.begin = self._segments.begin
+
+    def preload(self, config: RunConfig) -> list[str]:
+        """See `Experience`."""
+        return preload(self.table, config)
 
     @property
     def waiting(self) -> int:
@@ -112,7 +121,7 @@ class TableMemory:
 
     def due(self, step: int) -> int:
         """Number of updates due after the first `step` steps."""
-        return self._core.limiter.due(step)
+        return updates_due(self._core.limiter.ratio, step) if self._offline else self._core.limiter.due(step)
 
     def counters(self) -> dict[str, int]:
         """See `Experience`."""
@@ -146,6 +155,10 @@ class LatestTransition:
         self._turn: Turn
         stack = np.arange(self._spec.stack, dtype=np.int32)[None]
         self._index = stack, stack + self._spec.stack
+
+    def preload(self, config: RunConfig) -> list[str]:
+        """See `Experience`: there is nowhere to keep one."""
+        return []
 
     def begin(self, obs: Array) -> None:
         """See `Experience`."""

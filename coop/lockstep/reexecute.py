@@ -27,6 +27,7 @@ from coop.replay.core import ReplayCore
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import DRAW, Lost, journal_files, read_draw, read_file
 from coop.replay.persistence.recovery import Replaying
+from coop.replay.preload import preload
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,10 @@ def reexecute(run_dir: Path) -> Outcome:
         expected = final.state["agent"]
         agent, core, first = _beginning(config, found, folder, run_id)
     began = agent.updates
+    closing = ReplayCore(config, core.table.spec)
+    ReplayCheckpoints(run_dir, run_id).restore(closing, final.number)
+    if closing.table.preload_sum != core.table.preload_sum:
+        raise RunError(f"replay.preload = {config.replay.preload!r}: not the data set that the run began with")
     files = [number for number in journal_files(folder) if number >= first]
     counts = _last_draws(folder, files, run_id)
     waiting = {drawn.sequence: batch for batch, drawn in core.repeatable() if drawn.sequence not in counts}
@@ -100,8 +105,6 @@ def reexecute(run_dir: Path) -> Outcome:
     elif accepted != core.table.inserted:
         raise RunError(f"{folder}: {core.table.inserted:,} transitions, but the run accepted {accepted:,}")
     digest = hashlib.sha256(b"".join(network.snapshot().tobytes() for network in agent.networks)).hexdigest()
-    closing = ReplayCore(config, core.table.spec)
-    ReplayCheckpoints(run_dir, run_id).restore(closing, final.number)
     repeated, held = closing.table.repeated(), len(closing.table)
     return Outcome(
         began, agent.updates, core.table.inserted, core.missing_segments, repeated, held, digest, tuple(not_checked)
@@ -128,6 +131,7 @@ def _beginning(config: RunConfig, found: Survey, folder: Path, run_id: int) -> t
     files = journal_files(folder)
     if files[0] == 1:
         load_initial_networks(agent)
+        preload(core.table, config)
         return agent, core, 1
     for whole in sorted(found.whole, key=lambda each: each.number):
         first, _ = ReplayCheckpoints(found.run_dir, run_id).restore(core, whole.number)

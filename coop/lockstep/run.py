@@ -17,6 +17,7 @@ from coop.evaluation.episodes import Evaluator
 from coop.learner.initial_networks import load_initial_networks
 from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep, Replaying
+from coop.records.checkpoints import take_request
 from coop.records.following import Callbacks
 from coop.records.learner_checkpoints import load_learner
 from coop.records.locks import RunLock
@@ -26,6 +27,7 @@ from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import Summary
 
 PROGRESS_EVERY = 5.0  # seconds
+LOOK_EVERY = 0.2  # seconds
 
 
 class LockstepRun:
@@ -65,12 +67,14 @@ class LockstepRun:
             raise
         try:
             settings = settings_digest(config)
+            begun = [] if start.goes_on else self.run.memory.preload(config)  # before an older run is moved
             self._found, self.notices = start.prepare(
                 path, replay=not config.streaming, settings=settings, load=load_learner
             )
             self._lock.sign()
             if self._found.newest is None:
                 load_initial_networks(self.run.agent)
+                self.notices += begun or self.run.memory.preload(config)
             else:
                 self.run.restore(self._found.newest, replaying)
                 self._found.newest.state.clear()  # only its memory
@@ -130,7 +134,7 @@ def play_lockstep(
     Raises:
         RunError: there is no space for the closing checkpoint or the summary.
     """
-    trainer, due = run.trainer, time.monotonic() + PROGRESS_EVERY
+    trainer, due, looked = run.trainer, time.monotonic() + PROGRESS_EVERY, 0.0
     evaluator = Evaluator(run.config, stop.is_set)
     _evaluate(run, directory, evaluator)  # what a stop has abandoned
     outcome = ""
@@ -140,6 +144,10 @@ def play_lockstep(
                 directory.record(effects.episodes, effects.metrics)
             _evaluate(run, directory, evaluator)
             recorded()
+            if time.monotonic() >= looked:
+                looked = time.monotonic() + LOOK_EVERY
+                if take_request(directory.path):
+                    trainer.ask_checkpoint()
             if trainer.checkpoint_due() and not trainer.outcome():
                 trainer.checkpoint_begun()
                 try:

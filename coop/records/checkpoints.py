@@ -38,6 +38,7 @@ REPLAY = "replay"
 DONE = "DONE"
 WRITING = "WRITING"
 KEPT = 2  # finished checkpoints
+ASKED = "ASKED"  # in the folder of checkpoints: somebody waits for a new one
 RECORDS = ("episodes.csv", "metrics.jsonl")
 """The records that a resumed run cuts back to the size that its checkpoint seals."""
 EVALUATIONS = "evaluations.csv"
@@ -85,6 +86,21 @@ def checkpoint_numbers(run_dir: Path, part: str = "") -> list[int]:
     except OSError:
         return []
     return sorted(int(path.name) for path in own if not part or (path / part).exists())
+
+
+def ask(run_dir: Path) -> None:
+    """Ask the run that works in a folder for a checkpoint; raises OSError."""
+    make_folder(run_dir / FOLDER)
+    (run_dir / FOLDER / ASKED).touch()
+
+
+def take_request(run_dir: Path) -> bool:
+    """Whether somebody has asked for a checkpoint since the last call."""
+    try:
+        (run_dir / FOLDER / ASKED).unlink()
+    except OSError:
+        return False
+    return True
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -21,13 +21,23 @@ def draw_learning_curve(run_dir: Path, title: str) -> Path | None:
 
     Raises OSError and RunError.
     """
+    drawn = learning_curve(run_dir, title)
+    if drawn is None:
+        return None
+    path = run_dir / "learning_curve.png"
+    write_atomic(path, drawn)
+    return path
+
+
+def learning_curve(run_dir: Path, title: str) -> bytes | None:
+    """The curve of a run directory as a PNG; None if no episode has ended. Raises OSError and RunError."""
     path = run_dir / RECORDS[0]
     rows = read_csv(path)
     if not rows:
         return None
     steps, returns = (column(rows, name, path, 2) for name in ("env_step", "return"))
     evaluated = returns_by_step((run_dir / EVALUATIONS).read_text(encoding="utf-8"))
-    return draw_curve(steps, returns, title, run_dir / "learning_curve.png", evaluated)
+    return curve_png(steps, returns, title, evaluated)
 
 
 def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path, evaluated: Floats = NONE) -> Path:
@@ -38,6 +48,12 @@ def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path, eva
     Raises:
         OSError: it can't be written; an older one is untouched then.
     """
+    write_atomic(path, curve_png(steps, returns, title, evaluated))
+    return path
+
+
+def curve_png(steps: ArrayLike, returns: ArrayLike, title: str, evaluated: Floats = NONE) -> bytes:
+    """As `draw_curve`, the bytes of the PNG."""
     # A figure without pyplot leaves the caller's backend, a notebook's for example, as it is.
     from matplotlib import style  # noqa: PLC0415 (half a second, needed once at the end)
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -54,5 +70,4 @@ def draw_curve(steps: ArrayLike, returns: ArrayLike, title: str, path: Path, eva
         axes.legend(loc="lower right")
         axes.grid(alpha=0.3)
         figure.savefig(content, format="png", dpi=120)
-    write_atomic(path, content.getvalue())
-    return path
+    return content.getvalue()

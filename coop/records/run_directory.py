@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -15,7 +16,8 @@ from coop.common.imports import describe, remember
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.process.console import say
 from coop.common.process.files import FileDigest, make_folder, measure, truncate, write_atomic
-from coop.common.settings.config import RunConfig
+from coop.common.process.untrusted import MAX_SETTINGS, read_text
+from coop.common.settings.config import RunConfig, value_of
 from coop.common.settings.overrides import leaves
 from coop.common.settings.resuming import settings_digest
 from coop.common.settings.tables import CONFIG, run_config_text, to_tables
@@ -63,7 +65,7 @@ class RunDirectory:
             goes_on, names = number is not None, chosen_sinks(log)
             if goes_on and (path / "tb").exists():
                 names = tuple(dict.fromkeys((*names, DEFAULT_LOG)))  # which has to be cut back as well
-            run = RecordedRun(path, run_id, path.parent.name if (path.parent / SWEEP).exists() else "")
+            run = RecordedRun(path, run_id, *_study(path.parent, config))
             self._sinks = ChosenSinks(run, names)
             opened.callback(self._sinks.close)
             (path / SUMMARY).unlink(missing_ok=True)  # of the end that this run is no longer at
@@ -87,6 +89,7 @@ class RunDirectory:
                 raise
             raise RunError(f"run directory {path}: {error.strerror or error}") from error
         self._problem = ""
+        self._eval_return: float | None = None
 
     def run_id(self) -> int:
         """The random id of this run, which distinguishes it from others of its name; raises RunError."""
@@ -114,6 +117,7 @@ class RunDirectory:
 
     def evaluation(self, row: EvaluationRow) -> None:
         """Record an evaluation."""
+        self._eval_return = row.return_mean
         self._tell(lambda sink: sink.evaluation(row))
         self._look()
 
@@ -143,6 +147,8 @@ class RunDirectory:
         except OSError as error:
             # The message must also say how the run ended.
             raise RunError(f"{self.path}: {error.strerror or error}; how the run ended: {summary.exit}") from error
+        told = {**asdict(summary), "eval_return_mean": self._eval_return}
+        self._sinks.tell(lambda sink: sink.conclude(told))
         self.draw(title)
 
     def draw(self, title: str) -> None:
@@ -181,6 +187,22 @@ class RunDirectory:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _study(folder: Path, config: RunConfig) -> tuple[str, dict[str, Any]]:
+    """The name of the sweep that a folder is of, and the values of the settings that it varies, method and seed first.
+
+    Empty if it is none's.
+    """
+    if not (folder / SWEEP).exists():
+        return "", {}
+    try:
+        varied = tomllib.loads(read_text(folder / SWEEP, MAX_SETTINGS)).get("vary", {})
+        names = [".".join(place) for place, _ in leaves(varied)]
+    except (OSError, ValueError, RunError, AttributeError, RecursionError):  # a sweep's own command names it
+        names = []
+    cell = {name: value_of(config, name) for name in dict.fromkeys(("method", "seed", *names))}
+    return folder.name, {name: value for name, value in cell.items() if value is not None}
 
 
 def _lines(path: Path) -> int:

@@ -27,9 +27,27 @@ from coop.records.checkpoints import Damaged, Manifest, check_part, read_manifes
 from coop.records.run_ids import check_owner
 from coop.replay.core import CoreSnapshot, ReplayCore
 from coop.replay.table.numbering import EPISODES
+from coop.replay.table.streams import PRELOADED
 
 FRAMES_AT_ONCE = 256
 STATE = "state.msgpack"
+
+
+class SavedTable(NamedTuple):
+    """What a checkpoint keeps of a table, for readers.
+
+    columns: by name, in order of insertion, n rows each: what a table keeps of each transition, `obs` and `next_obs`:
+        <frame_dtype>[n, *obs_shape], `age`: int64 [n], and `priorities` and `episodes` if the table has them.
+    preloaded: transitions that the table began with; those of the run are numbered from there on.
+    streams: how many streams of an emulator the run's transitions are of. ends: the environment steps at which
+        episodes have ended, as far as the learner may ask for them again.
+    """
+
+    spec: EnvSpec
+    columns: dict[str, Array]
+    preloaded: int
+    streams: int
+    ends: list[int]
 
 
 class Mark(NamedTuple):
@@ -115,14 +133,8 @@ def load_snapshot(core: ReplayCore, path: Path, run_id: int, number: int) -> Mar
     return Mark(manifest.run, manifest.number, manifest.journal)
 
 
-def read_transitions(path: Path, number: int) -> tuple[EnvSpec, dict[str, Array]]:
-    """The environment's spec and the transitions of a snapshot of checkpoint `number`, in order of insertion.
-
-    By name: what a table keeps of each, `obs` and `next_obs`: <frame_dtype>[n, *obs_shape], `age`: int64 [n], and
-    `priorities` and `episodes` if the table has them.
-
-    Raises Damaged: the folder is not an intact snapshot.
-    """
+def read_table(path: Path, number: int) -> SavedTable:
+    """Read the table of a snapshot of checkpoint `number`; raises Damaged if the folder is not an intact snapshot."""
     with _of_a_table():
         _, state, arrays = _read(path, number, None)
         meta = state["table"]
@@ -134,7 +146,10 @@ def read_transitions(path: Path, number: int) -> tuple[EnvSpec, dict[str, Array]
         slots, frames = arrays["slots"][order], arrays["frames"]  # mapped: each is read from the disk as it is copied
         for name, index in (("obs", slots[:, : spec.stack]), ("next_obs", slots[:, spec.stack :])):
             found[name] = frames[index].reshape(-1, *spec.obs_shape)
-        return spec, {**found, "age": meta["inserted"] - 1 - found["ids"]}
+        preloaded = int(meta["preloaded"][0])
+        found["age"] = preloaded + meta["inserted"] - 1 - found["ids"]
+        streams = sum(1 for _, stream, *_ in meta["streams"] if stream != PRELOADED)
+        return SavedTable(spec, found, preloaded, streams, [int(step) for step, *_ in state["episodes"]])
 
 
 def _read(path: Path, number: int, run_id: int | None) -> tuple[Manifest, dict[str, Any], dict[str, Array]]:

@@ -7,10 +7,12 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from coop.common import bounds
 from coop.common.transitions import Segment
 from coop.replay.table.frames import FrameStore, Slots, as_slice
 
 MAX_STREAMS = 4096
+PRELOADED = bounds.MAX_STREAMS - 1  # the stream of the transitions that a table begins with; no emulator's
 
 
 class StreamTails:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from coop.common.errors import UsageError
 from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
-from coop.common.transitions import Batch, Segment
+from coop.common.transitions import IN_SEGMENT, Batch, Segment
 from coop.common.types import Array, EnvSpec
 from coop.replay.table.columns import Columns
 from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
@@ -63,7 +64,8 @@ class Table:
     Deterministic: all random numbers come from `rng` (a Generator over PCG64, which the table's state includes).
     Not thread-safe: one owner makes all calls.
 
-    inserted, batches: transitions inserted and sample calls so far.
+    inserted, batches: transitions inserted and sample calls so far. preloaded: transitions that it began with.
+    preload_sum: a checksum of these.
     """
 
     def __init__(
@@ -87,7 +89,7 @@ class Table:
                 raise UsageError(f"{name}_exponent: {exponent}, must be at least 0")
         self.spec = spec
         self.capacity = capacity
-        self.inserted = 0
+        self.inserted = self.preloaded = self.preload_sum = 0
         self.batches = 0
         self._settings = {
             "spec": [spec.env_id, list(spec.frame_shape), spec.frame_dtype, spec.stack, spec.num_actions],
@@ -121,7 +123,7 @@ class Table:
         # Users' own policies see what comes, and what they answer is checked.
         self._checked = [not type(each).__module__.startswith("coop.") for each in (self._eviction, self._sampling)]
         self._tails = StreamTails(self._frames, spec.stack)
-        self._sampled = 0
+        self._sampled = self._left_out = 0
         self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
 
     def __len__(self) -> int:
@@ -139,8 +141,13 @@ class Table:
 
     @property
     def evicted(self) -> int:
-        """Transitions inserted and no longer held."""
-        return self.inserted - len(self)
+        """Transitions held once, and no longer."""
+        return self.numbered - self._left_out - len(self)
+
+    @property
+    def numbered(self) -> int:
+        """The number of the next transition."""
+        return self.preloaded + self.inserted
 
     @property
     def evicted_unsampled(self) -> int:
@@ -158,7 +165,7 @@ class Table:
     def insert(self, segment: Segment) -> None:
         """Insert a valid segment that is no duplicate; the eviction policy chooses the transitions to evict."""
         size = len(self)
-        first = self.inserted
+        first = self.numbered
         if self._checked[0] or self._episodes is not None:
             rows, kept = self._admitted(segment)
         else:
@@ -181,11 +188,25 @@ class Table:
         if self._prioritized:
             self._set_priorities(rows, np.full(len(rows), self._max_priority))
 
+    def preload(self, segment: Segment) -> None:
+        """As `insert`, of transitions that the table is to begin with: they count neither as inserted nor as evicted.
+
+        Raises ValueError if others have been inserted.
+        """
+        if self.inserted:
+            raise ValueError("only a table without transitions of the run can be preloaded")
+        self.insert(segment)
+        self.inserted, self.preloaded = 0, self.preloaded + segment.steps
+        self._left_out = self.preloaded - len(self)
+        self._reuse_evicted[:] = 0
+        for name in ("frames", *IN_SEGMENT):
+            self.preload_sum = zlib.crc32(np.ascontiguousarray(getattr(segment, name)).data, self.preload_sum)
+
     def _admitted(self, segment: Segment) -> tuple[Slots, slice | Slots]:
         """The rows that a policy which sees the transitions gives them; raises UsageError for an impossible answer."""
         episodes = self._episodes
         numbers = np.zeros(segment.steps, np.int64) if episodes is None else episodes.number(segment)
-        rows, kept = self._eviction.admit(Incoming(segment, self.spec, self.inserted, numbers))
+        rows, kept = self._eviction.admit(Incoming(segment, self.spec, self.numbered, numbers))
         if self._checked[0]:
             check_placed((rows, kept), segment.steps, len(self), self.capacity, str(self._settings["eviction"]))
         if episodes is not None:
@@ -238,7 +259,7 @@ class Table:
             "obs_index": index[:, : self.spec.stack].copy(),
             "next_index": index[:, self.spec.stack :].copy(),
             "weights": weights,
-            "age": self.inserted - 1 - columns["ids"],
+            "age": self.numbered - 1 - columns["ids"],
         }
 
     def update_priorities(self, ids: NDArray[np.int64], priorities: NDArray[np.floating[Any]]) -> None:
@@ -275,6 +296,7 @@ class Table:
         meta = {
             "settings": self._settings,
             "inserted": self.inserted,
+            "preloaded": [self.preloaded, self.preload_sum, self._left_out],
             "held": size,
             "batches": self.batches,
             "sampled": self._sampled,
@@ -295,7 +317,7 @@ class Table:
 
         Raises UsageError if the state's table has other settings, ValueError if this table is not new.
         """
-        if self.inserted:
+        if self.numbered:
             raise ValueError("only a new table can load a state")
         for name, value in self._settings.items():
             if meta["settings"][name] != value:
@@ -310,6 +332,7 @@ class Table:
         self._columns.load_state(arrays, slots[arrays["slots"]])
         self._tails.load_state(meta["streams"], np.where(tails >= 0, slots[tails], -1))
         self.inserted = meta["inserted"]
+        self.preloaded, self.preload_sum, self._left_out = meta["preloaded"]
         self._held = meta["held"]
         if self._episodes is not None:
             self._episodes.load_state(meta["episodes"], arrays[EPISODES])

@@ -6,9 +6,11 @@ a class of an installed package, which its entry point in the group `coop.sinks`
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 from coop.common.errors import CoopError, UsageError, first_line
@@ -23,12 +25,20 @@ from coop.common.types import EpisodeRow
 EPISODE, ROW = "charts/episodic_return", "losses/q_values"
 
 
+FINAL = "final/return_mean_100"  # the tag of what a run has reached at its end
+
+
 class RecordedRun(NamedTuple):
-    """The run that a sink records: its directory, its id, and the name of the sweep that it belongs to, or nothing."""
+    """The run that a sink records: its directory, its id, and the sweep that it belongs to.
+
+    sweep: the sweep's name; empty for a run by itself. cell: the run's method and seed, and its values of the settings
+    that the sweep varies, by dotted name; empty for a run by itself.
+    """
 
     path: Path
     run_id: int
     sweep: str
+    cell: Mapping[str, Any] = MappingProxyType({})
 
 
 class Kept(NamedTuple):
@@ -77,6 +87,12 @@ class Sink:
     def film(self, gif: bytes, env_step: int) -> None:
         """Take an animated GIF of the acting network after `env_step` steps."""
 
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """Take the fields of summary.json, at the run's end, and `eval_return_mean` of its newest evaluation or None.
+
+        It may be called again if the run is made longer, and not at all if it is killed.
+        """
+
     def close(self) -> None:
         """Write or send what is left."""
 
@@ -102,6 +118,13 @@ class ScalarSink(Sink):
     def evaluation(self, row: EvaluationRow) -> None:
         """See `Sink`."""
         self.scalars({"eval/return_mean": row.return_mean, "eval/return_sd": row.return_sd}, row.env_step)
+
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """See `Sink`."""
+        final = {FINAL: summary["return_mean_100"], "final/eval_return_mean": summary["eval_return_mean"]}
+        numbers = {tag: value for tag, value in final.items() if value is not None and math.isfinite(value)}
+        if numbers:
+            self.scalars(numbers, summary["env_steps"])
 
 
 SINKS: Registry[Any] = Registry(

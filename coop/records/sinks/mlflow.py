@@ -47,7 +47,8 @@ class MlflowSink(ScalarSink):
             number = found.experiment_id if found else self._client.create_experiment(experiment)
         run_id = f"{run.run_id:x}"
         there = self._client.search_runs([number], filter_string=f"tags.`{ID}` = '{run_id}'")
-        begun = there[0] if there else self._client.create_run(number, run_name=run.path.name, tags={ID: run_id})
+        tags = {ID: run_id, **{f"coop.{name}": str(value) for name, value in run.cell.items()}}
+        begun = there[0] if there else self._client.create_run(number, run_name=run.path.name, tags=tags)
         self._id = begun.info.run_id
         self._client.update_run(self._id, status="RUNNING")
         self._late: list[Any] = []

@@ -15,6 +15,7 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import HistogramProto, Summary, SummaryMetadata
 from tensorboard.compat.proto.tensor_pb2 import TensorProto
 from tensorboard.compat.proto.types_pb2 import DT_STRING
+from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from tensorboard.summary.writer.record_writer import RecordWriter
 
@@ -37,12 +38,13 @@ class TensorBoardSink(ScalarSink):
 
     def __init__(self, run: RecordedRun) -> None:
         self._folder = run.path / FOLDER
-        self._trial = f"{run.run_id:x}"
+        self._trial, self._cell = f"{run.run_id:x}", run.cell
 
     def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
         """Create a file, and cut those that are there back to `kept`, or to nothing; raises OSError if that fails.
 
-        The settings are a table of text, and the hyperparameters of the plugin HParams.
+        The settings are a table of text. The hyperparameters of the plugin HParams are those in which the runs of a
+        sweep differ, and all of a run by itself.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
         _cut_back(self._folder, kept or Kept(0, 0, -1))
@@ -59,15 +61,25 @@ class TensorBoardSink(ScalarSink):
             metadata=SummaryMetadata(plugin_data=SummaryMetadata.PluginData(plugin_name="text")),
             tensor=TensorProto(dtype=DT_STRING, string_val=[f"|setting|value|\n|-|-|\n{rows}".encode()]),
         )
-        plain = {
-            name: value if isinstance(value, bool | int | float) else str(value) for name, value in settings.items()
-        }
+        chosen = self._cell or settings
+        plain = {name: value if isinstance(value, bool | int | float) else str(value) for name, value in chosen.items()}
         self._summary(0, text, *hparams_pb(plain, trial_id=self._trial).value)
 
     @property
     def problem(self) -> str:
         """Why records are being kept; empty if none are."""
         return self._file.problem
+
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """Add what the run has reached, and, for HParams, how it has ended."""
+        super().conclude(summary)
+        whole = str(summary["exit"]).startswith("complete")
+        status = api_pb2.STATUS_SUCCESS if whole else api_pb2.STATUS_FAILURE
+        told = plugin_data_pb2.HParamsPluginData(
+            session_end_info=plugin_data_pb2.SessionEndInfo(status=status, end_time_secs=time.time())
+        )
+        about = metadata.create_summary_metadata(told)
+        self._summary(0, Summary.Value(tag=metadata.SESSION_END_INFO_TAG, metadata=about, tensor=metadata.NULL_TENSOR))
 
     def film(self, gif: bytes, env_step: int) -> None:
         """See `Sink`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,13 +11,15 @@ from coop.common.errors import UsageError
 from coop.records.sinks import Kept, RecordedRun, ScalarSink
 
 STEP = "env_step"
+MAX_TAG = 64  # characters, the service's bound
 
 
 class WandbSink(ScalarSink):
     """One run of Weights & Biases; with its own variables, such as WANDB_MODE and WANDB_PROJECT, users direct it.
 
-    Scalars are plotted over environment steps, as in TensorBoard. The runs of a sweep are a group. A resumed run
-    continues the same run there; what was sent of steps after its checkpoint stays.
+    Scalars are plotted over environment steps, as in TensorBoard. The runs of a sweep are a group, in which tags tell
+    its cells apart, beside those of WANDB_TAGS. A resumed run continues the same run there; what was sent of steps
+    after its checkpoint stays.
     """
 
     name, extra, library = "wandb", "wandb", "wandb"
@@ -29,7 +32,10 @@ class WandbSink(ScalarSink):
         """
         wandb = importlib.import_module("wandb")  # an extra, and it takes seconds
         settings = wandb.Settings(console="off", silent=True, disable_git=True, save_code=False)
-        named = {"name": run.path.name, "id": f"{run.run_id:x}", "group": run.sweep or None}
+        named: dict[str, Any] = {"name": run.path.name, "id": f"{run.run_id:x}", "group": run.sweep or None}
+        if run.cell:
+            own = [f"{name}={value}"[:MAX_TAG] for name, value in run.cell.items()]
+            named["tags"] = [*filter(None, os.environ.get("WANDB_TAGS", "").split(",")), *own]
         try:
             self._run = wandb.init(dir=run.path, resume="allow", settings=settings, **named)
         except wandb.Error as error:

@@ -177,6 +177,7 @@ def from_config(config: RunConfig) -> tuple[StackSettings, Runs]:
         ("replay.ratio", replay.ratio, 1.0),
         ("network.dtype", network.dtype, "float32"), ("replay.sampling", replay.sampling, "uniform"),
         ("replay.replacement", replay.replacement, True), ("replay.n_step", replay.n_step, 1),
+        ("replay.preload", replay.preload, ""),
         ("learner.momentum", learner.momentum, 0.0), ("learner.weight_decay", learner.weight_decay, ()),
         ("learner.swap_unit", learner.swap_unit, "updates"), ("actor.num_envs", actor.num_envs, 1),
         ("learner.reset_role_at_episode", learner.reset_role_at_episode, False),

@@ -15,6 +15,7 @@ from coop.common.errors import UsageError
 from coop.common.places import absolute
 from coop.common.process.limits import cores
 from coop.common.settings.config import value_of
+from coop.evaluation.notebook import table_html
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.records.summaries import read_summary
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
@@ -40,6 +41,10 @@ class SweepResult:
     folder: Path
     runs: pd.DataFrame
     failed: dict[str, str]
+
+    def _repr_html_(self) -> str:
+        told = {"sweep": str(self.folder), "cells": f"{len(self.runs)} ended, {len(self.failed)} failed"}
+        return table_html(told) + str(self.runs.to_html(max_rows=60))
 
 
 def sweep(

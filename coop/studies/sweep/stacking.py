@@ -28,6 +28,7 @@ def why_not(config: RunConfig) -> str:
         ("replay.sampling", replay.sampling == "uniform" and replay.replacement, "uniform, with replacement"),
         ("replay.eviction", replay.eviction in ("fifo", "reservoir"), "fifo, reservoir"),
         ("replay.ratio", replay.ratio <= 1, "at most 1"), ("replay.n_step", replay.n_step == 1, "1"),
+        ("replay.preload", not replay.preload, "none"),
         ("learner.device", learner.device == "cpu", "cpu"),
         ("learner.tau", learner.tau is None, "none"),
         ("learner.swap_unit", learner.swap_unit == "updates" and not learner.reset_role_at_episode, "updates"),
