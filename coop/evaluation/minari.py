@@ -147,10 +147,16 @@ def _of_buffer(buffer: Buffer) -> Iterator[Episode]:
 def _of_journal(run_dir: Path, spec: EnvSpec) -> Iterator[Episode]:
     """The episodes of a journal that begins with the run, stream by stream as they end.
 
-    Segments of a stream may have arrived in another order; what follows one that is missing is left out.
+    Segments of a stream may have arrived in another order. Of one that is missing, and of those on both sides, only the
+    episodes that it cuts are left out.
     """
     waiting: dict[tuple[int, int], list[tuple[Array, ...]]] = {}
+    following: dict[tuple[int, int], int] = {}
+    cut: set[tuple[int, int]] = set()  # streams whose present episode lacks its beginning
     for stream, segment in _in_order(run_dir, spec):
+        if segment.sequence != following.get(stream, 0):
+            cut.add(stream)
+        following[stream] = segment.sequence + 1
         columns = (
             segment.frames[segment.obs_index].reshape(-1, *spec.obs_shape),
             segment.frames[segment.next_index].reshape(-1, *spec.obs_shape),
@@ -162,7 +168,9 @@ def _of_journal(run_dir: Path, spec: EnvSpec) -> Iterator[Episode]:
         for end in segment.episodes:
             stop = end.step_in_segment + 1
             rows.append(tuple(column[start:stop] for column in columns))
-            yield from _cut(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
+            if stream not in cut:
+                yield from _cut(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
+            cut.discard(stream)
             start = stop
             rows.clear()
         rows.append(tuple(column[start:] for column in columns))
@@ -190,6 +198,9 @@ def _in_order(run_dir: Path, spec: EnvSpec) -> Iterator[tuple[tuple[int, int], S
                 yield stream, held.pop(sequence)
                 sequence += 1
             following[stream] = sequence
+    for stream, held in early.items():
+        for sequence in sorted(held):
+            yield stream, held[sequence]
 
 
 def _cut(obs: Array, next_obs: Array, actions: Array, rewards: Array, terminated: Array) -> Iterator[Episode]:
