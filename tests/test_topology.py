@@ -113,7 +113,7 @@ def test_coop_local_end_to_end(tmp_path: Path) -> None:
 
 def test_a_learner_reads_frames_in_the_memory_of_the_replay_service(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    flags = ("--preset", "catch", "--actors", "1", "--total-steps", "1200", "--run-dir", str(path), "--shared-memory")
+    flags = ("--preset", "catch", "--actors", "1", "--total-steps", "800", "--run-dir", str(path), "--shared-memory")
 
     def shared(pid: int) -> set[str]:
         """The memories that a process has mapped."""
