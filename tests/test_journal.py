@@ -15,6 +15,7 @@ from samples import make_segment
 from test_checkpoints import CONFIG, save
 
 from coop.common.errors import RunError
+from coop.common.messaging.conversation import drive
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.session import open_session
@@ -182,7 +183,7 @@ def test_a_disk_that_fails_once_ends_the_service_and_acknowledges_nothing(
         with pytest.raises(NoAnswer):  # it is not trusted again
             client.ask(replay_key(client, "insert"), segment_bytes(spec, 0), timeout=1.0)
         stop = Stop()
-        service.run(stop, Console())
+        drive(service.serving(stop, Console()), stop)
         assert stop.failed
         assert stop.reason == "the journal can't be flushed to the disk: Input/output error"
 

@@ -11,11 +11,12 @@ from msgspec.structs import replace as changed
 from samples import await_service
 
 from coop.actors.policy import EpsilonGreedy
-from coop.actors.weights import GRACE, WeightsFollower, make_policy
+from coop.actors.weights import WeightsFollower, make_policy
 from coop.common.errors import JoinError
 from coop.common.messaging.keys import role_key, weights_key
 from coop.common.messaging.messages.control import JoinReply
 from coop.common.messaging.messages.weights import Role, Weights
+from coop.common.messaging.timing import GRACE
 from coop.common.messaging.transport import Node
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.settings.config import NetworkSettings, RunConfig

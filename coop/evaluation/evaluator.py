@@ -16,6 +16,7 @@ from coop.common.messaging.keys import evaluations_key
 from coop.common.messaging.messages.control import Join, JoinReply
 from coop.common.messaging.messages.evaluate import Evaluated, Video
 from coop.common.messaging.session import open_session
+from coop.common.messaging.timing import ANSWER_TIMEOUT, LAST_RECEIPT, RECEIPT_PAUSE
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process.console import Console, counted
 from coop.common.process.lifecycle import Stop
@@ -24,9 +25,6 @@ from coop.common.settings.options import RoleOptions
 from coop.evaluation.episodes import AT_ONCE, Evaluator
 
 LOOK_EVERY = 0.05  # seconds between looks at what the learner has broadcast
-ANSWER_TIMEOUT = 2.0  # seconds to wait for each receipt
-PAUSE = 0.1  # seconds before a result is sent, or networks are asked for, again
-LAST_RECEIPT = 5.0  # seconds to wait for the final networks, and for a receipt, at the run's end
 
 
 Progress = tuple[int, int]
@@ -145,7 +143,7 @@ class EvaluatorService:
             self._evaluations.rush()
             ends = time.monotonic() + LAST_RECEIPT
             while not self._weights.fetch() and time.monotonic() < ends:
-                time.sleep(PAUSE)
+                time.sleep(RECEIPT_PAUSE)
             if self._weights.ready:
                 self._turn()
 
@@ -179,7 +177,7 @@ class EvaluatorService:
                 now = time.monotonic()
                 ends = min(ends, now + LAST_RECEIPT) if self._stop.is_set() else ends
                 if now < ends:
-                    time.sleep(PAUSE)
+                    time.sleep(RECEIPT_PAUSE)
                     continue
                 said = f"{said}; the learner is gone"
             self._console.event(said)
