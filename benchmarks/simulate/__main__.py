@@ -1,4 +1,4 @@
-"""`python -m benchmarks.simulate`: runs seeds; prints a trace in words for one that fails, and what it takes to fail."""
+"""`python -m benchmarks.simulate`: runs seeds; prints what happened in one that fails, and what it takes to fail."""
 
 from __future__ import annotations
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.simulate.roles import ACTOR_NUMBERS, SPEC, STEPS
+from benchmarks.simulate.world import Process, Violation
 from coop.common.messaging import wire
 from coop.common.messaging.messages.answers import Ack
 from coop.common.transitions import Batch, Drawn, DrawRequest, Segment
@@ -18,9 +20,6 @@ from coop.replay.core import ReplayCore, Reply, RetryLater
 from coop.replay.persistence.checkpoints import ReplayCheckpoints, part_path
 from coop.replay.persistence.storage import load_snapshot
 from coop.replay.service import ReplayService
-
-from benchmarks.simulate.roles import ACTOR_NUMBERS, SPEC, STEPS
-from benchmarks.simulate.world import Process, Violation
 
 if TYPE_CHECKING:
     from benchmarks.simulate.cluster import Cluster
@@ -52,6 +51,7 @@ class Checks:
     def __init__(self, cluster: Cluster) -> None:
         self.cluster = cluster
         self.done: Counter[str] = Counter()
+        self._believed: Counter[int] = Counter()  # transitions acknowledged to each actor
         self.serving = -1  # incarnation of the replay service that the learner has admitted
         self.acked: dict[tuple[int, int], str] = {}  # segments, with when
         self.forgiven = 0
@@ -59,7 +59,10 @@ class Checks:
         self._forgive = False  # what was acknowledged may be lost: nothing says that it survives what has happened
         self._folder: object = None
         self._draws: dict[tuple[int, int], tuple[int, ...]] = {}
+        self._owners: dict[int, tuple[Reply, int]] = {}
         self._bases: dict[int, int] = {}
+        self._learner, self._counted = -1, 0
+        self._last_ack = self._last_save = -1.0
         self._flats: dict[tuple[int, int], set[bytes]] = defaultdict(set)
         self._roles: list[tuple[float, int, tuple[int, int]]] = []  # when, who acts, and versions
         self._saved: dict[int, set[bytes]] = defaultdict(set)  # agents after so many updates
@@ -74,7 +77,7 @@ class Checks:
             since = 0
 
             def insert(self, segment: Segment, payload: bytes = b"") -> int | RetryLater:
-                before, ahead = self.table.inserted, self.limiter.ahead(self.table.inserted, self.drawn)
+                before, ahead = self.table.inserted, self.limiter.ahead(self.table.inserted, checks.counted(self))
                 outcome = super().insert(segment, payload)
                 if self.table.inserted > before:
                     start, slack = (
@@ -89,7 +92,8 @@ class Checks:
                 return outcome
 
             def draw(self, request: DrawRequest) -> Reply | RetryLater:
-                known = request.sequence < self.drawn
+                known = request.sequence < checks.counted(self)
+                checks.asked(request)
                 outcome = super().draw(request)
                 if not isinstance(outcome, RetryLater):
                     checks.drawn(self, request, outcome, known)
@@ -127,6 +131,8 @@ class Checks:
 
     def on_reply(self, node: Any, key: str, message: wire.Message, reply: bytes) -> None:  # noqa: ANN401
         """An answer leaves."""
+        if node.role == "learner" and key.endswith("/config/replay") and message.kind == "leave":
+            self._departs(message.fields["incarnation"], wire.decode(reply).kind)
         if node.role != "replay" or not key.endswith(("/insert", "/sample")):
             return
         answer = wire.decode(reply)
@@ -140,7 +146,26 @@ class Checks:
             self.hold(
                 "acknowledged", core._seen.seen(who[0], 0, who[1]), f"segment {who[1]}, which is not in the table"
             )
-            self.acked.setdefault(who, f"{self.cluster.world.now:.3f}")
+            if who not in self.acked:
+                self.acked[who] = f"{self.cluster.world.now:.3f}"
+                self._believed[who[0]] += STEPS
+            self._last_ack = self.cluster.world.now
+
+    def _departs(self, incarnation: int, answer: str) -> None:
+        """The learner answers a replay service that wants to leave."""
+        if answer != "farewell" or incarnation != self.serving or self._trainer is None:
+            return
+        learner = self.cluster.roles["learner"]
+        if learner.stop.is_set() or self._trainer.outcome() or not self._trainer.agent.updates:
+            return
+        self.hold(
+            "departure", self._last_save > self._last_ack, "a replay service leaves with what is in no checkpoint"
+        )
+
+    def said(self, process: Process, text: str) -> None:
+        """A role has said something."""
+        if process.role == "learner" and ("saved, " in text or "goes on without it" in text):
+            self._last_save = self.cluster.world.now
 
     def service_begins(self, process: Process, core: ReplayCore) -> None:
         """A replay service has restored what it holds."""
@@ -193,20 +218,33 @@ class Checks:
     # ------------------------------------------------------------------------------------------------------------------
     # Draws and updates
 
+    def asked(self, request: DrawRequest) -> None:
+        """A learner asks: it will not ask for batches below its base again."""
+        self._bases[request.incarnation] = max(self._bases.get(request.incarnation, 0), request.base)
+
     def drawn(self, core: Any, request: DrawRequest, reply: Reply, known: bool) -> None:  # noqa: ANN401
         """A batch has been drawn, or drawn again."""
         plan = self.cluster.plan
+        if request.incarnation != self._learner:
+            self._learner, self._counted = request.incarnation, request.base
+        self._counted = max(self._counted, request.base, request.sequence + 1)
         ids = tuple(reply.batch.columns["ids"].tolist())
         key = request.incarnation, request.sequence
-        base = self._bases[request.incarnation] = max(self._bases.get(request.incarnation, 0), request.base)
+        _, owner = self._owners.setdefault(id(reply), (reply, request.incarnation))
+        self.hold("incarnation", owner == request.incarnation, f"draw {request.sequence} was another learner's")
+        base = self._bases[request.incarnation]
         if key in self._draws and request.sequence >= base:  # below, a late copy, whose answer nobody awaits
             self.hold("repeated draw", self._draws[key] == ids, f"draw {request.sequence} is another one now")
         if request.sequence >= base:
             self._draws[key] = ids
         if not known and core.table.inserted < plan.total:
-            ahead = core.limiter.ahead(core.table.inserted, core.drawn)
+            ahead = core.limiter.ahead(core.table.inserted, self._counted)
             slack = max(plan.tolerance, 0.5 / plan.ratio)
             self.hold("ratio", ahead >= -slack - 1e-9, f"draws are {-ahead:.1f} steps ahead")
+
+    def counted(self, core: ReplayCore) -> int:
+        """Draws as the present learner counts them; as the core does before its first one."""
+        return self._counted if self._learner in core._learners[-1:] else core.drawn
 
     def trainer_kind(self, process: Process) -> type[Trainer]:
         """The real trainer of a learner, watched."""
@@ -214,6 +252,10 @@ class Checks:
 
         class Watched(Trainer):
             """See `Trainer`."""
+
+            def __init__(self, *args: Any) -> None:  # noqa: ANN401
+                super().__init__(*args)
+                checks._trainer = self
 
             def train(self, batch: Batch, drawn: Drawn, now: float) -> Effects:
                 number, agent = self.agent.updates, self.agent
@@ -257,6 +299,9 @@ class Checks:
     def look(self, process: Process, weights: Any, policy: Any) -> None:  # noqa: ANN401
         """An actor has looked for weights: those that it acts with must be whole, and after a while the newest."""
         now, network = self.cluster.world.now, self.cluster.network
+        acked = process.state["inserts"].acked
+        given = self._believed[process.state["incarnation"]]
+        self.hold("acknowledged", acked <= given, f"{process.name} counts {acked} acknowledged, but {given} were")
         if not weights.ready:
             return
         for number, each in enumerate(policy.networks):
@@ -325,6 +370,7 @@ class Checks:
     def ended(self, process: Process, reason: str) -> None:
         """A process has ended."""
         expected = not reason or any(words in reason for words in EXPECTED)
+        expected |= process.stop.is_set() and ("was not begun" in reason or "no answer to" in reason)
         self.hold("ends", expected, f"{process.name}: {reason}")
         if process.role == "replay" and self.cluster.plan.journal == "off":
             self._forgive = True

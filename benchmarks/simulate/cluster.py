@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import random
 import shutil
@@ -15,17 +14,16 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+from benchmarks.simulate import roles
+from benchmarks.simulate.checks import Checks
+from benchmarks.simulate.disk import Disk
+from benchmarks.simulate.network import Network, Weather
+from benchmarks.simulate.plan import Fault, Plan
+from benchmarks.simulate.world import Machine, Process, Violation, World
 from coop.common.errors import RunError
 from coop.common.messaging import joining
 from coop.common.messaging.messages.control import JoinReply
 from coop.common.settings.config import ActorSettings, LearnerSettings, ReplaySettings, RunConfig
-
-from benchmarks.simulate import roles
-from benchmarks.simulate.checks import Checks
-from benchmarks.simulate.disk import Disk
-from benchmarks.simulate.network import Network, SimNode, Weather
-from benchmarks.simulate.plan import Fault, Plan
-from benchmarks.simulate.world import Machine, Process, Violation, World
 
 ENDS_WITHIN = 240.0  # seconds after the last fault: a lost acknowledgement alone takes a minute to be missed
 LEAVES_WITHIN = 90.0  # seconds that other roles may take once the run is complete: their patience is 60
@@ -63,6 +61,11 @@ class Cluster:
             for index, (name, rate) in enumerate(zip(("learner", "replay", "actors", "elsewhere"), drift, strict=True))
         }
         self.checks = Checks(self)
+        self.world.said = self.checks.said
+        self.world.disk_delay = self._disk_delay
+
+    def _disk_delay(self, process: Process) -> float:
+        return self.world.random.random() ** 3 * self.slow.get(process.machine.name, 0.004)
 
     def incarnation(self) -> int:
         """A random id."""
@@ -75,7 +78,7 @@ class Cluster:
         for name in ("learner", "replay", "elsewhere"):
             (self.root / name).mkdir(parents=True)
             self.disk.adopt(name)
-        before = set(os.listdir("/proc/self/fd"))
+        before = set(map(str, Path("/proc/self/fd").iterdir()))
         try:
             with self._product(), self.disk.installed():
                 for index, name in enumerate(("learner", "replay", "actor 0", "actor 1", "evaluator")):
@@ -160,48 +163,63 @@ class Cluster:
         """Let a fault happen."""
         if self.complete:
             return
-        world, network = self.world, self.network
         self.met[fault.kind] += 1
-        world.tell("FAULT", str(fault)[12:])
-        target = self.roles.get(fault.target)
-        match fault.kind:
-            case "kill":
-                if target is not None:
-                    target.end("killed")
-            case "freeze":
-                if target is not None and target.alive and not target.frozen:
-                    target.freeze()
-                    network.watch()
-                    world.after(fault.length, partial(self._thaw, target))
-            case "stop":
-                if target is not None and target.alive:
-                    target.do(lambda: target.stop.set("interrupted", exit_status=143))
-            case "crash":
-                self._crash(fault.target)
-            case "deadly":
-                self.disk.deadly[fault.target] = int(fault.number)
-            case "cut" | "partition":
-                ways = [(fault.target, fault.other), (fault.other, fault.target)]
-                for one, two in ways[: 1 + (fault.kind == "partition")]:
-                    network.cut(one, two)
-                    world.after(fault.length, partial(network.heal, one, two))
-            case "weather":
-                worse = {"late": (fault.number, 0, 0), "lost": (0.05, 0.25, 0), "doubled": (fault.number, 0, 0.4)}
-                network.weather = Weather(*worse.get(fault.target, (fault.number, 0.15, 0.2)))
-                world.after(fault.length, self._clear_up)
-            case "full":
-                self.disk.full.add(fault.target)
-                world.after(fault.length, lambda: self.disk.full.discard(fault.target))
-            case "slow":
-                self.slow[fault.target] = fault.number
-                world.after(fault.length, lambda: self.slow.pop(fault.target, None))
-            case "leap":
-                self.machines[fault.target].leap(fault.number)
-            case "second":
-                place = "elsewhere" if fault.other == "elsewhere" else "replay"
-                self.begin(f"replay second {self.met['second']}", place)
-            case "second actor":
-                self.begin(f"actor {2 + self.met['second actor']}")
+        self.world.tell("FAULT:", str(fault).split("s  ", 1)[1])
+        getattr(self, f"_{fault.kind.replace(' ', '_')}")(fault)
+
+    def _present(self, fault: Fault) -> Process | None:
+        """The process that a fault is meant for, if it is there and not frozen."""
+        process = self.roles.get(fault.target)
+        return process if process is not None and process.alive and not process.frozen else None
+
+    def _kill(self, fault: Fault) -> None:
+        process = self.roles.get(fault.target)
+        if process is not None:
+            process.end("killed")
+
+    def _freeze(self, fault: Fault) -> None:
+        if (process := self._present(fault)) is not None:
+            process.freeze()
+            self.network.watch()
+            self.world.after(fault.length, partial(self._thaw, process))
+
+    def _stop(self, fault: Fault) -> None:
+        if (process := self._present(fault)) is not None:
+            process.do(lambda: process.stop.set("interrupted", exit_status=143))
+
+    def _deadly(self, fault: Fault) -> None:
+        self.disk.deadly[fault.target] = int(fault.number)
+
+    def _cut(self, fault: Fault) -> None:
+        ways = [(fault.target, fault.other), (fault.other, fault.target)]
+        for one, two in ways[: 1 + (fault.kind == "partition")]:
+            self.network.cut(one, two)
+            self.world.after(fault.length, partial(self.network.heal, one, two))
+
+    _partition = _cut
+
+    def _weather(self, fault: Fault) -> None:
+        worse = {"late": (fault.number, 0, 0), "lost": (0.05, 0.25, 0), "doubled": (fault.number, 0, 0.4)}
+        self.network.weather = Weather(*worse.get(fault.target, (fault.number, 0.15, 0.2)))
+        self.world.after(fault.length, self._clear_up)
+
+    def _full(self, fault: Fault) -> None:
+        self.disk.full.add(fault.target)
+        self.world.after(fault.length, lambda: self.disk.full.discard(fault.target))
+
+    def _slow(self, fault: Fault) -> None:
+        self.slow[fault.target] = fault.number
+        self.world.after(fault.length, lambda: self.slow.pop(fault.target, None))
+
+    def _leap(self, fault: Fault) -> None:
+        self.machines[fault.target].leap(fault.number)
+
+    def _second(self, fault: Fault) -> None:
+        place = "elsewhere" if fault.other == "elsewhere" else "replay"
+        self.begin(f"replay second {self.met['second']}", place)
+
+    def _second_actor(self, fault: Fault) -> None:
+        self.begin(f"actor {2 + self.met[fault.kind]}")
 
     def _thaw(self, process: Process) -> None:
         self.network.disturbed = self.world.now
@@ -214,8 +232,8 @@ class Cluster:
         self.network.weather = Weather()
         self.network.disturbed = self.world.now
 
-    def _crash(self, top: str) -> None:
-        machine = self.machines[top]
+    def _crash(self, fault: Fault) -> None:
+        top, machine = fault.target, self.machines[fault.target]
         self.checks.crashed(top)
         for process in list(self.world.processes):
             if process.machine is machine:
@@ -261,10 +279,10 @@ class Cluster:
                 self.world.running = process
                 for activity in process.activities:
                     activity.abandon()
-        for descriptor in set(os.listdir("/proc/self/fd")) - before:
+        for descriptor in set(map(str, Path("/proc/self/fd").iterdir())) - before:
             with contextlib.suppress(OSError):
-                if os.readlink(f"/proc/self/fd/{descriptor}").startswith(str(self.root)):
-                    os.close(int(descriptor))
+                if Path(descriptor).readlink().is_relative_to(self.root):
+                    os.close(int(Path(descriptor).name))
         shutil.rmtree(self.root, ignore_errors=True)
 
 
@@ -336,6 +354,3 @@ def make_config(plan: Plan) -> RunConfig:
             sampling=plan.sampling,
         ),
     )
-
-
-__all__ = ["Cluster", "SimNode", "math"]

@@ -67,14 +67,14 @@ class Disk:
     def adopt(self, top: str) -> None:
         """Take all that a machine's disk holds as flushed."""
         for folder, names, files in os.walk(self.root / top):
-            entries = {name: os.stat(f"{folder}/{name}").st_ino for name in (*names, *files)}
-            self._folders[os.stat(folder).st_ino] = entries
+            entries = {name: Path(folder, name).stat().st_ino for name in (*names, *files)}
+            self._folders[Path(folder).stat().st_ino] = entries
             for name in files:
                 self._files[entries[name]] = Path(folder, name).read_bytes()
 
     def _survivors(self, folder: Path, kept: dict[Path, bytes], folders: list[Path], draw: random.Random) -> None:
         there = {entry.name: entry.inode() for entry in os.scandir(folder)}
-        flushed = self._folders.get(os.stat(folder).st_ino, {})
+        flushed = self._folders.get(folder.stat().st_ino, {})
         names = flushed if draw.random() < 0.7 else there  # what was not flushed may have been written all the same
         for name, inode in sorted(names.items()):
             path = folder / name

@@ -16,6 +16,7 @@ from fnmatch import fnmatchcase
 from types import SimpleNamespace
 from typing import Any
 
+from benchmarks.simulate.world import Activity, Process, Violation, World
 from coop.common.errors import BadMessage, CoopError
 from coop.common.messaging import wire
 from coop.common.messaging.conversation import Conversation
@@ -27,8 +28,6 @@ from coop.common.messaging.timing import ASK_TIMEOUT, LEASE
 from coop.common.messaging.transport import NoAnswer, Refused
 from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
-
-from benchmarks.simulate.world import Activity, Process, Violation, World
 
 RUN = "run"
 FAIR = 0.002  # seconds of delay
@@ -345,8 +344,7 @@ class _Server:
         self._unflushed.append((reply, answer, link, self.current))
         if len(self._unflushed) == 1:
             process = self.node.process
-            slow = process.world.random.random() ** 3 * 0.004
-            process.world.after(slow, lambda: process.do(self._flush))
+            process.world.after(process.world.disk_delay(process), lambda: process.do(self._flush))
 
     def _flush(self) -> None:
         group, self._unflushed = self._unflushed, []

@@ -22,14 +22,14 @@ KINDS = (
     "second",
     "second actor",
 )
-_WEIGHTS = (6, 5, 2, 3, 4, 4, 3, 6, 2, 2, 1, 3, 1)
+_WEIGHTS = (6, 5, 4, 6, 4, 4, 3, 6, 2, 3, 1, 4, 1)
 
 
 @dataclass(frozen=True)
 class Fault:
     """One fault.
 
-    at: seconds from the run's beginning. length: seconds that it lasts, if it does. number: of what it is, its kind says.
+    at: seconds from the run's beginning. length: seconds that it lasts, if it does. number: what its kind says.
     """
 
     at: float

@@ -11,6 +11,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from benchmarks.simulate.agent import SIZE, FewNumbers, Numbers
+from benchmarks.simulate.network import RUN, Network, SimNode
+from benchmarks.simulate.world import Process
 from coop.actors.weights import WeightsFollower
 from coop.common.errors import JoinError, RunError
 from coop.common.messaging.conversation import Conversation, asking
@@ -36,10 +39,6 @@ from coop.records.resumption import Start
 from coop.records.run_ids import claim, has_run_id, read_run_id
 from coop.replay.cli import serving_run
 
-from benchmarks.simulate.agent import SIZE, FewNumbers, Numbers
-from benchmarks.simulate.network import RUN, Network, SimNode
-from benchmarks.simulate.world import Process
-
 SPEC = EnvSpec("numbers", (1,), "float32", 1, 2)
 STEPS = 4  # of a segment
 LEARNER = "tcp/learner:1"
@@ -57,6 +56,7 @@ class Lines:
     def event(self, text: str) -> None:
         """See `Console`."""
         self._process.world.tell(self._process.name, "says:", text)
+        self._process.world.said(self._process, text)
 
     def recent(self) -> list[Any]:
         """See `Console`."""
@@ -73,11 +73,11 @@ class Directory:
         self,
         path: Path,
         config: RunConfig,
-        found: Any,
+        found: Any,  # noqa: ANN401
         number: int | None,
         steps: int,
         *,
-        log: object,  # noqa: ANN401
+        log: object,
     ) -> None:
         self.path, self.settings, self.fallbacks, self.aside, self.evaluated = path, "", [], "", 0
         newest = None if found is None or number is None else found.of(number)
@@ -285,4 +285,4 @@ def _sending(node: Any, payload: bytearray, stop: Any) -> Conversation[None]:  #
             return
 
 
-__all__ = ["JoinError", "SIZE", "actor", "evaluator", "learner", "learner_process", "replay"]
+__all__ = ["SIZE", "JoinError", "actor", "evaluator", "learner", "learner_process", "replay"]

@@ -38,7 +38,8 @@ class World:
         self.processes: list[Process] = []
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
-        self.ending = False
+        self.disk_delay: Callable[[Process], float] = lambda process: 0.0  # seconds that a flush takes
+        self.said: Callable[[Process, str], None] = lambda process, text: None
 
     def at(self, time: float, call: Callable[[], None]) -> None:
         """Call `call` at a time, after what was planned earlier for the same time."""
@@ -151,7 +152,8 @@ class Process:
         """Begin a conversation."""
         activity = Activity(self, name, conversation, stop)
         self.activities.append(activity)
-        self.world.after(0.0, lambda: self.do(activity.step))
+        delay = self.world.disk_delay(self) if name.startswith("checkpoint") else 0.0
+        self.world.after(delay, lambda: self.do(activity.step))
         return activity
 
     def freeze(self) -> None:
@@ -209,7 +211,7 @@ class Activity:
         for _ in range(100):
             try:
                 self._conversation.close()
-            except BaseException:  # noqa: S112, BLE001
+            except BaseException:
                 continue
             return
 
