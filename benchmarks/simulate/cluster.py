@@ -81,7 +81,8 @@ class Cluster:
         before = set(map(str, Path("/proc/self/fd").iterdir()))
         try:
             with self._product(), self.disk.installed():
-                for index, name in enumerate(("learner", "replay", "actor 0", "actor 1", "evaluator")):
+                names = ["learner", "replay", "actor 0", "actor 1"][: 2 + self.plan.actors]
+                for index, name in enumerate([*names, "evaluator"][: len(names) + self.plan.evaluator]):
                     self.world.after(0.01 * index, partial(self.begin, name))
                 for fault in self.plan.faults:
                     self.world.at(fault.at, partial(self._meet, fault))

@@ -215,6 +215,8 @@ class SimAnswer:
         if self._settled:
             return
         self._settled, self._raw = True, raw
+        if raw is not None:
+            self.node.arrived(self.key, raw)
         if self._then is not None:
             call, self._then = self._then, None
             self.node.process.do(call)
@@ -486,11 +488,17 @@ class SimNode:
         """Take a broadcast."""
         if not self.open:
             return
+        self.arrived(key, raw)
         if key in self._latest:
             self._latest[key].raw = raw
         for pattern, call in self._calls:
             if fnmatchcase(key, pattern):
                 call(key, self.read(raw))
+
+    def arrived(self, key: str, raw: bytes) -> None:
+        """Remember what has been said about the acting role."""
+        if key.endswith("/role"):
+            self.process.state.setdefault("roles", []).append(raw)
 
     def publish_status(self, status: object) -> None:
         """Nobody looks at displays here."""

@@ -77,6 +77,8 @@ class Plan:
     mirror: str
     sampling: str
     every: float
+    actors: int
+    evaluator: bool
     faults: tuple[Fault, ...]
 
     def __str__(self) -> str:
@@ -89,7 +91,8 @@ class Plan:
 def make_plan(seed: int) -> Plan:
     """The plan of a seed."""
     draw = random.Random(f"plan {seed}")
-    total = draw.choice((48, 64, 96))
+    total, every, actors = draw.choice((48, 64, 96)), draw.choice((0.05, 0.1, 0.2)), draw.choice((1, 2, 2))
+    lasts = 0.5 + total / 4 / actors * every  # seconds, if nothing happens
     return Plan(
         total=total,
         capacity=draw.choice((16, 32, total, total)),
@@ -99,28 +102,32 @@ def make_plan(seed: int) -> Plan:
         batch=4,
         swap=draw.choice((3, 7)),
         publish=draw.choice((1, 2, 5)),
-        checkpoint=draw.choice((5, 9)),
+        checkpoint=draw.choice((5, 9, 12)),
         prefetch=draw.choice((1, 2, 4, 8)),
         window=draw.choice((1, 2, 4)),
         journal=draw.choice(("sync", "sync", "async", "async", "async", "off")),
         mirror=draw.choice(("auto", "off")),
         sampling=draw.choice(("uniform", "uniform", "prioritized")),
-        every=draw.choice((0.05, 0.1, 0.2)),
-        faults=tuple(sorted(_faults(draw), key=lambda fault: fault.at)),
+        every=every,
+        actors=actors,
+        evaluator=draw.random() < 0.3,
+        faults=tuple(sorted(_faults(draw, lasts), key=lambda fault: fault.at)),
     )
 
 
-def _faults(draw: random.Random) -> list[Fault]:
+def _faults(draw: random.Random, lasts: float) -> list[Fault]:
     found = []
     for _ in range(draw.choice((0, 1, 1, 2, 2, 3))):
-        begins = draw.uniform(0.3, 8.0)
+        begins = draw.uniform(0.2, 1.2 * lasts)
         for _ in range(draw.randrange(1, 6)):
-            at = begins + draw.random() ** 2 * 2.0
+            at = begins + draw.random() ** 2 * draw.choice((0.3, 2.0))
             kind = draw.choices(KINDS, _WEIGHTS)[0]
             target, other = draw.choice(ROLES), ""
             length, number = draw.choice((draw.uniform(0.05, 1.0), draw.uniform(1.0, 6.0))), 0.0
             if kind in ("crash", "full", "slow", "deadly"):
                 target = draw.choice(("learner", "replay", "replay"))
+            if kind == "stop":
+                target = draw.choice(("replay", "replay", "learner", "actor 0", "evaluator"))
             if kind == "deadly":
                 number = draw.randrange(60)
             if kind == "leap":
