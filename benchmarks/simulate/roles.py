@@ -11,31 +11,28 @@ from typing import Any, Self
 
 import numpy as np
 
-from benchmarks.simulate.agent import SIZE, FewNumbers, Numbers
+from benchmarks.simulate.agent import FewNumbers, Numbers
 from benchmarks.simulate.network import RUN, Network, SimNode
 from benchmarks.simulate.world import Process
 from coop.actors.weights import WeightsFollower
-from coop.common.errors import JoinError, RunError
-from coop.common.messaging.conversation import Conversation, asking
+from coop.common.errors import RunError
+from coop.common.messaging.conversation import Conversation
 from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.joining import Membership, joining, leaving
-from coop.common.messaging.keys import evaluations_key
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.control import Join, JoinReply
 from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow
 from coop.common.messaging.route import ReplayRoute
-from coop.common.messaging.timing import ANSWER_TIMEOUT, RECEIPT_PAUSE
-from coop.common.messaging.transport import NoAnswer, Refused
 from coop.common.process.files import FileDigest
 from coop.common.settings.config import RunConfig
 from coop.common.transitions import Segment
 from coop.common.types import EnvSpec, EpisodeEnd
-from coop.learner import process as learner_process
+from coop.evaluation.evaluator import reporting
 from coop.learner.process import training_run
 from coop.learner.trainer import Trainer
 from coop.records.checkpoints import RECORDS
 from coop.records.learner_checkpoints import load_learner
-from coop.records.resumption import Start
+from coop.records.resumption import Start, go_back
 from coop.records.run_ids import claim, has_run_id, read_run_id
 from coop.replay.cli import serving_run
 
@@ -84,7 +81,10 @@ class Directory:
         for name in RECORDS:
             (path / name).touch()
         if found is not None:
-            self.aside = learner_process_go_back(found, number)
+            try:
+                self.aside = go_back(found, number)
+            except OSError as error:
+                raise RunError(f"{path}: {error}") from error
         if newest is not None:
             self.fallbacks = [*newest.manifest.fallbacks, *found.fallbacks(newest.number)]
         self.summary: Any = None
@@ -114,16 +114,6 @@ class Directory:
 
     def __exit__(self, *_: object) -> None:
         """Nothing is open."""
-
-
-def learner_process_go_back(found: Any, number: int | None) -> str:  # noqa: ANN401
-    """Move aside what the run does not go on with, as `RunDirectory` does."""
-    from coop.records.resumption import go_back  # noqa: PLC0415
-
-    try:
-        return go_back(found, number)
-    except OSError as error:
-        raise RunError(f"{found.run_dir}: {error}") from error
 
 
 def claim_directory(draw: random.Random, path: Path, config: RunConfig, known: int | None = None) -> int:
@@ -268,21 +258,6 @@ def evaluator(network: Network, process: Process, incarnation: int, every: float
                 if weights.settled:
                     update, env_step = weights.progress
                     row = EvaluationRow(env_step, update, 1, 1, 1.0, 0.0, 1, 0.0)
-                    yield from _sending(node, Evaluated(incarnation, number, row).encode(RUN), stop)
+                    yield from reporting(node, stop, Evaluated(incarnation, number, row).encode(RUN))
                     number += 1
     yield from leaving(node, request)
-
-
-def _sending(node: Any, payload: bytearray, stop: Any) -> Conversation[None]:  # noqa: ANN401
-    while not stop.is_set():
-        try:
-            yield from asking(node, evaluations_key(node), payload, ANSWER_TIMEOUT)
-        except Refused:
-            return
-        except NoAnswer:
-            yield RECEIPT_PAUSE
-        else:
-            return
-
-
-__all__ = ["SIZE", "JoinError", "actor", "evaluator", "learner", "learner_process", "replay"]
