@@ -142,10 +142,11 @@ def _service(
         console.event(line)
     settings, synced = reply.config.replay, None
     if settings.journal != "off":
-        number, notices = recover(core, folder.journal, first, folder.run_id)
+        sync = settings.journal == "sync"
+        number, notices = recover(core, folder.journal, first, folder.run_id, sync=sync)
         for line in notices:
             console.event(line)
-        sync, keep, accepted = settings.journal == "sync", settings.journal_keep, core.table.inserted
+        keep, accepted = settings.journal_keep, core.table.inserted
         try:
             journal = Journal(folder.journal, folder.run_id, number, keep=keep, sync=sync, accepted=accepted)
         except OSError as error:
