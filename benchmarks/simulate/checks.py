@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.simulate.roles import ACTOR_NUMBERS, SPEC, STEPS
 from benchmarks.simulate.world import Process, Violation
 from coop.common.messaging import wire
+from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.messaging.messages.weights import Role
 from coop.common.transitions import Batch, Drawn, DrawRequest, Segment
 from coop.learner.roster import Roster
@@ -60,6 +61,7 @@ class Checks:
         self._folder: object = None
         self._draws: dict[tuple[int, int], tuple[int, ...]] = {}
         self._owners: dict[int, tuple[Reply, int]] = {}
+        self._evaluations: set[float] = set()
         self._bases: dict[int, int] = {}
         self._learner, self._counted = -1, 0
         self._last_ack = self._last_save = -1.0
@@ -290,8 +292,16 @@ class Checks:
     # ------------------------------------------------------------------------------------------------------------------
     # Weights
 
+    def evaluated(self, row: EvaluationRow) -> None:
+        """The learner has recorded an evaluation, whose seconds no other has."""
+        self.hold("evaluation", row.seconds not in self._evaluations, "recorded twice by one learner")
+        self._evaluations.add(row.seconds)
+        assert self._trainer is not None
+        self.hold("evaluation", row.env_step <= self._trainer.drawn.inserted, f"after {row.env_step} steps")
+
     def learner_begins(self, process: Process) -> None:
         """A learner's process has begun."""
+        self._evaluations.clear()
         self._roles.clear()
         self._began_at = self.cluster.world.now
         self._learner_look = self.look_at_checkpoints()

@@ -255,7 +255,7 @@ class Cluster:
             replace("coop.replay.cli.ReplayCore", checks.core_kind)
             replace("coop.replay.cli.ReplayService", checks.service_kind)
             replace("coop.learner.process.Roster", checks.roster_kind)
-            replace("coop.learner.process.RunDirectory", roles.Directory)
+            replace("coop.learner.process.RunDirectory", partial(roles.Directory, checks.evaluated))
             replace("coop.learner.process.claim_run_directory", partial(roles.claim_directory, ids))
             replace("coop.learner.process.load_initial_networks", lambda agent: None)
             replace("coop.learner.trainer.METRICS_EVERY", 1 << 40)

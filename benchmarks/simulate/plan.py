@@ -119,6 +119,10 @@ def _faults(draw: random.Random, lasts: float) -> list[Fault]:
     found = []
     for _ in range(draw.choice((0, 1, 1, 2, 2, 3))):
         begins = draw.uniform(0.2, 1.2 * lasts)
+        if draw.random() < 0.15:  # one replay service can't be reached while another waits for its place
+            kind, other = draw.choice((("freeze", ""), ("partition", "learner"), ("partition", "actors")))
+            found.append(Fault(begins, kind, "replay", other, draw.uniform(1.0, 6.0)))
+            found.append(Fault(max(0.1, begins + draw.uniform(-1.0, 2.0)), "second", "replay", "elsewhere"))
         for _ in range(draw.randrange(1, 6)):
             at = begins + draw.random() ** 2 * draw.choice((0.3, 2.0))
             kind = draw.choices(KINDS, _WEIGHTS)[0]

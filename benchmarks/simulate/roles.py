@@ -68,6 +68,7 @@ class Directory:
 
     def __init__(
         self,
+        recorded: Callable[[EvaluationRow], None],
         path: Path,
         config: RunConfig,
         found: Any,  # noqa: ANN401
@@ -76,6 +77,7 @@ class Directory:
         *,
         log: object,
     ) -> None:
+        self._recorded = recorded
         self.path, self.settings, self.fallbacks, self.aside, self.evaluated = path, "", [], "", 0
         newest = None if found is None or number is None else found.of(number)
         for name in RECORDS:
@@ -100,8 +102,9 @@ class Directory:
     def record(self, episodes: object, metrics: object) -> None:
         """See `RunDirectory`."""
 
-    def evaluation(self, row: object) -> None:
+    def evaluation(self, row: EvaluationRow) -> None:
         """See `RunDirectory`."""
+        self._recorded(row)
 
     def conclude(self, summary: Any, title: str) -> None:  # noqa: ANN401
         """See `RunDirectory`."""
@@ -257,7 +260,9 @@ def evaluator(network: Network, process: Process, incarnation: int, every: float
                 yield from weights.refreshing()
                 if weights.settled:
                     update, env_step = weights.progress
-                    row = EvaluationRow(env_step, update, 1, 1, 1.0, 0.0, 1, 0.0)
+                    row = EvaluationRow(
+                        env_step, update, 1, 1, 1.0, 0.0, 0.0, float(incarnation % 10**6 * 100 + number)
+                    )
                     yield from reporting(node, stop, Evaluated(incarnation, number, row).encode(RUN))
                     number += 1
     yield from leaving(node, request)
