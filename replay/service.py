@@ -154,15 +154,20 @@ class ReplayService:
 
         return self._admitted(self._inserts, attempt)
 
-    def _flush(self) -> bool:
-        """Flush the journal to the disk; a disk that fails once may have dropped what a later flush calls written."""
+    def _flush(self) -> bytearray | None:
+        """Flush the journal to the disk; return the refusal that leaves in place of acknowledgements, if they may not.
+
+        A disk that fails once may have dropped what a later flush calls written. One that is slow may let a
+        confirmation expire: another service may serve now, which does not have these segments.
+        """
         assert self._synced is not None
         if not self._broken:
             try:
                 self._synced.flush(self._changed)
             except OSError as error:
                 self._broken = f"the journal can't be flushed to the disk: {error.strerror or error}"
-        return not self._broken
+        refusal = RetryLater(self._broken) if self._broken else self._not_serving()
+        return None if refusal is None else Retry(refusal.reason).encode(self._node.run)
 
     def _window(self) -> int:
         """Segments that each actor may have in flight; behind a router, actors have no connections of their own."""

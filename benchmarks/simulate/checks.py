@@ -122,7 +122,13 @@ class Checks:
         """Count a look at an invariant; raise Violation if it does not hold."""
         self.done[what] += 1
         if not holds:
-            raise Violation(f"{what}: {words}")
+            self.broken(f"{what}: {words}")
+
+    def broken(self, words: str) -> None:
+        """Raise Violation, and make sure that it ends the run."""
+        world = self.cluster.world
+        world.broken = world.broken or Violation(words)
+        raise world.broken
 
     # ------------------------------------------------------------------------------------------------------------------
     # Acknowledgements and the table
@@ -183,7 +189,7 @@ class Checks:
                     self.forgiven += STEPS
                     continue
                 text = f"segment {who[1]} of actor {who[0]:x}, acknowledged at {when} s, is not in the restored table"
-                raise Violation(f"acknowledged: {text}")
+                self.broken(f"acknowledged: {text}")
         if self._forgive:
             self._draws.clear()
         self._forgive = False
@@ -297,7 +303,8 @@ class Checks:
         self.hold("evaluation", row.seconds not in self._evaluations, "recorded twice by one learner")
         self._evaluations.add(row.seconds)
         assert self._trainer is not None
-        self.hold("evaluation", row.env_step <= self._trainer.drawn.inserted, f"after {row.env_step} steps")
+        known = row.env_step <= self._trainer.drawn.inserted or self.forgiven > 0
+        self.hold("evaluation", known, f"after {row.env_step} steps")
 
     def learner_begins(self, process: Process) -> None:
         """A learner's process has begun."""
@@ -362,7 +369,7 @@ class Checks:
             if newest in ReplayCheckpoints(folder, -1).intact():
                 self._restore(folder, newest)
                 return
-        raise Violation(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
+        self.broken(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
 
     def _restore(self, folder: Any, number: int) -> None:  # noqa: ANN401
         core = ReplayCore(self.cluster.config, SPEC)
@@ -371,7 +378,7 @@ class Checks:
         try:
             load_snapshot(core, part_path(folder, number), read_run_id(folder), number)
         except Damaged as damaged:
-            raise Violation(f"checkpoint: part of {number}: {damaged}") from damaged
+            self.broken(f"checkpoint: part of {number}: {damaged}")
         acked, self.acked = self.acked, {}
         self.look_at(core)
         self.acked = acked

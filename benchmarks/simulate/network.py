@@ -274,7 +274,7 @@ class _Server:
         node: SimNode,
         key: str,
         answer: Callable[[Message], bytearray | Conversation[bytearray]],
-        flush: Callable[[], bool] | None,
+        flush: Callable[[], bytearray | None] | None,
     ) -> None:
         self.node, self.key, self.answer, self.flush = node, key, answer, flush
         self.queue: deque[tuple[bytes, SimAnswer, Link]] = deque()
@@ -351,9 +351,9 @@ class _Server:
     def _flush(self) -> None:
         group, self._unflushed = self._unflushed, []
         assert self.flush is not None
-        if self.flush():
-            for reply, answer, link, message in group:
-                self._give(reply, answer, link, message)
+        instead = self.flush()
+        for reply, answer, link, message in group:
+            self._give(reply if instead is None else bytes(instead), answer, link, message)
 
     def _give(self, reply: bytes, answer: SimAnswer, link: Link, message: Message) -> None:
         self.node.on_reply(self.node, self.key, message, reply)
@@ -450,7 +450,7 @@ class SimNode:
         self,
         key: str,
         answer: Callable[[Message], bytearray | Conversation[bytearray]],
-        flush: Callable[[], bool] | None = None,
+        flush: Callable[[], bytearray | None] | None = None,
         changed: threading.Condition | None = None,
     ) -> None:
         """See `Node`."""

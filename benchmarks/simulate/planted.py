@@ -33,7 +33,7 @@ def _ack_before_write() -> Patches:
 
 
 def _ack_before_flush() -> Patches:
-    return [(ReplayService, "_flush", lambda self: True)]
+    return [(ReplayService, "_flush", lambda self: None)]
 
 
 def _forgotten_base() -> Patches:
@@ -155,6 +155,14 @@ def _overtaking_draws() -> Patches:
     return [(ReplayCore, "draw", counted), (RateLimiter, "why_not_sample", by_count)]
 
 
+def _late_acknowledgement() -> Patches:
+    def flush(self: Any) -> bytearray | None:  # noqa: ANN401
+        self._synced.flush(self._changed)
+        return None
+
+    return [(ReplayService, "_flush", flush)]
+
+
 def _closing_once() -> Patches:
     def saving(self: Any) -> Any:  # noqa: ANN401
         if self._agent.updates and (yield from self._replay_stats()) is not None:
@@ -179,6 +187,7 @@ PLANTED: dict[str, tuple[str, Callable[[], Patches]]] = {
     "unflushed-part": ("checkpoints are sealed before their files are on the disk", _unflushed_part),
     "retry-as-ack": ("an actor takes a refusal for an acknowledgement", _retry_as_ack),
     "overtaking-draws": ("as it was: a draw that overtakes another exceeds the ratio", _overtaking_draws),
+    "late-acknowledgement": ("as it was: a slow flush outlives the confirmation", _late_acknowledgement),
     "closing-once": ("as it was: a replay service that restarts makes a complete run fail", _closing_once),
     "journal-begins-late": ("a checkpoint names the wrong file of the journal that continues it", _journal_begins_late),
 }

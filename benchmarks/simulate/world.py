@@ -39,6 +39,7 @@ class World:
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self.disk_delay: Callable[[Process], float] = lambda process: 0.0  # seconds that a flush takes
+        self.broken: Violation | None = None  # the first one
         self.said: Callable[[Process, str], None] = lambda process, text: None
 
     def at(self, time: float, call: Callable[[], None]) -> None:
@@ -64,6 +65,8 @@ class World:
             self.now = time
             self.events += 1
             call()
+            if self.broken is not None:  # what it was raised in may have more to say before it ends
+                raise self.broken
         return until()
 
 

@@ -166,12 +166,13 @@ class Node:
         self,
         key: str,
         answer: Callable[[Message], bytearray | Conversation[bytearray]],
-        flush: Callable[[], bool] | None = None,
+        flush: Callable[[], bytearray | None] | None = None,
         changed: threading.Condition | None = None,
     ) -> None:
         """Answer the queries on `key`, one after another, in a new thread, until the session closes.
 
-        flush: called in another thread before replies leave, once for all that wait then; they do if it returns True.
+        flush: called in another thread before replies leave, once for all that wait then; returns what leaves in place
+            of each, or None if they may leave.
         changed: answers are conversations, which wait for changes of what this guards, and hold it otherwise.
 
         A message that cannot be decoded, names another run, or makes `answer` raise BadMessage gets an error reply, is
@@ -227,15 +228,15 @@ class Node:
         if waiting is not None:
             waiting.put(None)
 
-    def _reply_flushed(self, waiting: _Waiting, key: str, flush: Callable[[], bool]) -> None:
-        """Send replies once `flush` has returned that was called after they were made."""
+    def _reply_flushed(self, waiting: _Waiting, key: str, flush: Callable[[], bytearray | None]) -> None:
+        """Send replies once `flush` has returned that was called after they were made, or what it returns."""
         while (first := waiting.get()) is not None:
             group = [first]
             while not waiting.empty() and (another := waiting.get()) is not None:
                 group.append(another)
-            if flush():
-                for query, answered in group:
-                    _reply(key, query, answered)
+            instead = flush()
+            for query, answered in group:
+                _reply(key, query, answered if instead is None else instead)
 
     def read(self, payload: zenoh.ZBytes | None) -> Message:
         """Decode a payload of this run; raises BadMessage."""

@@ -29,9 +29,7 @@ from coop.replay.persistence.journal import (
 from coop.replay.table.table import PinnedBatch
 
 
-def recover(
-    core: ReplayCore, folder: Path, first: int, run_id: int, *, sync: bool = False
-) -> tuple[int, list[str]]:
+def recover(core: ReplayCore, folder: Path, first: int, run_id: int, *, sync: bool = False) -> tuple[int, list[str]]:
     """Replay the journal on a core from file `first` to its end; return the next file's number, and lines to say.
 
     sync: what was acknowledged had been flushed to the disk. So what can't be read at the journal's end is what a
