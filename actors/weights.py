@@ -48,8 +48,8 @@ class WeightsFollower:
 
     @property
     def ready(self) -> bool:
-        """True once both networks have been received."""
-        return UNKNOWN not in self._held
+        """True once both networks have been received, and which one acts."""
+        return UNKNOWN not in (*self._held, *self._told)
 
     @property
     def settled(self) -> bool:

@@ -183,7 +183,7 @@ def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
     assert policy.acting == 0
     assert follower.version == 4
     follower.refresh()
-    assert follower.ready == (silent == "role")
+    assert not follower.ready, "without the role it does not know which network acts"
 
 
 def test_a_layout_that_differs_is_refused(spec: EnvSpec) -> None:
