@@ -62,6 +62,7 @@ class Checks:
         self._draws: dict[tuple[int, int], tuple[int, ...]] = {}
         self._owners: dict[int, tuple[Reply, int]] = {}
         self._evaluations: set[float] = set()
+        self._sealed: object = None  # the checkpoint that was looked at last
         self._bases: dict[int, int] = {}
         self._learner, self._counted = -1, 0
         self._last_ack = self._last_save = -1.0
@@ -362,12 +363,16 @@ class Checks:
         if not numbers:
             return
         newest = numbers[-1]
-        state = load_learner(path / "checkpoints" / str(newest))
-        self.hold("checkpoint", state["agent"]["updates"] == newest, f"{newest} holds another number of updates")
+        sealed = newest, (path / "checkpoints" / str(newest) / DONE).stat().st_mtime_ns
+        if sealed != self._sealed:
+            state = load_learner(path / "checkpoints" / str(newest))
+            self.hold("checkpoint", state["agent"]["updates"] == newest, f"{newest} holds another number of updates")
         parts = [root / place / "table" for place in ("replay", "elsewhere")]
         for folder in parts:
             if newest in ReplayCheckpoints(folder, -1).intact():
-                self._restore(folder, newest)
+                if sealed != self._sealed:
+                    self._restore(folder, newest)
+                self._sealed = sealed
                 return
         self.broken(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
 

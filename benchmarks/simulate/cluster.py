@@ -29,8 +29,8 @@ ENDS_WITHIN = 240.0  # seconds after the last fault: a lost acknowledgement alon
 LEAVES_WITHIN = 90.0  # seconds that other roles may take once the run is complete: their patience is 60
 DRIFT = 5e-5  # clocks of two machines differ by a ten-thousandth at most
 _decoded: dict[bytes, JoinReply] = {}
-_decode, _identify = JoinReply.decode, joining._identity
-_identities: dict[tuple[int, int], dict[str, Any]] = {}
+_decode, _compare = JoinReply.decode, joining.difference
+_compared: dict[tuple[int, int, int, int], str | None] = {}
 
 
 class Cluster:
@@ -268,7 +268,7 @@ class Cluster:
             )
             replace("coop.common.process.files.time", SimpleNamespace(strftime=lambda form: "moved"))
             replace("coop.common.messaging.messages.control.JoinReply.decode", _remembered)
-            replace("coop.common.messaging.joining._identity", _identity)
+            replace("coop.common.messaging.joining.difference", _difference)
             replace("benchmarks.simulate.network.SimNode.on_reply", staticmethod(checks.on_reply))
             yield
 
@@ -319,17 +319,17 @@ def _remembered(message: Any) -> JoinReply:  # noqa: ANN401
     if raw not in _decoded:
         if len(_decoded) > 4096:
             _decoded.clear()
-            _identities.clear()
+            _compared.clear()
         _decoded[raw] = _decode(message)
     return _decoded[raw]
 
 
-def _identity(reply: JoinReply) -> dict[str, Any]:
-    """What a member compares of a reply; it depends on few things that differ from one reply to another."""
-    key = id(reply.config), reply.run_id
-    if key not in _identities:
-        _identities[key] = _identify(reply)
-    return _identities[key]
+def _difference(mine: JoinReply, theirs: JoinReply) -> str | None:
+    """What keeps a member from following a learner; two settings that are the same object differ in nothing."""
+    key = id(mine.config), mine.run_id, id(theirs.config), theirs.run_id
+    if key not in _compared:
+        _compared[key] = _compare(mine, theirs)
+    return _compared[key]
 
 
 def make_config(plan: Plan) -> RunConfig:

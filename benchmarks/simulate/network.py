@@ -46,10 +46,10 @@ class Weather:
 
 @dataclass
 class Link:
-    """A connection of two nodes; number: how many came before it."""
+    """A connection of two nodes; endpoint: by which the first found the second."""
 
     ends: tuple[SimNode, SimNode]
-    number: int
+    endpoint: str
     up: bool = True
     last: dict[str, float] = field(default_factory=dict)  # when the last message will arrive, by its sender's role
     questions: list[SimAnswer] = field(default_factory=list)
@@ -74,7 +74,6 @@ class Network:
         self.disturbed = -100.0  # when the weather was bad last, or a cut or a freeze ended
         self.delivered = self.dropped = self.doubled = 0
         self._held: list[tuple[SimNode, SimNode, Link, Callable[[], None]]] = []
-        self._links = 0
 
     def blocked(self, source: SimNode, target: SimNode) -> bool:
         """Whether nothing gets through in this direction now."""
@@ -142,17 +141,17 @@ class Network:
         return [node for process in self.world.processes if process.alive for node in process.nodes]
 
     def connect(self, node: SimNode, endpoint: str) -> None:
-        """Try to connect a node now and again, as long as it is open."""
+        """Connect a node, or try again soon; also once the link is gone."""
         if not (node.open and node.process.alive):
             return
         target = self.listening.get(endpoint)
         if target is not None and target.open and target.process.alive and not node.linked(target):
-            link = Link((node, target), self._links)
+            link = Link((node, target), endpoint)
             if not self.dead(link):
-                self._links += 1
                 for end in link.ends:
                     end.links.append(link)
                     self._token(end, link, there=True)
+                return
         again = RECONNECT * (0.75 + self.world.random.random() / 2)
         self.world.after(again, lambda: self.connect(node, endpoint))
 
@@ -165,6 +164,7 @@ class Network:
             self._token(end, link, there=False)
         for answer in link.questions:
             self.world.after(0.001, answer.lose)
+        self.world.after(RECONNECT, lambda: self.connect(link.ends[0], link.endpoint))
 
     def _token(self, end: SimNode, link: Link, *, there: bool) -> None:
         other = link.other(end)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import json
 import os
-import sys
 import time
 import traceback
 from collections import Counter
@@ -17,6 +16,7 @@ from benchmarks.simulate.plan import Plan, make_plan
 from benchmarks.simulate.planted import PLANTED, planted
 from benchmarks.simulate.world import Violation
 
+COLLECTED_EVERY = 25  # seeds between collections of garbage, which otherwise come in the middle of one
 MEMORY = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path("/tmp")
 
 
@@ -107,44 +107,62 @@ def run_many(first: int, seeds: int, bug: str, out: str) -> int:
     """Run many seeds, and print figures; or find all planted bugs."""
     if bug == "all":
         return _find_all(first, seeds, out)
-    began, failed = time.perf_counter(), []
-    met: Counter[str] = Counter()
-    checks: Counter[str] = Counter()
-    events = messages = forgiven = 0
-    simulated = 0.0
+    total = Figures()
     with planted(bug):
         gc.disable()
         for seed in range(first, first + seeds):
             outcome = simulate(seed)
-            met += outcome.met
-            checks += outcome.checks
-            events, messages = events + outcome.events, messages + outcome.messages
-            simulated, forgiven = simulated + outcome.simulated, forgiven + outcome.forgiven
-            if seed % 20 == 0:
-                gc.collect()
+            total.add(outcome)
             if outcome.problem:
-                failed.append((seed, outcome.problem))
-                if len(failed) == 1:
-                    print(explain(outcome, bug), flush=True)
-                else:
-                    print(f"seed {seed}: {outcome.problem}", flush=True)
+                print(f"seed {seed}: {outcome.problem}" if total.failed > 1 else explain(outcome, bug), flush=True)
+            if total.seeds % COLLECTED_EVERY == 0:
+                gc.collect()
+                total.write(out)
         gc.enable()
-    seconds = time.perf_counter() - began
-    figures = {
-        "seeds": seeds,
-        "failed": len(failed),
-        "seconds": round(seconds, 1),
-        "processor_seconds": round(time.process_time(), 1),
-        "events": events,
-        "messages": messages,
-        "simulated_seconds": round(simulated),
-        "faults": dict(met.most_common()),
-        "checks": dict(checks.most_common()),
-    }
-    print(json.dumps(figures, indent=1))
-    if out:
-        Path(out).write_text(json.dumps(figures, indent=1))
-    return int(bool(failed))
+    print(total.write(out))
+    return int(total.failed > 0)
+
+
+class Figures:
+    """The sums of many seeds."""
+
+    def __init__(self) -> None:
+        self.seeds = self.failed = self.events = self.messages = 0
+        self.simulated = 0.0
+        self.met: Counter[str] = Counter()
+        self.checks: Counter[str] = Counter()
+        self._began = time.perf_counter(), time.process_time()
+
+    def add(self, outcome: Outcome) -> None:
+        """Count one."""
+        self.seeds += 1
+        self.failed += bool(outcome.problem)
+        self.events += outcome.events
+        self.messages += outcome.messages
+        self.simulated += outcome.simulated
+        self.met += outcome.met
+        self.checks += outcome.checks
+
+    def write(self, out: str) -> str:
+        """The figures as JSON, also in a file if one is named."""
+        wall, processor = self._began
+        text = json.dumps(
+            {
+                "seeds": self.seeds,
+                "failed": self.failed,
+                "seconds": round(time.perf_counter() - wall, 1),
+                "processor_seconds": round(time.process_time() - processor, 1),
+                "events": self.events,
+                "messages": self.messages,
+                "simulated_seconds": round(self.simulated),
+                "faults": dict(self.met.most_common()),
+                "checks": dict(self.checks.most_common()),
+            },
+            indent=1,
+        )
+        if out:
+            Path(out).write_text(text)
+        return text
 
 
 def find(bug: str, first: int, seeds: int) -> tuple[int, Outcome | None]:
@@ -168,7 +186,3 @@ def _find_all(first: int, seeds: int, out: str) -> int:
     if out:
         Path(out).write_text(json.dumps(found, indent=1))
     return int(sum(each[3] is None for each in found) > 1)
-
-
-if __name__ == "__main__":
-    sys.exit(0)
