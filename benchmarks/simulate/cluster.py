@@ -266,11 +266,18 @@ class Cluster:
                 "coop.common.process.files.secrets",
                 SimpleNamespace(token_hex=lambda n: f"{ids.getrandbits(8 * n):0{2 * n}x}"),
             )
+            replace("coop.common.messaging.members.os", SimpleNamespace(getpid=lambda: self._present_process().number))
+            where = SimpleNamespace(gethostname=lambda: self._present_process().machine.name)
+            replace("coop.common.messaging.members.socket", where)
             replace("coop.common.process.files.time", SimpleNamespace(strftime=lambda form: "moved"))
             replace("coop.common.messaging.messages.control.JoinReply.decode", _remembered)
             replace("coop.common.messaging.joining.difference", _difference)
             replace("benchmarks.simulate.network.SimNode.on_reply", staticmethod(checks.on_reply))
             yield
+
+    def _present_process(self) -> Process:
+        assert self.world.running is not None
+        return self.world.running
 
     def _clear(self, before: set[str]) -> None:
         """End what is left of dead processes, whose files and conversations nothing else closes."""

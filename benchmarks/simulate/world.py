@@ -129,6 +129,7 @@ class Process:
         self.on_end: Callable[[str], None] = lambda reason: None
         self.state: dict[str, Any] = {}
         self.since = world.now  # when it began, or was thawed last
+        self.number = len(world.processes) + 1
         self._backlog: list[Callable[[], None]] = []
         world.processes.append(self)
 
