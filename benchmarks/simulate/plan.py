@@ -22,7 +22,7 @@ KINDS = (
     "second",
     "second actor",
 )
-_WEIGHTS = (6, 5, 4, 6, 4, 4, 3, 6, 2, 3, 1, 4, 1)
+_WEIGHTS = (6, 5, 4, 6, 8, 4, 3, 6, 2, 3, 1, 4, 1)
 
 
 @dataclass(frozen=True)
