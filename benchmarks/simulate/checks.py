@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -175,6 +176,14 @@ class Checks:
         """A role has said something."""
         if process.role == "learner" and ("saved, " in text or "goes on without it" in text):
             self._last_save = self.cluster.world.now
+            numbers = checkpoint_numbers(self.cluster.root / "learner" / "run", DONE)
+            parts = [part_path(folder, numbers[-1]) for folder in self._folders()] if numbers else []
+            there = not parts or any((part / DONE).exists() for part in parts)
+            self.hold("checkpoint", there, f"{numbers[-1:]} is sealed without the replay service's part")
+
+    def _folders(self) -> list[Path]:
+        """Where replay services keep their parts."""
+        return [self.cluster.root / place / "table" for place in ("replay", "elsewhere")]
 
     def service_begins(self, process: Process, core: ReplayCore) -> None:
         """A replay service has restored what it holds."""
@@ -367,8 +376,7 @@ class Checks:
         if sealed != self._sealed:
             state = load_learner(path / "checkpoints" / str(newest))
             self.hold("checkpoint", state["agent"]["updates"] == newest, f"{newest} holds another number of updates")
-        parts = [root / place / "table" for place in ("replay", "elsewhere")]
-        for folder in parts:
+        for folder in self._folders():
             if newest in ReplayCheckpoints(folder, -1).intact():
                 if sealed != self._sealed:
                     self._restore(folder, newest)
