@@ -12,7 +12,7 @@ STAMP = $(shell date +%Y%m%d-%H%M%S)
 # The tests start hundreds of processes: they share what Python has compiled, also where it is told not to keep it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test check results fuzz netns soak chaos slurm-test dask-test compose-test mutants bench gpu gpu-atari docs dist
+.PHONY: run test check results fuzz netns soak chaos simulate slurm-test dask-test compose-test mutants bench gpu gpu-atari docs dist
 
 run: $(RUNS)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
@@ -48,6 +48,10 @@ chaos: $(READY)
 
 soak: $(READY)
 	@$(BIN)/python benchmarks/soak.py
+
+# Whole runs in made-up time, with faults from a seed each; FIRST=N begins at another one.
+simulate: $(READY)
+	@$(BIN)/python -m benchmarks.simulate --seeds $(or $(SEEDS),1000) --first $(or $(FIRST),0)
 
 # A Slurm controller and three nodes on this machine; root installs what is missing.
 slurm-test: $(READY)

@@ -12,8 +12,10 @@ from coop.actors.policy import EpsilonGreedy
 from coop.actors.segments import SegmentAssembler
 from coop.actors.weights import WeightsFollower
 from coop.common.envs.protocol import VectorEnv
-from coop.common.messaging.insert_client import InsertClient, QuerySender
+from coop.common.messaging.conversation import Asker
+from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.messages.status import ActorStatus
+from coop.common.messaging.timing import STATUS_EVERY
 from coop.common.messaging.transport import Node
 from coop.common.numbers import Rate
 from coop.common.process.console import Console
@@ -21,7 +23,6 @@ from coop.common.process.lifecycle import Stop
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
 
-STATUS_EVERY = 0.5  # seconds
 SPEED_OVER = 2.0  # seconds
 
 
@@ -43,7 +44,7 @@ class ActorService:
     def __init__(
         self,
         node: Node,
-        route: QuerySender,
+        route: Asker,
         stop: Stop,
         config: RunConfig,
         envs: Sequence[VectorEnv],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Collection
 
 import numpy as np
@@ -11,16 +10,16 @@ import numpy as np
 from coop.actors.policy import EpsilonGreedy
 from coop.common.errors import BadMessage, JoinError
 from coop.common.imports import check_allowed
+from coop.common.messaging.conversation import Conversation, asking, drive
 from coop.common.messaging.keys import role_key, weights_key
 from coop.common.messaging.messages.control import JoinReply
 from coop.common.messaging.messages.weights import Current, Role, Weights
+from coop.common.messaging.timing import ANSWER_TIMEOUT, GRACE
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.messaging.wire import Message
 from coop.common.networks.acting import acting_network
 
 UNKNOWN = -1  # a version: no weights, or no role, received yet
-GRACE = 0.5  # seconds to wait for a broadcast before asking for the weights
-ANSWER_TIMEOUT = 2.0  # seconds to wait for each answer
 
 
 class WeightsFollower:
@@ -49,8 +48,8 @@ class WeightsFollower:
 
     @property
     def ready(self) -> bool:
-        """True once both networks have been received."""
-        return UNKNOWN not in self._held
+        """True once both networks have been received, and which one acts."""
+        return UNKNOWN not in (*self._held, *self._told)
 
     @property
     def settled(self) -> bool:
@@ -59,29 +58,37 @@ class WeightsFollower:
 
     def refresh(self) -> None:
         """Load new broadcasts; ask the learner for weights whose broadcast did not arrive."""
+        drive(self.refreshing())
+
+    def refreshing(self) -> Conversation[None]:
+        """See `refresh`."""
         for follower in self._weights:
             if (message := follower.poll()) is not None:
                 self._load(message)
         if (message := self._role.poll()) is not None:
             self._follow(message)
         if not self.ready:
-            self.fetch()
+            yield from self.fetching()
         elif self._held[self._policy.acting] >= self._told[self._policy.acting]:
             self._ask_at = math.inf
         else:
-            now = time.monotonic()
+            now = self._node.now()
             self._ask_at = min(self._ask_at, now + GRACE)
             if now >= self._ask_at:
                 self._ask_at = math.inf
-                self.fetch()
+                yield from self.fetching()
 
     def fetch(self) -> bool:
         """Ask the learner for both networks and the role; False if it does not answer."""
+        return drive(self.fetching())
+
+    def fetching(self) -> Conversation[bool]:
+        """See `fetch`."""
         question = Current().encode(self._node.run)
         try:
             for key in self._keys:
-                self._load(self._node.ask(key, question, timeout=ANSWER_TIMEOUT))
-            self._follow(self._node.ask(role_key(self._node), question, timeout=ANSWER_TIMEOUT))
+                self._load((yield from asking(self._node, key, question, ANSWER_TIMEOUT)))
+            self._follow((yield from asking(self._node, role_key(self._node), question, ANSWER_TIMEOUT)))
         except NoAnswer:
             return False
         return True

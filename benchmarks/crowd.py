@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 from synthetic import PATIENCE, STEPS, Broadcasts, Space, SyntheticActor
 
-from coop.actors.service import STATUS_EVERY
-from coop.common.messaging.joining import IDLE_ASK_EVERY
+from coop.common.messaging.timing import IDLE_ASK_EVERY, STATUS_EVERY
 from coop.common.process.memory import keep_freed_memory
 
 AT_ONCE = 16  # actors of a process that join at the same time

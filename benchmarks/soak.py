@@ -43,7 +43,11 @@ def measure(pid: int) -> Sample:
 def soak(seconds: float, folder: Path, flags: Sequence[str]) -> None:
     """Print the table; raise a CoopError if a resource grows or a process ends."""
     roles = Roles.of_run(
-        folder, "soak", (free_endpoint(), free_endpoint()), ("--total-steps=1000000000", *flags), ACTORS
+        folder,
+        "soak",
+        (free_endpoint(), free_endpoint()),
+        ("--total-steps=1000000000", "--checkpoint-every=2000", *flags),
+        ACTORS,
     )
     samples: dict[str, list[Sample]] = defaultdict(list)
     with running(roles):

@@ -18,11 +18,8 @@ import zenoh
 from made_up import ATARI, segments
 from zenoh.handlers import FifoChannel, RingChannel
 
-from coop.actors.weights import GRACE
 from coop.common.errors import RunError
 from coop.common.messaging import wire
-from coop.common.messaging.insert_client import INSERT_TIMEOUT
-from coop.common.messaging.joining import RETRY_PAUSE
 from coop.common.messaging.keys import join_key, replay_key, role_key, run_key, status_key, weights_key
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack
@@ -31,6 +28,7 @@ from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.messages.status import ActorStatus
 from coop.common.messaging.messages.weights import Current, Role
 from coop.common.messaging.session import open_session
+from coop.common.messaging.timing import GRACE, INSERT_TIMEOUT, RETRY_PAUSE
 from coop.common.messaging.transport import NoAnswer, Pending, new_incarnation
 
 STEPS, STREAMS = 32, 8  # of a segment; emulators of an actor

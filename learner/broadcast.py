@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ class Broadcaster:
         self._acting = 0
         self._weights = [bytearray(), bytearray()]
         self._role = bytearray()
-        self._thread = ThreadPoolExecutor(1, "broadcast")
+        self._thread = node.pool("broadcast")
         self._sent: Future[None] | None = None
         self.publish(env_step, wait=True)
         node.serve(self._weights_key(0), lambda message: self._answer(message, self._weights[0]))

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 from coop.common.errors import CoopError, RunError
+from coop.common.messaging.conversation import Conversation, Task, asking, ended
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Retry
 from coop.common.messaging.messages.control import Snapshot, Written
 from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.timing import SNAPSHOT_PATIENCE, WRITTEN_PAUSE
 from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.messaging.wire import Message
 from coop.common.process.files import FileDigest
-from coop.common.process.lifecycle import Worker
 from coop.learner.shared_checkpoints import SharedCheckpoints
 from coop.records.checkpoints import DONE, KEPT, checkpoint_numbers
-from coop.records.learner_checkpoints import save_checkpoint
+from coop.records.learner_checkpoints import saving_checkpoint
 from coop.records.run_directory import RunDirectory
-
-PATIENCE = 5.0  # seconds to wait for the replay service's answer
-PAUSE = 0.05  # seconds between requests
 
 
 class Checkpoints:
@@ -48,71 +45,71 @@ class Checkpoints:
         self._event = event
         self._samples = samples
         self._shared = shared
-        self._writer = Worker("checkpoints")
+        self._writer: Task | None = None
 
     def begin(self, state: Callable[[], dict[str, Any]]) -> bool:
         """Begin a checkpoint between two updates; do nothing and return False while the last one is being written."""
-        if self._writer.busy:
+        if self._writer is not None and self._writer.is_alive():
             return False
-        number, frozen, records = self._samples.pin(), state(), self._directory.records()
-        self._writer.begin(lambda: self._try(number, frozen, records))
+        number = self._samples.pin()
+        self._writer = self._node.start(
+            f"checkpoint {number}", self._trying(number, state(), self._directory.records())
+        )
         return True
 
-    def save(self, state: dict[str, Any]) -> None:
+    def saving(self, state: dict[str, Any]) -> Conversation[None]:
         """Save a checkpoint and wait until it is written.
 
         Raises:
             RunError: it could not be saved; the message gives the reason.
         """
-        self.wait()
-        self._save(self._samples.pin(), state, self._directory.records())
+        yield from self.written()
+        yield from self._saving(self._samples.pin(), state, self._directory.records())
 
-    def wait(self) -> None:
+    def written(self) -> Conversation[None]:
         """Wait for the checkpoint being written, if there is one."""
-        self._writer.wait()
+        yield from ended(self._writer)
 
-    def _try(self, number: int, state: dict[str, Any], records: dict[str, FileDigest]) -> None:
+    def _trying(self, number: int, state: dict[str, Any], records: dict[str, FileDigest]) -> Conversation[None]:
         try:
-            self._save(number, state, records)
+            yield from self._saving(number, state, records)
         except RunError as error:
             self._event(f"{error}; the run goes on without it")
 
-    def _save(self, number: int, state: dict[str, Any], records: dict[str, FileDigest]) -> None:
-        began = time.monotonic()
+    def _saving(self, number: int, state: dict[str, Any], records: dict[str, FileDigest]) -> Conversation[None]:
+        began, run_dir = self._node.now(), self._run_dir
         try:
             try:
-                self._ask(Snapshot(number, checkpoint_numbers(self._run_dir, DONE)[-KEPT:]).encode(self._node.run))
+                snapshot = Snapshot(number, checkpoint_numbers(run_dir, DONE)[-KEPT:])
+                yield from self._asking(snapshot.encode(self._node.run))
             finally:
                 self._samples.release()
-            written = Written(number).encode(self._node.run)
-            save_checkpoint(
-                self._run_dir,
+            with saving_checkpoint(
+                run_dir,
                 self._directory.run_id(),
                 number,
                 state,
-                lambda _: self._wait_for(written),
                 records=records,
                 fallbacks=self._directory.fallbacks,
                 settings=self._directory.settings,
-            )
+            ):
+                written = Written(number).encode(self._node.run)
+                while (yield from self._asking(written)).kind == Retry.kind:
+                    yield WRITTEN_PAUSE
         except OSError as error:
-            raise RunError(f"checkpoint {number} in {self._run_dir}: {error.strerror or error}") from error
+            raise RunError(f"checkpoint {number} in {run_dir}: {error.strerror or error}") from error
         except CoopError as error:
             raise RunError(f"checkpoint {number}: {error}") from error
         self._shared.finished(number)
-        self._event(f"checkpoint {number} saved, {time.monotonic() - began:.1f} s")
+        self._event(f"checkpoint {number} saved, {self._node.now() - began:.1f} s")
 
-    def _wait_for(self, question: bytearray) -> None:
-        while self._ask(question).kind == Retry.kind:
-            time.sleep(PAUSE)
-
-    def _ask(self, question: bytearray) -> Message:
-        """Ask the replay service, which may be restarting, until it answers or `PATIENCE` seconds have passed."""
-        deadline = time.monotonic() + PATIENCE
+    def _asking(self, question: bytearray) -> Conversation[Message]:
+        """Ask the replay service, which may be restarting, until it answers or `SNAPSHOT_PATIENCE` has passed."""
+        deadline = self._node.now() + SNAPSHOT_PATIENCE
         while True:
             try:
-                return self._node.ask(replay_key(self._node, "snapshot"), question)
+                return (yield from asking(self._node, replay_key(self._node, "snapshot"), question))
             except NoAnswer:
-                if time.monotonic() > deadline:
+                if self._node.now() > deadline:
                     raise
-            time.sleep(PAUSE)
+            yield WRITTEN_PAUSE

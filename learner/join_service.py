@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
 
@@ -91,6 +90,11 @@ class JoinService:
         for key in {join_key(node, role) for role in JOINING}:  # each with its own thread
             node.serve(key, partial(self._answer, key))
 
+    @property
+    def serving(self) -> int:
+        """Incarnation of the active replay service; -1 before the first."""
+        return self._roster.serving
+
     def connected(self) -> dict[str, int]:
         """Number of connected processes by role; a replay service that was not admitted does not count."""
         counts = {**dict.fromkeys(ROLES, 0), **self._node.presence.counts()}
@@ -129,7 +133,7 @@ class JoinService:
 
     def _admit(self, request: Join) -> int:
         """Admit a replay service, and send actors to it; return its number. Raises as `Roster.replay`."""
-        index = self._roster.replay(request, time.monotonic(), self._replays_there())
+        index = self._roster.replay(request, self._node.now(), self._replays_there())
         self._replay_endpoints, self._replay = request.endpoints, request.origin
         return index
 

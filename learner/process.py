@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 
 from coop.common.errors import RunError, UsageError
+from coop.common.messaging.conversation import Conversation, drive
 from coop.common.messaging.links import locators
 from coop.common.messaging.mirror import FrameMirror
 from coop.common.messaging.sample_client import SampleClient
@@ -35,6 +36,7 @@ from coop.records.learner_checkpoints import fitting, load_learner
 from coop.records.locks import RunLock
 from coop.records.resumption import Survey
 from coop.records.run_directory import RunDirectory, claim_run_directory
+from coop.records.summaries import Summary
 
 
 def learn(options: LearnerOptions, config: RunConfig, spec: EnvSpec) -> None:
@@ -60,64 +62,79 @@ def _train(
     options: LearnerOptions, config: RunConfig, spec: EnvSpec, found: Survey, stop: Stop, console: Console
 ) -> None:
     """Train a run from its beginning, or from a checkpoint, to its end."""
-    path, held = found.run_dir, [each.number for each in reversed(found.whole)]
     trainer = Trainer(Agent(config, spec), time.monotonic())
-    agent = trainer.agent
-    if not held:
-        load_initial_networks(agent)
-    shared = SharedCheckpoints(held, str(path), restart=options.restart)
-    incarnation = new_incarnation()
+    if found.newest is None:
+        load_initial_networks(trainer.agent)
     session = open_session(options.listen, (), options.zenoh_config, options.shared_memory, send_queue=SHORT_QUEUE)
-    with Node(session, config.run, "learner", incarnation) as node, answering(options.health, console):
-        run_id = claim_run_directory(path, config) if found.newest is None else found.newest.manifest.run
-        roster = Roster(path, time.monotonic(), run_id)
-        layout = agent.networks[0].layout_digest()
-        join_service = JoinService(node, config, spec, layout, run_id, shared, roster, console.event)
-        console.event(f"run {config.run!r} listens on {', '.join(locators(session))}; files in {path}")
-        if held:
-            console.event("waiting for the replay service's list of checkpoints")
-        number = shared.wait(stop)
-        if number is None:
-            stop.raise_for_status()
-            return
-        state = found.of(number).state if number else None
-        if state is not None:
-            with fitting(found.of(number).path):
-                trainer.load_state(state, time.monotonic())
-            found = found.cut_back(number, "the replay service has no whole part of it")
-            skipped = "; ".join(found.fallbacks(number))
-            console.event(f"resuming from checkpoint {number}{skipped and f'; passes over {skipped}'}")
-        elif held:
-            load_initial_networks(agent)
-            console.event("starting over: learner and replay service share no checkpoint")
-        settings, episodes_received = config.learner, 0 if state is None else state["episodes_received"]
-        for each in found.whole:
-            each.state.clear()  # only its memory
-        samples = SampleClient(
-            node,
-            stop,
-            incarnation,
-            spec,
-            settings.batch_size,
-            settings.prefetch,
-            agent.updates,
-            episodes_received,
-            shared_memory=options.shared_memory,
-            mirror=_mirror(config, spec, agent.device, console),
-        )
-        steps = trainer.drawn.inserted
-        with RunDirectory(path, config, found, number or None, steps, log=options.log) as directory:
-            if directory.aside:
-                console.event(directory.aside)
-            checkpoints = Checkpoints(node, directory, samples, shared, console.event)
-            service = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console)
-            with _exported(options.prometheus, service):
-                summary = service.run()
-    say(str(summary))
+    with Node(session, config.run, "learner", new_incarnation()) as node, answering(options.health, console):
+        summary = drive(training_run(node, stop, trainer, found, options, locators(session), console), stop)
+    if summary is not None:
+        say(str(summary))
     if trainer.diverged:
         raise RunError(trainer.diverged)
-    if stop.failed or summary.exit == stop.reason:  # otherwise the run was complete before the signal
+    if summary is None or stop.failed or summary.exit == stop.reason:  # otherwise complete before the signal
         stop.raise_for_status()
+
+
+def training_run(
+    node: Node,
+    stop: Stop,
+    trainer: Trainer,
+    found: Survey,
+    options: LearnerOptions,
+    listens: list[str],
+    console: Console,
+) -> Conversation[Summary | None]:
+    """Train a run from what was found in its directory to its end; None if a stop comes before the first turn.
+
+    trainer: new, with the initial networks. listens: the endpoints of the node.
+    """
+    config, spec, agent, path = trainer.config, trainer.agent.spec, trainer.agent, found.run_dir
+    held = [each.number for each in reversed(found.whole)]
+    shared = SharedCheckpoints(held, str(path), restart=options.restart)
+    run_id = claim_run_directory(path, config) if found.newest is None else found.newest.manifest.run
+    roster = Roster(path, node.now(), run_id)
+    layout = agent.networks[0].layout_digest()
+    join_service = JoinService(node, config, spec, layout, run_id, shared, roster, console.event)
+    console.event(f"run {config.run!r} listens on {', '.join(listens)}; files in {path}")
+    if held:
+        console.event("waiting for the replay service's list of checkpoints")
+    number = yield from shared.decided()
+    if number is None:
+        return None
+    state = found.of(number).state if number else None
+    if state is not None:
+        with fitting(found.of(number).path):
+            trainer.load_state(state, node.now())
+        found = found.cut_back(number, "the replay service has no whole part of it")
+        skipped = "; ".join(found.fallbacks(number))
+        console.event(f"resuming from checkpoint {number}{skipped and f'; passes over {skipped}'}")
+    elif held:
+        load_initial_networks(agent)
+        console.event("starting over: learner and replay service share no checkpoint")
+    settings, episodes_received = config.learner, 0 if state is None else state["episodes_received"]
+    for each in found.whole:
+        each.state.clear()  # only its memory
+    samples = SampleClient(
+        node,
+        stop,
+        node.incarnation,
+        spec,
+        settings.batch_size,
+        settings.prefetch,
+        agent.updates,
+        episodes_received,
+        shared_memory=options.shared_memory,
+        mirror=_mirror(config, spec, agent.device, console),
+    )
+    steps = trainer.drawn.inserted
+    with RunDirectory(path, config, found, number or None, steps, log=options.log) as directory:
+        if directory.aside:
+            console.event(directory.aside)
+        checkpoints = Checkpoints(node, directory, samples, shared, console.event)
+        service = LearnerService(node, stop, trainer, directory, samples, checkpoints, join_service, console)
+        with _exported(options.prometheus, service):
+            return (yield from service.training())
 
 
 def _mirror(config: RunConfig, spec: EnvSpec, device: torch.device, console: Console) -> FrameMirror | None:

@@ -16,7 +16,7 @@ from coop.common.errors import BadMessage, RunError
 from coop.common.messaging.members import ROLES, Origin
 from coop.common.messaging.messages.control import Join
 from coop.common.messaging.messages.status import ActorStatus, Member
-from coop.common.messaging.presence import LEASE
+from coop.common.messaging.timing import FORGOTTEN, LEASE
 from coop.common.process.files import sealed, unsealed, write_atomic
 from coop.common.process.untrusted import MAX_SETTINGS, read_bytes
 from coop.records.run_ids import check_owner
@@ -137,9 +137,6 @@ class Roster:
             except OSError as error:
                 raise RunError(f"{self._path}: {error.strerror or error}") from error
         self._entries = entries
-
-
-FORGOTTEN = 60.0  # seconds after which a lost member is no longer listed as missing
 
 
 @dataclass(frozen=True, slots=True)

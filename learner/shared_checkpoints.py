@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 
 from coop.common.errors import UsageError
+from coop.common.messaging.conversation import Conversation
 from coop.common.messaging.messages.control import Join
-from coop.common.process.lifecycle import Stop
-
-LOOK_EVERY = 0.1  # seconds
-REFUSAL = 0.5  # seconds for the refusal to reach the replay service before this process ends
+from coop.common.messaging.timing import LOOK_EVERY, REFUSAL
 
 
 class SharedCheckpoints:
@@ -34,9 +31,7 @@ class SharedCheckpoints:
         self._restart = restart
         self._problem = ""
         self._began_anew = -1  # incarnation of the replay service that was told to start from the beginning
-        self._decided = threading.Event()
-        if not held:
-            self._decided.set()
+        self._decided = not held
 
     def offered(self, request: Join) -> tuple[int, bool]:
         """Answer a joining replay service: the checkpoint to restore, and whether to start from the beginning.
@@ -44,9 +39,9 @@ class SharedCheckpoints:
         Raises:
             UsageError: no checkpoint is held by both.
         """
-        if not self._decided.is_set():
+        if not self._decided:
             self._decide(request)
-            self._decided.set()
+            self._decided = True
         if self._problem:
             raise UsageError(self._problem)
         return self.newest, request.incarnation == self._began_anew
@@ -55,17 +50,17 @@ class SharedCheckpoints:
         """Note a newly finished checkpoint."""
         self.newest = number
 
-    def wait(self, stop: Stop) -> int | None:
+    def decided(self) -> Conversation[int | None]:
         """Wait for the decision: the checkpoint to continue from, 0 for the beginning, None if a stop comes first.
 
         Raises:
             UsageError: no checkpoint is held by both.
         """
-        while not self._decided.wait(LOOK_EVERY):
-            if stop.is_set():
+        while not self._decided:
+            if (yield LOOK_EVERY):
                 return None
         if self._problem:
-            stop.wait(REFUSAL)
+            yield REFUSAL
             raise UsageError(self._problem)
         return self.newest
 

@@ -22,6 +22,7 @@ from coop.common.messaging.messages.status import (
 )
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.transport import Node
+from coop.common.messaging.wire import Message
 from coop.common.metrics import MEASURED
 from coop.common.numbers import Rate, finite
 from coop.common.process.console import Console
@@ -53,9 +54,7 @@ class StatusReporter:
         self._slow_steps_per_s, self._slow_updates_per_s = Rate(TIME_LEFT_OVER), Rate(TIME_LEFT_OVER)
         self._replay = node.latest(status_key(node, "replay"))
         self._replay_status: ReplayStatus | None = None
-        node.session.declare_subscriber(
-            status_key(node, "actor"), node.faults.guarded("reading an actor's status", self._on_actor)
-        )
+        node.on(status_key(node, "actor"), "reading an actor's status", self._on_actor)
 
     def publish(self, now: float) -> LearnerStatus:
         """Publish the present status; return it."""
@@ -127,14 +126,8 @@ class StatusReporter:
             except BadMessage as error:
                 self._node.count_bad(status_key(self._node, "replay"), error)
 
-    def _on_actor(self, sample: Any) -> None:  # noqa: ANN401 (zenoh's sample)
-        try:
-            incarnation = incarnation_of(str(sample.key_expr))
-            status = ActorStatus.decode(self._node.read(sample.payload))
-        except BadMessage as error:
-            self._node.count_bad(status_key(self._node, "actor"), error)
-            return
-        self._join_service.members.report(incarnation, status)
+    def _on_actor(self, key: str, message: Message) -> None:
+        self._join_service.members.report(incarnation_of(key), ActorStatus.decode(message))
 
     def _seconds_left(self, now: float, steps: int) -> float | None:
         """Estimate from the speed of the last half minute; None while nothing moves."""

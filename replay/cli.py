@@ -9,12 +9,13 @@ from pathlib import Path
 import msgspec
 
 from coop.common.errors import RunError
+from coop.common.messaging.conversation import Conversation, drive
 from coop.common.messaging.endpoints import check_endpoints
-from coop.common.messaging.joining import Membership, join, leave_run
+from coop.common.messaging.joining import Membership, joining, leaving
 from coop.common.messaging.links import locators
 from coop.common.messaging.messages.control import MOST_CHECKPOINTS, Join, JoinReply
-from coop.common.messaging.presence import LEASE
 from coop.common.messaging.session import open_session
+from coop.common.messaging.timing import LEASE
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.places import absolute
 from coop.common.process import cli
@@ -57,34 +58,45 @@ def _run() -> None:
     stop = Stop()
     stop.on_signals()
     stop.on_thread_failures()
-    incarnation, console = new_incarnation(), Console()
+    console = Console()
     session = open_session(options.listen, options.connect, options.zenoh_config, options.shared_memory)
     check_endpoints(options.advertise)
-    with Node(session, options.run, "replay", incarnation) as node, answering(options.health, console):
-        node.follow_stop(stop)
-        joining = partial(join, node, stop, connect=options.connect, timeout=options.join_timeout, event=console.event)
-        known = joining(Join("replay", incarnation, []))
-        if known is not None:
-            folder = ReplayFolder(options.run_dir or _named(options.run, known.run_id), known.run_id)
-            console.event(folder.check(resume=options.resume))
-            with folder.lock():
-                parts = ReplayCheckpoints(folder.path, known.run_id)
-                held = parts.intact()
-                if problems := parts.passed_over():
-                    console.event(f"passes over {problems}")
-                endpoints = list(options.advertise) or locators(session)
-                request = Join("replay", incarnation, endpoints, checkpoints=held[-MOST_CHECKPOINTS:])
-                reply = joining(request)
-                if reply is not None:
-                    _serve(node, stop, options, folder, request, reply, console)
+    with Node(session, options.run, "replay", new_incarnation()) as node, answering(options.health, console):
+        drive(serving_run(node, stop, options, locators(session), console), stop)
     stop.raise_for_status()
+
+
+def serving_run(
+    node: Node, stop: Stop, options: ReplayOptions, listens: list[str], console: Console
+) -> Conversation[None]:
+    """Join a run, serve it until the stop, and then until the learner has saved a checkpoint.
+
+    listens: the endpoints of the node.
+    """
+    node.follow_stop(stop)
+    incarnation = node.incarnation
+    ask = partial(joining, node, connect=options.connect, timeout=options.join_timeout, event=console.event)
+    known = yield from ask(Join("replay", incarnation, []))
+    if known is None:
+        return
+    folder = ReplayFolder(options.run_dir or _named(options.run, known.run_id), known.run_id)
+    console.event(folder.check(resume=options.resume))
+    with folder.lock():
+        parts = ReplayCheckpoints(folder.path, known.run_id)
+        held = parts.intact()
+        if problems := parts.passed_over():
+            console.event(f"passes over {problems}")
+        request = Join("replay", incarnation, [*(options.advertise or listens)], checkpoints=held[-MOST_CHECKPOINTS:])
+        reply = yield from ask(request)
+        if reply is not None:
+            yield from _serving(node, stop, options, folder, request, reply, console)
 
 
 def _named(run: str, run_id: int) -> Path:
     return absolute(Path("runs") / f"{run}-replay-{run_id:x}")
 
 
-def _serve(
+def _serving(
     node: Node,
     stop: Stop,
     options: ReplayOptions,
@@ -92,8 +104,7 @@ def _serve(
     request: Join,
     reply: JoinReply,
     console: Console,
-) -> None:
-    """Serve a run that this process has joined until the stop, and then until the learner has saved a checkpoint."""
+) -> Conversation[None]:
     service = _service(node, reply, folder, console, shared_memory=options.shared_memory)
 
     def learned(_: JoinReply, asked: float) -> None:
@@ -103,9 +114,9 @@ def _serve(
     rejoining = msgspec.structs.replace(request, serving=True)
     with Membership(node, stop, rejoining, reply, options.patience, learned, console.event):
         service.start()
-        service.run(stop, console)
+        yield from service.serving(stop, console)
     if not stop.failed:
-        leave_run(node, request)
+        yield from leaving(node, request)
     service.close()
     console.event(f"{stop.reason}; {service.progress()}")
 
@@ -122,7 +133,7 @@ def _service(
     if reply.run_id != folder.run_id:
         raise RunError(f"another learner of run {node.run!r} has begun while this one joined")
     core = ReplayCore(reply.config, reply.spec, shared_memory=shared_memory)
-    checkpoints = ReplayCheckpoints(folder.path, folder.run_id)
+    checkpoints = ReplayCheckpoints(folder.path, folder.run_id, start=node.start)
     try:
         aside = checkpoints.go_back(reply.checkpoint, anew=reply.anew)
     except OSError as error:
@@ -134,14 +145,15 @@ def _service(
         console.event(line)
     settings, synced = reply.config.replay, None
     if settings.journal != "off":
-        number, notices = recover(core, folder.journal, first, folder.run_id)
+        sync = settings.journal == "sync"
+        number, notices = recover(core, folder.journal, first, folder.run_id, sync=sync)
         for line in notices:
             console.event(line)
-        sync, keep, accepted = settings.journal == "sync", settings.journal_keep, core.table.inserted
+        keep, accepted = settings.journal_keep, core.table.inserted
         try:
             journal = Journal(folder.journal, folder.run_id, number, keep=keep, sync=sync, accepted=accepted)
         except OSError as error:
             raise RunError(f"journal in {folder.journal}: {error.strerror or error}") from error
         core.recorder, synced = journal, journal if sync else None
-        checkpoints = ReplayCheckpoints(folder.path, folder.run_id, journal)
+        checkpoints = ReplayCheckpoints(folder.path, folder.run_id, journal, node.start)
     return ReplayService(node, core, checkpoints, confirmed=0.0, synced=synced)

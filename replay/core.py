@@ -182,7 +182,8 @@ class ReplayCore:
             return known
         reason = None
         if request.sequence >= self.drawn:
-            reason = self.limiter.why_not_sample(self.table.inserted, self.drawn, len(self.table))
+            # Earlier ones may be on their way still: they count as drawn, too.
+            reason = self.limiter.why_not_sample(self.table.inserted, request.sequence, len(self.table))
         if reason and self.problem:
             reason = f"{reason}; {self.problem}"
         self.samples_wait_for = reason or ""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from coop.common.messaging.messages.status import Held
-
-HOLD = 1.0  # seconds that a request is held before it is answered with a refusal
-ASKED_AGAIN = 2.5  # seconds after a refusal within which a client that is still there has asked again
+from coop.common.messaging.timing import ASKED_AGAIN, HOLD
 
 
 class Gate:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
 
 import numpy as np
 
 from coop.common.errors import BadMessage, CoopError, RunError
+from coop.common.messaging.conversation import Conversation
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.answers import Ack, Retry
@@ -23,22 +22,20 @@ from coop.common.messaging.messages.control import Limit, Limits, LimitsQuestion
 from coop.common.messaging.messages.insert import SegmentReader
 from coop.common.messaging.messages.sample import Draws, Memory, encode_batch, encode_named, read_request
 from coop.common.messaging.messages.status import Ratio, ReplayStats, ReplayStatus, StatsQuestion
+from coop.common.messaging.timing import HOLD, STATUS_EVERY
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.messaging.wire import Message
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
 from coop.common.transitions import DrawRequest
 from coop.replay.core import ReplayCore, Reply, RetryLater
-from coop.replay.gate import HOLD, Gate
+from coop.replay.gate import Gate
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import Journal
 
 LEAVING = "the replay service is stopping"
 UNCONFIRMED = "the learner has not confirmed this replay service lately"
-STATUS_EVERY = 0.5  # seconds
 IN_FLIGHT = 256  # segments of all actors together, but at least one of each
-
-T = TypeVar("T")
 
 
 class ReplayService:
@@ -66,8 +63,8 @@ class ReplayService:
         self._synced = synced
         self._read_segment = SegmentReader(core.table.spec)
         self._changed = threading.Condition()
-        self._inserts = Gate(time.monotonic())
-        self._draws = Gate(time.monotonic())
+        self._inserts = Gate(node.now())
+        self._draws = Gate(node.now())
         self._leaving = False
         self._broken = ""  # why the core must no longer be used
         self._table = new_incarnation()  # a process restored from a journal stores the frames in other slots
@@ -76,16 +73,16 @@ class ReplayService:
     def start(self) -> None:
         """Begin to answer requests."""
         node = self._node
-        node.serve(replay_key(node, "insert"), self._insert, self._flush if self._synced else None)
-        node.serve(replay_key(node, "sample"), self._sample)
+        node.serve(replay_key(node, "insert"), self._insert, self._flush if self._synced else None, self._changed)
+        node.serve(replay_key(node, "sample"), self._sample, changed=self._changed)
         node.serve(replay_key(node, "stats"), self._stats)
         node.serve(replay_key(node, "limits"), self._limits)
-        node.serve(replay_key(node, "snapshot"), self._snapshot)
+        node.serve(replay_key(node, "snapshot"), self._snapshot, changed=self._changed)
 
-    def run(self, stop: Stop, console: Console) -> None:
+    def serving(self, stop: Stop, console: Console) -> Conversation[None]:
         """Publish the status until the stop; from then on save checkpoints, but acknowledge and draw nothing."""
         problem = ""
-        while not stop.wait(STATUS_EVERY):
+        while not (yield STATUS_EVERY):
             if self._broken:
                 stop.set(self._broken, failed=True)
             if problem != self._core.problem:
@@ -94,7 +91,7 @@ class ReplayService:
             stats = self.stats()
             waiting = stats.inserts_wait_for or stats.samples_wait_for
             console.progress(stats.inserted + stats.drawn, waiting, self.progress)
-            self._node.publish_status(self._status(time.monotonic()))
+            self._node.publish_status(self._status(self._node.now()))
         with self._changed:
             self._leaving = True
             self._changed.notify_all()
@@ -148,39 +145,43 @@ class ReplayService:
                 faults=self._node.faults.count,
             )
 
-    def _insert(self, message: Message) -> bytearray:
+    def _insert(self, message: Message) -> Conversation[bytearray]:
         segment = self._read_segment(message)
-        outcome = self._admit(self._inserts, lambda: self._core.insert(segment, message.payload))
-        if isinstance(outcome, RetryLater):
-            return Retry(outcome.reason).encode(self._node.run)
-        return Ack(outcome, self._window()).encode(self._node.run)
 
-    def _flush(self) -> bool:
-        """Flush the journal to the disk; a disk that fails once may have dropped what a later flush calls written."""
+        def attempt() -> bytearray | RetryLater:
+            outcome = self._core.insert(segment, message.payload)
+            return outcome if isinstance(outcome, RetryLater) else Ack(outcome, self._window()).encode(self._node.run)
+
+        return self._admitted(self._inserts, attempt)
+
+    def _flush(self) -> bytearray | None:
+        """Flush the journal to the disk; return the refusal that leaves in place of acknowledgements, if they may not.
+
+        A disk that fails once may have dropped what a later flush calls written. One that is slow may let a
+        confirmation expire: another service may serve now, which does not have these segments.
+        """
         assert self._synced is not None
         if not self._broken:
             try:
                 self._synced.flush(self._changed)
             except OSError as error:
                 self._broken = f"the journal can't be flushed to the disk: {error.strerror or error}"
-        return not self._broken
+        refusal = RetryLater(self._broken) if self._broken else self._not_serving()
+        return None if refusal is None else Retry(refusal.reason).encode(self._node.run)
 
     def _window(self) -> int:
         """Segments that each actor may have in flight; behind a router, actors have no connections of their own."""
         there = self._node.presence.counts()
         return max(1, IN_FLIGHT // max(1, there.get(ROUTE, 0), there.get("actor", 0)))
 
-    def _sample(self, message: Message) -> bytearray:
+    def _sample(self, message: Message) -> bytearray | Conversation[bytearray]:
         request = read_request(message)
         if request.batch_size != self._core.batch_size:
             raise BadMessage("fields.batch_size", f"{request.batch_size}; this run draws {self._core.batch_size}")
         shared = self._core.table.shared_memory
         if shared and request.memory not in (None, shared):
             return Memory(shared).encode(self._node.run)
-        outcome = self._admit(self._draws, lambda: self._draw(request))
-        if isinstance(outcome, RetryLater):
-            return Retry(outcome.reason).encode(self._node.run)
-        return outcome
+        return self._admitted(self._draws, lambda: self._draw(request))
 
     def _draw(self, request: DrawRequest) -> bytearray | RetryLater:
         """Draw batches as a message; frames that the learner lacks are copied straight into it."""
@@ -216,18 +217,17 @@ class ReplayService:
         lacking = core.table.stored(slots[indices])
         return encode_named(self._node.run, draws, columns, slots, frames.numbers, indices, lacking, self._batch)
 
-    def _admit(self, gate: Gate, attempt: Callable[[], T | RetryLater]) -> T | RetryLater:
-        """Try, and repeat whenever the core has changed, until the gate's deadline."""
-        with self._changed:
-            if self._broken:  # senders repeat their requests to the next replay service
-                return RetryLater(self._broken)
+    def _admitted(self, gate: Gate, attempt: Callable[[], bytearray | RetryLater]) -> Conversation[bytearray]:
+        """Try, and repeat whenever the core has changed, until the gate's deadline; return the answer."""
+        if self._broken:  # senders repeat their requests to the next replay service
+            return Retry(self._broken).encode(self._node.run)
         with self._changing():
             while isinstance(outcome := self._not_serving() or attempt(), RetryLater):
-                left = gate.refuse(outcome.reason, time.monotonic())
+                left = gate.refuse(outcome.reason, self._node.now())
                 if left <= 0 or self._leaving:
-                    return outcome
-                self._changed.wait(left)
-            gate.admit(time.monotonic())
+                    return Retry(outcome.reason).encode(self._node.run)
+                yield left
+            gate.admit(self._node.now())
             self._changed.notify_all()
             return outcome
 
@@ -253,7 +253,7 @@ class ReplayService:
         """Why this service must neither acknowledge nor draw now; None if it may."""
         if self._leaving:
             return RetryLater(LEAVING)
-        return None if time.monotonic() < self._confirmed else RetryLater(UNCONFIRMED)
+        return None if self._node.now() < self._confirmed else RetryLater(UNCONFIRMED)
 
     def _stats(self, message: Message) -> bytearray:
         StatsQuestion.decode(message)
@@ -283,11 +283,15 @@ class ReplayService:
             )
         return now.encode(self._node.run)
 
-    def _snapshot(self, message: Message) -> bytearray:
+    def _snapshot(self, message: Message) -> Conversation[bytearray]:
         if message.kind == Snapshot.kind:
             request = Snapshot.decode(message)
             with self._changing():
                 self._checkpoints.begin(self._core, self._changed, request.number, request.keep)
-        elif not self._checkpoints.written(Written.decode(message).number, HOLD):
-            return Retry("the replay service is writing its part of the checkpoint").encode(self._node.run)
+            return Ack(self._core.table.inserted).encode(self._node.run)
+        number, until = Written.decode(message).number, self._node.now() + HOLD
+        while not self._checkpoints.written(number):
+            if (left := until - self._node.now()) <= 0:
+                return Retry("the replay service is writing its part of the checkpoint").encode(self._node.run)
+            yield left
         return Ack(self._core.table.inserted).encode(self._node.run)

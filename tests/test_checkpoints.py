@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples import make_segment
+from samples import make_segment, until
 from table_reference import check_references
 
 from coop.common.errors import RunError
@@ -43,7 +43,7 @@ def _used_core(spec: EnvSpec) -> ReplayCore:
 
 def save(core: ReplayCore, checkpoints: ReplayCheckpoints, number: int, *keep: int) -> None:
     checkpoints.begin(core, threading.Condition(), number, list(keep))
-    assert checkpoints.written(number, 10)
+    until(lambda: checkpoints.written(number))
 
 
 def test_a_restored_core_goes_on_alike(spec: EnvSpec, tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_a_writer_that_dies_of_anything_has_written_nothing(
     monkeypatch.setattr(threading, "excepthook", lambda args: None)
     checkpoints.begin(_used_core(spec), threading.Condition(), 10, [])
     with pytest.raises(RunError, match="10/replay: OverflowError"):
-        checkpoints.written(10, 10)
+        until(lambda: checkpoints.written(10))
 
 
 def test_old_folders_go_where_nothing_else_is_in_them(spec: EnvSpec, tmp_path: Path) -> None:

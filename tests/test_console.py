@@ -7,8 +7,9 @@ from msgspec.structs import replace
 
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.control import Join
+from coop.common.messaging.timing import FORGOTTEN
 from coop.common.process.console import RECENT, STALL_AFTER, Console, PeerMonitor, StallDetector, counted, progress_line
-from coop.learner.roster import FORGOTTEN, MemberTracker
+from coop.learner.roster import MemberTracker
 
 STATUS = {
     "env_steps": 9964,

@@ -432,6 +432,19 @@ def test_a_damaged_record_costs_only_itself_and_is_counted(
     assert (third.table.inserted, third.lost) == (28 - lost, lost), "the same loss, once"
 
 
+@pytest.mark.parametrize(("sync", "lost"), [(False, 4), (True, 0)])
+def test_what_was_never_flushed_was_not_acknowledged(spec: EnvSpec, tmp_path: Path, sync: bool, lost: int) -> None:
+    """The machine's death may leave a torn record at a journal's end; also where the next process has begun a file."""
+    _, at = _journal(spec, tmp_path)
+    flip(tmp_path / "00000001.log", at[-1] + HEADER_BYTES + 40)
+    for _ in range(2):
+        twin = ReplayCore(AHEAD, spec)
+        number, notices = recover(twin, tmp_path, 1, 5, sync=sync)
+        assert (twin.table.inserted, twin.lost) == (20, lost)
+        assert ("had been acknowledged" in notices[-1]) == (lost > 0)
+        Journal(tmp_path, 5, number, keep=False, sync=sync, accepted=20).close()
+
+
 @pytest.mark.parametrize("length", [1 << 40, (1 << 28) + 1])
 def test_a_record_is_no_longer_than_a_message(length: int, spec: EnvSpec, tmp_path: Path) -> None:
     """Whatever its header declares, and however much of nothing the file holds."""

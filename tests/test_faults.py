@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from samples import await_service, make_segment, until
 
+from coop.common.messaging.conversation import drive
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Ack, Retry
 from coop.common.messaging.messages.control import Snapshot
@@ -69,7 +70,7 @@ def test_a_table_that_may_be_half_changed_is_not_used_any_more(
     service = ReplayService(server, core, ReplayCheckpoints(tmp_path, 5))
     service.start()
     await_service(client, replay_key(client, "snapshot"))  # the last one that it declares
-    running = threading.Thread(target=service.run, args=(stop, Console()))
+    running = threading.Thread(target=drive, args=(service.serving(stop, Console()), stop))
     running.start()
     first, second = (encode_segment("test", make_segment(spec, number)) for number in range(2))
     client.ask(replay_key(client, "insert"), first)

@@ -15,10 +15,12 @@ from samples import make_segment
 from test_checkpoints import CONFIG, save
 
 from coop.common.errors import RunError
+from coop.common.messaging.conversation import drive
 from coop.common.messaging.keys import replay_key
+from coop.common.messaging.messages.answers import Retry
 from coop.common.messaging.messages.insert import encode_segment
 from coop.common.messaging.session import open_session
-from coop.common.messaging.transport import NoAnswer, Node, new_incarnation
+from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
 from coop.common.transitions import NO_IDS, NO_PRIORITIES, DrawRequest
@@ -176,13 +178,12 @@ def test_a_disk_that_fails_once_ends_the_service_and_acknowledges_nothing(
 
     with served(endpoint, spec, tmp_path) as (client, service):
         monkeypatch.setattr(os, "fdatasync", fail)
-        with pytest.raises(NoAnswer):
-            client.ask(replay_key(client, "insert"), segment_bytes(spec, 0), timeout=1.0)
+        assert client.ask(replay_key(client, "insert"), segment_bytes(spec, 0)).kind == "retry"
         monkeypatch.undo()
-        with pytest.raises(NoAnswer):  # it is not trusted again
-            client.ask(replay_key(client, "insert"), segment_bytes(spec, 0), timeout=1.0)
+        again = client.ask(replay_key(client, "insert"), segment_bytes(spec, 0))
+        assert Retry.decode(again).reason.startswith("the journal can't be flushed"), "it is not trusted again"
         stop = Stop()
-        service.run(stop, Console())
+        drive(service.serving(stop, Console()), stop)
         assert stop.failed
         assert stop.reason == "the journal can't be flushed to the disk: Input/output error"
 

@@ -2,6 +2,8 @@
 
 import socket
 import struct
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
@@ -19,6 +21,7 @@ from hypothesis import strategies as st
 from samples import await_service, make_segment
 
 from coop.common.messaging import wire
+from coop.common.messaging.conversation import drive_held
 from coop.common.messaging.insert_client import InsertClient
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.links import locators
@@ -70,7 +73,7 @@ def _ended() -> Stop:
 
 
 def _make_service(core: ReplayCore) -> ReplayService:
-    return ReplayService(SimpleNamespace(run="test"), core, None)  # type: ignore[arg-type]
+    return ReplayService(SimpleNamespace(run="test", now=time.monotonic), core, None)  # type: ignore[arg-type]
 
 
 @dataclass
@@ -95,7 +98,7 @@ class _Network:
 
     def answer(self, payload: bytes, service: int = -1) -> Message:
         target = self.services[service]
-        reply = bytes(target._sample(wire.decode(payload)))
+        reply = bytes(drive_held(target._sample(wire.decode(payload)), threading.Condition()))
         message = wire.decode(reply)
         if message.kind == NAMED:
             numbers = message.arrays["numbers"][message.arrays["carried"]].tolist()
@@ -114,7 +117,10 @@ class _Query:
         if fault.startswith("twice") or fault == "both services":
             self._answers.append(network.answer(payload))
 
-    def wait(self) -> Message:
+    def settle(self) -> None:
+        """Nothing is awaited."""
+
+    def ready(self) -> Message:
         if self._fault.startswith("lost"):
             raise NoAnswer("lost")
         if self._fault == "late":  # it overtakes none: later requests were answered before it

@@ -15,6 +15,7 @@ from samples import make_segment
 from test_checkpoints import CONFIG, save, save_learner
 
 from coop.common.errors import RunError, UsageError
+from coop.common.messaging.conversation import drive
 from coop.common.messaging.joining import join
 from coop.common.messaging.messages.control import Join
 from coop.common.messaging.session import open_session
@@ -210,7 +211,7 @@ def offer(*checkpoints: int, serving: bool = False, incarnation: int = 3) -> Joi
 def test_the_newest_checkpoint_that_both_hold(mine: tuple[int, ...], theirs: Join, number: int) -> None:
     shared = SharedCheckpoints(mine, "run")
     assert shared.offered(theirs) == (number, False)
-    assert shared.wait(Stop()) == number
+    assert drive(shared.decided(), Stop()) == number
     shared.finished(2000)
     assert shared.offered(offer(500, 2000)) == (2000, False), "one that comes back in the middle of the run"
 
@@ -224,14 +225,14 @@ def test_no_checkpoint_in_common() -> None:
     with pytest.raises(UsageError, match=words):
         shared.offered(offer())
     with pytest.raises(UsageError, match=words):
-        shared.wait(Stop())
+        drive(shared.decided(), Stop())
     restarted = SharedCheckpoints((500, 1000), "runs/a", restart=True)
     assert restarted.offered(offer(1500)) == (0, True)
-    assert restarted.wait(Stop()) == 0
+    assert drive(restarted.decided(), Stop()) == 0
     assert restarted.offered(offer(incarnation=4)) == (0, False), "one that comes later begins with what it holds"
     stop = Stop()
     stop.set("interrupted")
-    assert SharedCheckpoints((500,), "runs/a").wait(stop) is None
+    assert drive(SharedCheckpoints((500,), "runs/a").decided(), stop) is None
 
 
 def test_the_learner_goes_back_to_the_checkpoint_that_is_chosen(tmp_path: Path) -> None:
@@ -310,7 +311,7 @@ def test_who_only_asks_takes_nobody_s_place(
     assert join(other, Stop(), Join("replay", 1, []), (), 5) is not None
     stop = Stop()
     stop.set("enough")
-    assert shared.wait(stop) is None, "nothing is decided by a question"
+    assert drive(shared.decided(), stop) is None, "nothing is decided by a question"
     reply = join(other, Stop(), Join("replay", 1, ["tcp/h:1"], checkpoints=[500]), (), 5)
     assert reply is not None
     assert (reply.checkpoint, reply.replay_endpoints) == (500, ["tcp/h:1"])

@@ -23,7 +23,8 @@ from coop.common.messaging.messages.sample import encode_request
 from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.session import open_session
-from coop.common.messaging.transport import ASK_TIMEOUT, NoAnswer, Node, Refused, new_incarnation
+from coop.common.messaging.timing import ASK_TIMEOUT
+from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.transitions import DrawRequest

@@ -8,7 +8,7 @@ import coop.learner.roster
 from coop.common.errors import BadMessage, RunError
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.control import Join
-from coop.common.messaging.presence import LEASE
+from coop.common.messaging.timing import LEASE
 from coop.common.process.files import write_atomic
 from coop.learner.roster import AlreadyServed, Roster
 

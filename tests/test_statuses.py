@@ -6,11 +6,12 @@ from msgspec.structs import replace
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.control import Join
 from coop.common.messaging.messages.status import ActorStatus, Held, Member, Ratio, ReplayStatus, Wait
+from coop.common.messaging.timing import FORGOTTEN, HOLD
 from coop.common.numbers import Rate
-from coop.learner.roster import FORGOTTEN, MemberTracker
+from coop.learner.roster import MemberTracker
 from coop.learner.status import waits
 from coop.learner.telemetry import ReturnHistory
-from coop.replay.gate import HOLD, Gate
+from coop.replay.gate import Gate
 
 
 def test_who_waits_for_whom() -> None:

@@ -11,11 +11,12 @@ from msgspec.structs import replace as changed
 from samples import await_service
 
 from coop.actors.policy import EpsilonGreedy
-from coop.actors.weights import GRACE, WeightsFollower, make_policy
+from coop.actors.weights import WeightsFollower, make_policy
 from coop.common.errors import JoinError
 from coop.common.messaging.keys import role_key, weights_key
 from coop.common.messaging.messages.control import JoinReply
 from coop.common.messaging.messages.weights import Role, Weights
+from coop.common.messaging.timing import GRACE
 from coop.common.messaging.transport import Node
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.settings.config import NetworkSettings, RunConfig
@@ -182,7 +183,7 @@ def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
     assert policy.acting == 0
     assert follower.version == 4
     follower.refresh()
-    assert follower.ready == (silent == "role")
+    assert not follower.ready, "without the role it does not know which network acts"
 
 
 def test_a_layout_that_differs_is_refused(spec: EnvSpec) -> None:

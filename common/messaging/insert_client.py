@@ -8,39 +8,26 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import msgspec
 
 from coop.common.errors import BadMessage
-from coop.common.messaging.backoff import BAD_ANSWER, NO_ANSWER, Backoff
-from coop.common.messaging.keys import KeySpace, replay_key
+from coop.common.messaging.conversation import BAD_ANSWER, NO_ANSWER, Answer, Asker, Conversation, drive, pauses
+from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Ack, Retry
 from coop.common.messaging.messages.insert import encode_segment
-from coop.common.messaging.transport import NoAnswer, Pending
+from coop.common.messaging.timing import INSERT_TIMEOUT
+from coop.common.messaging.transport import NoAnswer
 from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
 from coop.common.transitions import Segment
-
-# Seconds. A segment may wait behind its whole window while the limiter admits segments one by one; a lost peer is
-# noticed sooner, by its link.
-INSERT_TIMEOUT = 60.0
-
-
-class QuerySender(KeySpace, Protocol):
-    """The connection that carries queries to the replay service: a `Node`, or an actor's `ReplayRoute`."""
-
-    run: str
-
-    def begin(self, key: str, payload: bytearray, timeout: float) -> Pending:
-        """See `Node`."""
 
 
 @dataclass(slots=True)
 class _Sent:
     payload: bytearray
     steps: int
-    pending: Pending
+    answer: Answer
 
 
 class InsertClient:
@@ -57,7 +44,7 @@ class InsertClient:
         waiting: why inserts wait, in words; empty while they do not.
     """
 
-    def __init__(self, node: QuerySender, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, node: Asker, stop: Stop, window: int, on_wait: Callable[[], None] = lambda: None) -> None:
         self.acked = 0
         self.inserted = 0
         self.waiting = ""
@@ -69,7 +56,7 @@ class InsertClient:
         self._key = replay_key(node, "insert")
         self._outstanding: deque[_Sent] = deque()
         self._spare: list[bytearray] = []  # memory of acknowledged segments, for the next ones: sending copies
-        self._backoff = Backoff()
+        self._pauses = pauses()
 
     def submit(self, segment: Segment) -> bool:
         """Send a segment once there is room in the window; return False if a stop was requested first.
@@ -77,20 +64,26 @@ class InsertClient:
         Raises:
             Refused: the replay service rejected a segment as invalid.
         """
+        return drive(self.submitting(segment), self._stop, self._on_wait)
+
+    def drain(self) -> bool:
+        """Wait until all segments are acknowledged; return False if a stop was requested first."""
+        return drive(self._until(lambda: 1), self._stop, self._on_wait)
+
+    def submitting(self, segment: Segment) -> Conversation[bool]:
+        """See `submit`."""
         self._collect_acks()
-        while len(self._outstanding) >= self._permitted:
-            if not self._await_ack(self._outstanding[0]):
-                return False
-            self._end_first()
+        if not (yield from self._until(lambda: self._permitted)):
+            return False
         memory = self._spare.pop() if self._spare else None
         payload = encode_segment(self._node.run, msgspec.structs.replace(segment, acked=self.acked), memory)
         self._outstanding.append(_Sent(payload, segment.steps, self._send(payload)))
         return True
 
-    def drain(self) -> bool:
-        """Wait until all segments are acknowledged; return False if a stop was requested first."""
-        while self._outstanding:
-            if not self._await_ack(self._outstanding[0]):
+    def _until(self, fewer_than: Callable[[], int]) -> Conversation[bool]:
+        """Wait until fewer segments are in flight; return False if a stop was requested first."""
+        while len(self._outstanding) >= fewer_than():
+            if not (yield from self._acknowledged(self._outstanding[0])):
                 return False
             self._end_first()
         return True
@@ -100,27 +93,27 @@ class InsertClient:
         while self._outstanding:
             sent = self._outstanding[0]
             try:
-                message = sent.pending.ready()
+                message = sent.answer.ready()
                 if message is None:
                     return
                 accepted = self._accept(message, sent)
             except (NoAnswer, BadMessage):
                 return  # it is sent again when the window is full
             if not accepted:
-                sent.pending = self._send(sent.payload)
+                sent.answer = self._send(sent.payload)
                 return
             self._end_first()
 
     def _end_first(self) -> None:
         self._spare.append(self._outstanding.popleft().payload)
 
-    def _await_ack(self, sent: _Sent) -> bool:
+    def _acknowledged(self, sent: _Sent) -> Conversation[bool]:
         """Wait for one acknowledgement, sending again as often as necessary; return False if a stop was requested."""
         while True:
             try:
-                message = self._wait(sent.pending)
-                if message is None:
-                    return False
+                while (message := sent.answer.ready()) is None:
+                    if (yield sent.answer):
+                        return False
                 if self._accept(message, sent):
                     return True
             except NoAnswer:
@@ -128,20 +121,11 @@ class InsertClient:
             except BadMessage as error:
                 self.waiting = f"{BAD_ANSWER}: {error}"
             self._on_wait()
-            if self._backoff.pause(self._stop):
+            if (yield next(self._pauses)):
                 return False
-            sent.pending = self._send(sent.payload)
+            sent.answer = self._send(sent.payload)
 
-    def _wait(self, pending: Pending) -> Message | None:
-        """The answer, or None if a stop was requested first; raises as `Pending.ready`."""
-        looks = Backoff(0.001, 0.05)
-        while (message := pending.ready()) is None:
-            if looks.pause(self._stop):
-                return None
-            self._on_wait()
-        return message
-
-    def _send(self, payload: bytearray) -> Pending:
+    def _send(self, payload: bytearray) -> Answer:
         return self._node.begin(self._key, payload, INSERT_TIMEOUT)
 
     def _accept(self, message: Message, sent: _Sent) -> bool:
@@ -153,5 +137,5 @@ class InsertClient:
         self._permitted = min(self._window, ack.window or self._window)
         self.acked += sent.steps
         self.waiting = ""
-        self._backoff.reset()
+        self._pauses = pauses()
         return True

@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import msgspec
 
 from coop.common.errors import BadMessage, JoinError
+from coop.common.messaging.conversation import Conversation, asking, drive
 from coop.common.messaging.endpoints import unknown_hosts
 from coop.common.messaging.keys import join_key
 from coop.common.messaging.messages.answers import Retry
 from coop.common.messaging.messages.control import Join, JoinReply, Leave
+from coop.common.messaging.timing import (
+    ASK_EVERY,
+    HANDOVER_TIMEOUT,
+    IDLE_ASK_EVERY,
+    JOIN_ANSWER,
+    LEAVE_WITHIN,
+    RETRY_PAUSE,
+)
 from coop.common.messaging.transport import NoAnswer, Node, Refused
 from coop.common.process.console import PeerMonitor, StallDetector
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.tables import first_difference, identity
-
-RETRY_PAUSE = 0.1  # seconds
-HANDOVER_TIMEOUT = 5.0  # seconds that a replay service waits for another one to end; a dead one is given up sooner
-ASK_EVERY = 0.4  # seconds between a member's requests while its work depends on the answer
-LEAVE_WITHIN = 25.0  # seconds that a stopping process stays because the learner still needs it
-IDLE_ASK_EVERY = 5.0  # seconds between requests otherwise
 
 
 def join(
@@ -45,36 +46,51 @@ def join(
         JoinError: no learner (or no replay service) answered within `timeout` seconds, the learner refused this
             process, or another replay service serves the run.
     """
+    if stop.is_set():
+        return None
+    return drive(joining(node, request, connect, timeout, need_replay=need_replay, event=event), stop)
+
+
+def joining(
+    node: Node,
+    request: Join,
+    connect: Sequence[str],
+    timeout: float,
+    *,
+    need_replay: bool = False,
+    event: Callable[[str], None] = lambda text: None,
+) -> Conversation[JoinReply | None]:
+    """See `join`."""
     where = _where(connect)
-    deadline = time.monotonic() + timeout
+    deadline = node.now() + timeout
     stall = StallDetector()
     vacant_by: float | None = None
     answered = False
-    while not stop.is_set():
+    while True:
         try:
-            answer = ask_to_join(node, request)
+            answer = yield from _ask_to_join(node, request)
         except NoAnswer:
             vacant_by = None
         else:
             answered = True
             if isinstance(answer, str):
-                vacant_by = vacant_by or time.monotonic() + HANDOVER_TIMEOUT
-                if time.monotonic() > vacant_by:
+                vacant_by = vacant_by or node.now() + HANDOVER_TIMEOUT
+                if node.now() > vacant_by:
                     raise JoinError(f"run {node.run!r}: {answer}")
             elif answer.replay_endpoints or not need_replay:
                 return answer
-        if time.monotonic() > deadline and vacant_by is None:
+        if node.now() > deadline and vacant_by is None:
             if answered:
                 raise JoinError(f"no replay service of run {node.run!r} found at {where} within {timeout:g} s")
             raise JoinError(no_learner(node, connect, timeout))
         awaited = f"a replay service of run {node.run!r}" if answered else f"the learner of run {node.run!r} at {where}"
-        if text := stall.check(time.monotonic(), 0, f"waiting for {awaited}"):
+        if text := stall.check(node.now(), 0, f"waiting for {awaited}"):
             event(text)
-        stop.wait(RETRY_PAUSE)
-    return None
+        if (yield RETRY_PAUSE):
+            return None
 
 
-def ask_to_join(node: Node, request: Join) -> JoinReply | str:
+def _ask_to_join(node: Node, request: Join) -> Conversation[JoinReply | str]:
     """Ask the learner once; return its answer, or the reason why this process cannot join now.
 
     Raises:
@@ -82,8 +98,8 @@ def ask_to_join(node: Node, request: Join) -> JoinReply | str:
         JoinError: the learner refused this process.
     """
     try:
-        message = node.ask(join_key(node, request.role), request.encode(node.run), timeout=1.0)
-        return Retry.decode(message).reason if message.kind == "retry" else JoinReply.decode(message)
+        message = yield from asking(node, join_key(node, request.role), request.encode(node.run), JOIN_ANSWER)
+        return Retry.decode(message).reason if message.kind == Retry.kind else JoinReply.decode(message)
     except (Refused, BadMessage) as error:
         raise JoinError(f"the learner of run {node.run!r} refused: {error}") from error
 
@@ -93,18 +109,24 @@ def leave_run(node: Node, request: Join) -> None:
 
     Returns after `LEAVE_WITHIN` seconds at the latest, and at once if there is no learner.
     """
-    deadline = time.monotonic() + LEAVE_WITHIN
+    drive(leaving(node, request))
+
+
+def leaving(node: Node, request: Join) -> Conversation[None]:
+    """See `leave_run`."""
+    deadline = node.now() + LEAVE_WITHIN
     payload = Leave(request.incarnation).encode(node.run)
-    while time.monotonic() < deadline:
+    while node.now() < deadline:
         try:
-            if node.ask(join_key(node, request.role), payload, timeout=1.0).kind != Retry.kind:
+            message = yield from asking(node, join_key(node, request.role), payload, JOIN_ANSWER)
+            if message.kind != Retry.kind:
                 return
         except NoAnswer:
             if not node.presence.members("learner"):
                 return
         except (Refused, BadMessage):
             return
-        time.sleep(RETRY_PAUSE)
+        yield RETRY_PAUSE
 
 
 def no_learner(node: Node, connect: Sequence[str], timeout: float) -> str:
@@ -127,7 +149,7 @@ def other_runs(node: Node) -> list[str]:
 
 
 class Membership:
-    """Asks the learner repeatedly, in its own thread, for changes of the run's members.
+    """Asks the learner repeatedly, beside the process's work, for changes of the run's members.
 
     Stops the process if the learner belongs to another run, refuses it, or has been gone for `patience` seconds.
 
@@ -135,7 +157,7 @@ class Membership:
         request: the request with which this process first joined. reply: the learner's answer to it.
         learned: called with each answer and with the time of the request.
         event: called with a line when a member stops answering, and when it is back.
-        replay_there: returns whether a replay service is connected; while none is, this thread asks often for the
+        replay_there: returns whether a replay service is connected; while none is, this process asks often for the
             next one's endpoints, otherwise seldom. None: this process needs none; it always asks often.
     """
 
@@ -158,29 +180,28 @@ class Membership:
         self._learned = learned
         self._event = event
         self._replay_there = replay_there
-        self._thread = threading.Thread(target=self._run, name="membership", daemon=True)
-        self._thread.start()
+        self._task = node.start("membership", self._staying(), stop)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stop.set("this process ends")  # if nothing else has stopped it
-        self._thread.join()
+        self._task.join()
 
-    def _run(self) -> None:
+    def _staying(self) -> Conversation[None]:
         learner, replay = PeerMonitor("the learner"), PeerMonitor("the replay service")
-        known, asked = self._node.presence.members("learner"), time.monotonic()
-        while not self._stop.wait(ASK_EVERY):
+        known, asked = self._node.presence.members("learner"), self._node.now()
+        while not (yield ASK_EVERY):
             if self._node.presence.absence("learner") > self._patience:
                 text = f"the learner of run {self._node.run!r} has been gone for {self._patience:g} s"
                 self._stop.set(text, failed=True)
                 return
             there = self._node.presence.members("learner")
             replay_there = self._replay_there is not None and self._replay_there()
-            if there - known or not replay_there or time.monotonic() - asked > IDLE_ASK_EVERY:
-                asked = time.monotonic()
-                if self._ask(asked):
+            if there - known or not replay_there or self._node.now() - asked > IDLE_ASK_EVERY:
+                asked = self._node.now()
+                if (yield from self._ask(asked)):
                     known = there
             for text in (
                 learner.check(bool(there & known), str(self._reply.learner)),
@@ -189,10 +210,10 @@ class Membership:
                 if text and not self._stop.is_set():
                     self._event(text)
 
-    def _ask(self, now: float) -> bool:
+    def _ask(self, now: float) -> Conversation[bool]:
         """Ask the learner once; return True if it answered."""
         try:
-            answer = ask_to_join(self._node, self._request)
+            answer = yield from _ask_to_join(self._node, self._request)
             problem = answer if isinstance(answer, str) else difference(self._reply, answer)
         except NoAnswer:
             return False

@@ -16,35 +16,43 @@ from coop.common.messaging.faults import Faults
 from coop.common.messaging.keys import incarnation_of
 from coop.common.messaging.members import ROLES, ROUTE
 
-LEASE = 1.5  # seconds of silence after which a link is given up and the learner's last answer expires
-
 
 class Presence:
     """The liveliness tokens of a run's members.
 
     Args:
-        prefix: key of the tokens, which is followed by ROLE/INCARNATION.
-        faults: records bugs of this program in Zenoh's threads.
-        refuse: called with the key of a token that names no incarnation, and why it doesn't.
+        now: the process's clock.
     """
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        prefix: str,
-        faults: Faults,
-        refuse: Callable[[str, BadMessage], None] = lambda key, error: None,
-    ) -> None:
-        self._refuse = refuse
-        self._prefix = prefix
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
         self._there: dict[str, set[str]] = {}  # incarnations by role
         self._gone: dict[str, float] = {}  # by role, when its last member disappeared
         self._lock = threading.Lock()
         self._on_change: Callable[[int, bool], None] = lambda incarnation, there: None
-        self._began = time.monotonic()
+        self._began = now()
+
+    def watch(
+        self, session: zenoh.Session, prefix: str, faults: Faults, refuse: Callable[[str, BadMessage], None]
+    ) -> None:
+        """Follow the tokens of a session.
+
+        Args:
+            prefix: key of the tokens, which is followed by ROLE/INCARNATION.
+            faults: records bugs of this program in Zenoh's threads.
+            refuse: called with the key of a token that names no incarnation, and why it doesn't.
+        """
+
+        def on_token(sample: zenoh.Sample) -> None:
+            role = str(sample.key_expr).split("/")[-2]
+            try:
+                self.note(role, incarnation_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+            except BadMessage as error:
+                refuse(f"{prefix}/{role}", error)
+
         for role in (*ROLES, ROUTE):  # one subscriber each: access control may let a process see only some roles
             session.liveliness().declare_subscriber(
-                f"{prefix}/{role}/*", faults.guarded("watching who is there", self._on_token), history=True
+                f"{prefix}/{role}/*", faults.guarded("watching who is there", on_token), history=True
             )
 
     def on_change(self, call: Callable[[int, bool], None]) -> None:
@@ -66,21 +74,16 @@ class Presence:
         with self._lock:
             if self._there.get(role):
                 return 0.0
-            return time.monotonic() - self._gone.get(role, self._began)
+            return self._now() - self._gone.get(role, self._began)
 
-    def _on_token(self, sample: zenoh.Sample) -> None:
-        role, incarnation = str(sample.key_expr).split("/")[-2:]
-        try:
-            number = incarnation_of(str(sample.key_expr))
-        except BadMessage as error:
-            self._refuse(f"{self._prefix}/{role}", error)
-            return
-        there = sample.kind == zenoh.SampleKind.PUT
+    def note(self, role: str, number: int, there: bool) -> None:
+        """Note that the token of an incarnation has appeared or disappeared."""
+        incarnation = f"{number:x}"
         with self._lock:
             incarnations = self._there.setdefault(role, set())
             if there:
                 incarnations.add(incarnation)
             else:
                 incarnations.discard(incarnation)
-                self._gone[role] = time.monotonic()
+                self._gone[role] = self._now()
         self._on_change(number, there)

@@ -14,12 +14,13 @@ from typing import Self
 import zenoh
 
 from coop.common.errors import JoinError
+from coop.common.messaging.conversation import Answer
 from coop.common.messaging.members import ROUTE
 from coop.common.messaging.session import open_session
-from coop.common.messaging.transport import NoAnswer, Node, Pending
+from coop.common.messaging.timing import ASK_TIMEOUT, RETRY_PAUSE
+from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.process.lifecycle import Stop
 
-RETRY_PAUSE = 0.1  # seconds
 CLOSING = "closing a route"  # name of a thread
 
 
@@ -75,7 +76,11 @@ class ReplayRoute:
         """See `Node`."""
         return self._node.key(*parts)
 
-    def begin(self, key: str, payload: bytearray, timeout: float) -> Pending:
+    def now(self) -> float:
+        """See `Node`."""
+        return self._node.now()
+
+    def begin(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Answer:
         """See `Node`."""
         with self._lock:
             return self._node.begin(key, payload, timeout)
@@ -87,14 +92,17 @@ class ReplayRoute:
         node = self._open(endpoints)
         with self._lock:
             old, self._node, self._endpoints = self._node, node, set(endpoints)
-        # In a thread of its own, for which the process waits: it takes up to 10 s where nobody answers.
-        threading.Thread(target=old.close, name=CLOSING).start()
+        self._retire(old)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._node.close()
+
+    def _retire(self, node: Node) -> None:
+        """Close it in a thread of its own, for which the process waits: up to 10 s where nobody answers."""
+        threading.Thread(target=node.close, name=CLOSING).start()
 
     def _open(self, endpoints: Sequence[str]) -> Node:
         return Node(self._open_route(endpoints), self.run, ROUTE, self._incarnation)
@@ -111,6 +119,7 @@ class RoutedReplay:
         self.run = node.run
         self.key = node.key
         self.begin = node.begin
+        self.now = node.now
         self._node = node
 
     @property

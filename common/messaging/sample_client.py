@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coop.common.bounds import MAX_AHEAD
 from coop.common.errors import BadMessage
-from coop.common.messaging.backoff import BAD_ANSWER, NO_ANSWER, Backoff
+from coop.common.messaging.conversation import BAD_ANSWER, NO_ANSWER, Answer, Asker, Conversation, drive, pauses
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Retry
 from coop.common.messaging.messages.sample import (
@@ -27,7 +27,7 @@ from coop.common.messaging.messages.sample import (
 )
 from coop.common.messaging.mirror import FrameMirror
 from coop.common.messaging.shared_frames import SharedFrames
-from coop.common.messaging.transport import NoAnswer, Node, Pending
+from coop.common.messaging.transport import NoAnswer
 from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.capacity import frame_bytes
@@ -46,7 +46,7 @@ class _Asked(NamedTuple):
 
     first: int
     draws: int
-    pending: Pending
+    answer: Answer
 
 
 class SampleClient:
@@ -65,7 +65,7 @@ class SampleClient:
 
     def __init__(
         self,
-        node: Node,
+        node: Asker,
         stop: Stop,
         incarnation: int,
         spec: EnvSpec,
@@ -101,7 +101,7 @@ class SampleClient:
         self._pinned: int | None = None
         self._trained: list[_Priorities] = []  # those that no request contains yet
         self._carried: dict[int, _Priorities] = {}  # by first number of the request with them
-        self._backoff = Backoff()
+        self._pauses = pauses()
 
     def pin(self) -> int:
         """Keep all later batches repeatable until `release`; return the number of batches received."""
@@ -122,13 +122,17 @@ class SampleClient:
         Raises:
             Refused: the replay service rejected a request as invalid, or now serves another learner.
         """
+        return drive(self.drawing(), self._stop)
+
+    def drawing(self) -> Conversation[tuple[Batch, Drawn] | None]:
+        """See `next`."""
         self._ask_ahead()
         if not self._outstanding and not self._arrived:
             self.waiting = "the replay service has not begun its part of the checkpoint"
-            self._backoff.pause(self._stop)
+            yield next(self._pauses)
             return None
         try:
-            if self._arrived or self._receive():
+            if self._arrived or (yield from self._receive()):
                 if (batch := self._frames_of(*self._arrived[0])) is not None:
                     return batch, self._accept()
                 self._ask_again()  # and the answer will carry what the mirror lacks
@@ -137,8 +141,8 @@ class SampleClient:
             self.waiting = NO_ANSWER
         except BadMessage as error:
             self.waiting = f"{BAD_ANSWER}: {error}"
-        self._backoff.pause(self._stop)
-        self._ask_again()
+        yield next(self._pauses)
+        self._ask_all_again()
         return None
 
     @property
@@ -184,18 +188,27 @@ class SampleClient:
             first, count, _ = self._outstanding[0]
             self._outstanding[0] = self._request(first, count)
 
-    def _receive(self) -> bool:
+    def _ask_all_again(self) -> None:
+        """Ask again for all that has not arrived, in order: the later ones have met the same fate, or will.
+
+        If only the first were asked for again, it would come behind the others for good, and wait for each of them.
+        """
+        if self._arrived:
+            self._ask_again()
+        self._outstanding = deque(self._request(first, count) for first, count, _ in self._outstanding)
+
+    def _receive(self) -> Conversation[bool]:
         """Wait for the first answer; False if it is no batch, and batches have been asked for again."""
-        first, count, pending = self._outstanding[0]
-        message = pending.wait()
+        first, count, answer = self._outstanding[0]
+        while (message := answer.ready()) is None:
+            yield answer
         if message.kind == Memory.kind:
             self._share(Memory.decode(message).address)
-            # All of them, in their order: the later ones have met the same answer, or will.
-            self._outstanding = deque(self._request(first, count) for first, count, _ in self._outstanding)
+            self._ask_all_again()
             return False
         if message.kind == Retry.kind:
             self.waiting = Retry.decode(message).reason
-            self._backoff.pause(self._stop)
+            yield next(self._pauses)
             self._ask_again()
             return False
         arrived: list[tuple[Batch | NamedBatch, Drawn]] = []
@@ -246,7 +259,7 @@ class SampleClient:
     def _accept(self) -> Drawn:
         """Note that the first batch has arrived; return what accompanies it, without episodes that have before."""
         _, drawn = self._arrived.popleft()
-        self._backoff.reset()
+        self._pauses = pauses()
         self.waiting = ""
         self._done = drawn.sequence + 1
         self._carried.pop(drawn.sequence, None)

@@ -20,7 +20,7 @@ from coop.common.messaging.endpoints import (
     zenoh_reason,
 )
 from coop.common.messaging.links import never_linger, permit_many, wait_for_words
-from coop.common.messaging.presence import LEASE
+from coop.common.messaging.timing import LEASE
 from coop.common.messaging.transport import NoAnswer
 from coop.common.process.ports import check_loopback
 

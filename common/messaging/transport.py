@@ -10,7 +10,9 @@ import contextlib
 import queue
 import secrets
 import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from types import TracebackType
 from typing import Any, Self, TypeAlias
 
@@ -18,6 +20,7 @@ import zenoh
 
 from coop.common.errors import BadMessage, CoopError, RunError
 from coop.common.messaging import wire
+from coop.common.messaging.conversation import Conversation, Task, drive_held, start
 from coop.common.messaging.faults import Faults
 from coop.common.messaging.keys import run_key, stop_key
 from coop.common.messaging.links import close
@@ -25,11 +28,11 @@ from coop.common.messaging.messages.answers import Error
 from coop.common.messaging.messages.control import EndOfRun
 from coop.common.messaging.messages.status import Status
 from coop.common.messaging.presence import Presence
+from coop.common.messaging.timing import ASK_TIMEOUT
 from coop.common.messaging.wire import Message
 from coop.common.process.console import say, stamped
 from coop.common.process.lifecycle import Stop
 
-ASK_TIMEOUT = 5.0  # seconds
 MOST_REFUSALS = 8  # lines that say what is wrong with messages of one key
 LONGEST_REFUSAL = 200  # characters
 QUEUE = 1 << 14  # queries that wait for an answer: one more blocks Zenoh's thread, which receives everything else
@@ -53,31 +56,49 @@ def new_incarnation() -> int:
 
 
 class Pending:
-    """A query in flight."""
+    """A query in flight: an `Answer`."""
 
     def __init__(self, handler: Any, key: str) -> None:  # noqa: ANN401 (zenoh's handler of replies)
         self._handler = handler
         self._key = key
+        self._reply: zenoh.Reply | None = None
+        self._lost = False
+
+    def settled(self) -> bool:
+        """Whether the answer has arrived, or can't any more."""
+        self._receive(self._handler.try_recv)
+        return self._lost or self._reply is not None
+
+    def settle(self) -> None:
+        """Wait until it is settled."""
+        self._receive(self._handler.recv)
 
     def ready(self) -> Message | None:
-        """The answer if it has arrived, else None; raises as `wait`."""
-        try:
-            reply = self._handler.try_recv()
-        except zenoh.ZError as error:
-            raise NoAnswer(f"no answer to {self._key}") from error
-        return None if reply is None else _answer(reply)
-
-    def wait(self) -> Message:
-        """Wait for the answer.
+        """The answer if it has arrived, else None.
 
         Raises:
             NoAnswer: no process serves this key, or the time-out passed.
             Refused: the peer rejected the message as invalid, or could not fulfil the request.
         """
-        try:
-            return _answer(self._handler.recv())
-        except zenoh.ZError as error:
-            raise NoAnswer(f"no answer to {self._key}") from error
+        if not self.settled():
+            return None
+        if self._reply is None:
+            raise NoAnswer(f"no answer to {self._key}")
+        return _answer(self._reply)
+
+    def wait(self) -> Message:
+        """Wait for the answer; raises as `ready`."""
+        self.settle()
+        message = self.ready()
+        assert message is not None
+        return message
+
+    def _receive(self, receive: Callable[[], zenoh.Reply | None]) -> None:
+        if self._reply is None and not self._lost:
+            try:
+                self._reply = receive()
+            except zenoh.ZError:
+                self._lost = True
 
 
 class Node:
@@ -96,6 +117,7 @@ class Node:
     def __init__(self, session: zenoh.Session, run: str, role: str, incarnation: int) -> None:
         self.session = session
         self.run = run
+        self.incarnation = incarnation
         self.bad_messages = 0
         self.faults = Faults()
         self._counting = threading.Lock()
@@ -104,7 +126,8 @@ class Node:
         self._threads: list[threading.Thread] = []
         self._closing = False
         self._status = session.declare_publisher(self.key("metrics", self._name))
-        self.presence = Presence(session, self.key("alive"), self.faults, self.count_bad)
+        self.presence = Presence()
+        self.presence.watch(session, self.key("alive"), self.faults, self.count_bad)
         self._token = session.liveliness().declare_token(self.key("alive", self._name))
 
     def key(self, *parts: str) -> str:
@@ -123,14 +146,34 @@ class Node:
         )
         return Pending(handler, key)
 
+    def now(self) -> float:
+        """Seconds of this process's clock, which never goes back."""
+        return time.monotonic()
+
+    def start(self, name: str, conversation: Conversation[None], stop: Stop | None = None) -> Task:
+        """Run a conversation beside its caller, see `conversation.start`."""
+        return start(name, conversation, stop)
+
+    def pool(self, name: str) -> Executor:
+        """One thread, for what takes long and happens in order."""
+        return ThreadPoolExecutor(1, name)
+
     def ask(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Message:
         """Send a query and wait for its answer; raises as `Pending.wait`."""
         return self.begin(key, payload, timeout).wait()
 
-    def serve(self, key: str, answer: Callable[[Message], bytearray], flush: Callable[[], bool] | None = None) -> None:
+    def serve(
+        self,
+        key: str,
+        answer: Callable[[Message], bytearray | Conversation[bytearray]],
+        flush: Callable[[], bytearray | None] | None = None,
+        changed: threading.Condition | None = None,
+    ) -> None:
         """Answer the queries on `key`, one after another, in a new thread, until the session closes.
 
-        flush: called in another thread before replies leave, once for all that wait then; they do if it returns True.
+        flush: called in another thread before replies leave, once for all that wait then; returns what leaves in place
+            of each, or None if they may leave.
+        changed: answers are conversations, which wait for changes of what this guards, and hold it otherwise.
 
         A message that cannot be decoded, names another run, or makes `answer` raise BadMessage gets an error reply, is
         counted, and changes nothing. Any other CoopError of `answer` also becomes an error reply, and so does any
@@ -141,7 +184,15 @@ class Node:
         if flush is not None:
             waiting = queue.SimpleQueue()
             self._start(f"flush {key}", self._reply_flushed, waiting, key, flush)
-        self._start(f"serve {key}", self._serve, queryable, key, answer, waiting)
+
+        def answered(message: Message) -> bytearray:
+            given = answer(message)
+            if isinstance(given, bytearray):
+                return given
+            assert changed is not None
+            return drive_held(given, changed)
+
+        self._start(f"serve {key}", self._serve, queryable, key, answered, waiting)
 
     def _start(self, name: str, target: Callable[..., None], *args: Any) -> None:  # noqa: ANN401
         thread = threading.Thread(target=target, args=args, name=name, daemon=True)
@@ -177,15 +228,15 @@ class Node:
         if waiting is not None:
             waiting.put(None)
 
-    def _reply_flushed(self, waiting: _Waiting, key: str, flush: Callable[[], bool]) -> None:
-        """Send replies once `flush` has returned that was called after they were made."""
+    def _reply_flushed(self, waiting: _Waiting, key: str, flush: Callable[[], bytearray | None]) -> None:
+        """Send replies once `flush` has returned that was called after they were made, or what it returns."""
         while (first := waiting.get()) is not None:
             group = [first]
             while not waiting.empty() and (another := waiting.get()) is not None:
                 group.append(another)
-            if flush():
-                for query, answered in group:
-                    _reply(key, query, answered)
+            instead = flush()
+            for query, answered in group:
+                _reply(key, query, answered if instead is None else instead)
 
     def read(self, payload: zenoh.ZBytes | None) -> Message:
         """Decode a payload of this run; raises BadMessage."""
@@ -228,13 +279,21 @@ class Node:
     def follow_stop(self, stop: Stop) -> None:
         """Set `stop` when the learner ends the run."""
 
-        def stopped(sample: zenoh.Sample) -> None:
-            try:
-                stop.set(EndOfRun.decode(self.read(sample.payload)).reason)
-            except BadMessage as error:
-                self.count_bad(str(sample.key_expr), error)
+        def stopped(_: str, message: Message) -> None:
+            stop.set(EndOfRun.decode(message).reason)
 
-        self.session.declare_subscriber(stop_key(self), self.faults.guarded("reading the stop", stopped))
+        self.on(stop_key(self), "reading the stop", stopped)
+
+    def on(self, key: str, doing: str, call: Callable[[str, Message], None]) -> None:
+        """Call `call(key, message)`, in one of Zenoh's threads, for each value of a key; one that raises is refused."""
+
+        def received(sample: zenoh.Sample) -> None:
+            try:
+                call(str(sample.key_expr), self.read(sample.payload))
+            except BadMessage as error:
+                self.count_bad(key, error)
+
+        self.session.declare_subscriber(key, self.faults.guarded(doing, received))
 
     def close(self) -> None:
         """Close the session and wait for the serving threads."""

@@ -70,8 +70,10 @@ class SyncedFile:
     def close(self) -> None:
         """Flush the file to the disk and close it."""
         if not self._file.closed:
-            os.fsync(self._file.fileno())
-            self._file.close()
+            try:
+                os.fsync(self._file.fileno())
+            finally:
+                self._file.close()
 
     def __enter__(self) -> Self:
         return self

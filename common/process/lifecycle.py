@@ -11,7 +11,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from types import FrameType
 
@@ -123,37 +122,6 @@ class Stop:
             self.set(f"error of this program in the thread {name!r}: {first_line(failure.exc_value)}", failed=True)
 
         threading.excepthook = handle
-
-
-class Worker:
-    """A thread that does one job at a time; what ends a job is reported as what ends a thread.
-
-    There is one for all jobs of a kind because glibc gives threads memory of their own, which is not given back.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._thread = ThreadPoolExecutor(1, name)
-        self._job: Future[None] = self._thread.submit(lambda: None)  # starts the thread
-
-    @property
-    def busy(self) -> bool:
-        """True while a job is being done."""
-        return not self._job.done()
-
-    def begin(self, job: Callable[[], None]) -> None:
-        """Begin a job."""
-        self._job = self._thread.submit(_reported, job)
-
-    def wait(self, seconds: float | None = None) -> None:
-        """Wait until the job is done, at most `seconds`."""
-        wait([self._job], seconds)
-
-
-def _reported(job: Callable[[], None]) -> None:
-    try:
-        job()
-    except BaseException:
-        threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
 
 
 def status_after(number: int) -> int:

@@ -11,11 +11,13 @@ import numpy as np
 from coop.actors.weights import WeightsFollower, make_policy
 from coop.common.envs.make import check_filmed
 from coop.common.errors import UsageError
+from coop.common.messaging.conversation import Conversation, asking, drive
 from coop.common.messaging.joining import Membership, join, leave_run
 from coop.common.messaging.keys import evaluations_key
 from coop.common.messaging.messages.control import Join, JoinReply
 from coop.common.messaging.messages.evaluate import Evaluated, Video
 from coop.common.messaging.session import open_session
+from coop.common.messaging.timing import ANSWER_TIMEOUT, LAST_RECEIPT, RECEIPT_PAUSE
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
 from coop.common.process.console import Console, counted
 from coop.common.process.lifecycle import Stop
@@ -24,9 +26,6 @@ from coop.common.settings.options import RoleOptions
 from coop.evaluation.episodes import AT_ONCE, Evaluator
 
 LOOK_EVERY = 0.05  # seconds between looks at what the learner has broadcast
-ANSWER_TIMEOUT = 2.0  # seconds to wait for each receipt
-PAUSE = 0.1  # seconds before a result is sent, or networks are asked for, again
-LAST_RECEIPT = 5.0  # seconds to wait for the final networks, and for a receipt, at the run's end
 
 
 Progress = tuple[int, int]
@@ -145,7 +144,7 @@ class EvaluatorService:
             self._evaluations.rush()
             ends = time.monotonic() + LAST_RECEIPT
             while not self._weights.fetch() and time.monotonic() < ends:
-                time.sleep(PAUSE)
+                time.sleep(RECEIPT_PAUSE)
             if self._weights.ready:
                 self._turn()
 
@@ -167,24 +166,28 @@ class EvaluatorService:
                 self._send(video, f"a video after {env_step:,} steps")
 
     def _send(self, message: Evaluated | Video, said: str) -> None:
-        """Send a result until it is acknowledged, or for `LAST_RECEIPT` seconds at the run's end."""
-        payload, ends = message.encode(self._node.run), math.inf
+        """Send a result, see `reporting`, and say so."""
+        payload = message.encode(self._node.run)
         self._number += 1
-        while True:
-            try:
-                self._node.ask(evaluations_key(self._node), payload, timeout=ANSWER_TIMEOUT)
-            except Refused as error:
-                said = f"{said}; the learner refused it: {error}"
-            except NoAnswer:
-                now = time.monotonic()
-                ends = min(ends, now + LAST_RECEIPT) if self._stop.is_set() else ends
-                if now < ends:
-                    time.sleep(PAUSE)
-                    continue
-                said = f"{said}; the learner is gone"
-            self._console.event(said)
-            return
+        self._console.event(said + drive(reporting(self._node, self._stop, payload)))
 
     def _abandons(self) -> bool:
         """Whether an evaluation has become useless."""
         return not self._node.presence.members("learner") if self._last else self._stop.is_set()
+
+
+def reporting(node: Node, stop: Stop, payload: bytearray) -> Conversation[str]:
+    """Send a result until it is acknowledged, or for `LAST_RECEIPT` seconds at the run's end; say if it was not."""
+    ends = math.inf
+    while True:
+        try:
+            yield from asking(node, evaluations_key(node), payload, ANSWER_TIMEOUT)
+        except Refused as error:
+            return f"; the learner refused it: {error}"
+        except NoAnswer:
+            ends = min(ends, node.now() + LAST_RECEIPT) if stop.is_set() else ends
+            if node.now() >= ends:
+                return "; the learner is gone"
+            yield RECEIPT_PAUSE
+        else:
+            return ""

@@ -33,7 +33,29 @@ def save_checkpoint(
     """Save one checkpoint, and delete those that are too old.
 
     snapshot: makes the replay service save its state under the given folder, relative to the run directory.
-    records, fallbacks, settings: see `Manifest`.
+    The other arguments are those of `saving_checkpoint`, and it raises the same.
+    """
+    with saving_checkpoint(
+        run_dir, run_id, number, learner_state, records=records, fallbacks=fallbacks, settings=settings
+    ) as path:
+        snapshot(str(path.relative_to(run_dir)))
+    return path
+
+
+@contextmanager
+def saving_checkpoint(
+    run_dir: Path,
+    run_id: int,
+    number: int,
+    learner_state: dict[str, Any],
+    *,
+    records: Mapping[str, FileDigest],
+    fallbacks: Sequence[str] = (),
+    settings: str = "",
+) -> Iterator[Path]:
+    """Save the learner's part, and seal the checkpoint once the body has made the replay service save its part.
+
+    Deletes checkpoints that are too old. records, fallbacks, settings: see `Manifest`.
 
     Raises:
         OSError: the run directory cannot be written; nothing is left of this checkpoint.
@@ -44,14 +66,13 @@ def save_checkpoint(
         content = io.BytesIO()
         torch.save(learner_state, content)
         files = {LEARNER: write_atomic(path / LEARNER, content.getvalue())}
-        snapshot(str(path.relative_to(run_dir)))
+        yield path
         manifest = Manifest(run_id, number, files, dict(records), list(fallbacks), settings=settings)
         finish(run_dir, path, manifest)
     except BaseException:
         remove(path)
         raise
     remove_old(run_dir, number)
-    return path
 
 
 def newest_checkpoint(run_dir: Path, settings: str = "", *, replay: bool = False) -> Whole | None:

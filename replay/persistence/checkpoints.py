@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 from coop.common.errors import RunError
+from coop.common.messaging.conversation import Conversation, Task, start
 from coop.common.process.files import aside_folder, move_aside
-from coop.common.process.lifecycle import Worker
 from coop.records.checkpoints import (
     DONE,
     FOLDER,
@@ -29,11 +30,18 @@ from coop.replay.persistence.storage import Mark, load_snapshot, save_snapshot
 class ReplayCheckpoints:
     """Parts of checkpoints under `checkpoints/` of a folder, written one at a time in a separate thread."""
 
-    def __init__(self, folder: Path, run_id: int, journal: Journal | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        run_id: int,
+        journal: Journal | None = None,
+        start: Callable[[str, Conversation[None]], Task] = start,
+    ) -> None:
         self._folder = folder
         self._run_id = run_id
         self._journal = journal
-        self._writer = Worker("checkpoints")
+        self._start = start
+        self._writer: Task | None = None
         self._number = -1
         self._on_disk = False
         self._problem = ""
@@ -46,7 +54,7 @@ class ReplayCheckpoints:
         Raises:
             RunError: another checkpoint is being written, or there is no space for the journal.
         """
-        if self._writer.busy:
+        if self._is_writing():
             if number == self._number:
                 return
             raise RunError(f"checkpoint {number}: checkpoint {self._number} is still being written")
@@ -58,8 +66,9 @@ class ReplayCheckpoints:
                 raise RunError(f"the journal can't be written: {error.strerror or error}") from error
             snapshot = core.snapshot(number, keep)
 
-        def write() -> None:
+        def write() -> Conversation[None]:
             try:
+                yield 0.0
                 if self._journal is not None:
                     self._journal.sync(mark.journal)
                 save_snapshot(snapshot, lock, path, mark)
@@ -70,24 +79,29 @@ class ReplayCheckpoints:
             except Exception as error:  # whatever it is, the part must not count as written
                 self._problem = f"{path}: {type(error).__name__}: {error}"
                 raise
+            finally:
+                with lock:
+                    lock.notify_all()
 
         self._number, self._on_disk, self._problem = number, False, ""
-        self._writer.begin(write)
+        self._writer = self._start(f"checkpoint {number}", write())
 
-    def written(self, number: int, seconds: float) -> bool:
-        """Wait up to `seconds`; return whether the part of checkpoint `number` is on disk (False: it is being written).
+    def written(self, number: int) -> bool:
+        """Whether the part of checkpoint `number` is on disk (False: it is being written).
 
         Raises:
             RunError: it was not begun or could not be written.
         """
-        if number != self._number:
+        if number != self._number or self._writer is None:
             raise RunError(f"checkpoint {number} was not begun")
-        self._writer.wait(seconds)
-        if self._writer.busy:
+        if self._is_writing():
             return False
         if not self._on_disk:
             raise RunError(self._problem or f"{part_path(self._folder, number)}: the writer ended without a result")
         return True
+
+    def _is_writing(self) -> bool:
+        return self._writer is not None and self._writer.is_alive() and not (self._on_disk or self._problem)
 
     def intact(self) -> list[int]:
         """Numbers of the intact parts, in ascending order."""
@@ -150,7 +164,8 @@ class ReplayCheckpoints:
 
     def close(self) -> None:
         """Wait for the part being written, and end the journal."""
-        self._writer.wait()
+        if self._writer is not None:
+            self._writer.join()
         if self._journal is not None:
             with contextlib.suppress(OSError):  # the next process reads it like one that was killed
                 self._journal.close()

@@ -29,8 +29,11 @@ from coop.replay.persistence.journal import (
 from coop.replay.table.table import PinnedBatch
 
 
-def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[int, list[str]]:
+def recover(core: ReplayCore, folder: Path, first: int, run_id: int, *, sync: bool = False) -> tuple[int, list[str]]:
     """Replay the journal on a core from file `first` to its end; return the next file's number, and lines to say.
+
+    sync: what was acknowledged had been flushed to the disk. So what can't be read at the journal's end is what a
+    machine's death leaves, and its actors send it again; if not, their next segments tell (`ReplayCore.lost`).
 
     Raises:
         RunError: the journal belongs to another run, or the replay deviates from an undamaged record.
@@ -40,26 +43,27 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int) -> tuple[in
     numbers = [number for number in journal_files(folder) if number >= first]
     for _ in replaying.draws(first, numbers):
         draws += 1
-    core.damaged += replaying.transitions_lost
+    lost = replaying.transitions_lost - (replaying.behind if sync else 0)
+    core.damaged += lost
     taken = f"{core.table.inserted - before:,} transitions and {draws:,} batches from the journal"
     if numbers and not replaying.ended:
         taken += ", which ends as a kill leaves it"
     notices = [f"{text}; the journal is read on behind it" for text in replaying.lost]
-    if replaying.lost:
-        notices.append(f"the journal lacks {replaying.transitions_lost:,} transitions that had been acknowledged")
+    if replaying.lost and (lost or not sync):
+        notices.append(f"the journal lacks {lost:,} transitions that had been acknowledged")
     return max([first, *(number + 1 for number in numbers)]), [taken, *notices]
 
 
 class Replaying:
     """Replays files of a journal on a core.
 
-    lost: what could not be read, in words. transitions_lost: acknowledged transitions among it. ended: the last file
-    read was closed properly.
+    lost: what could not be read, in words. transitions_lost: accepted transitions among it; behind: of these, those
+    behind the last whole record of their file. ended: the last file read was closed properly.
     """
 
     def __init__(self, core: ReplayCore, folder: Path, run_id: int) -> None:
         self.lost: list[str] = []
-        self.transitions_lost = 0
+        self.transitions_lost = self.behind = 0
         self.ended = True
         self._core = core
         self._folder = folder
@@ -79,21 +83,23 @@ class Replaying:
 
     def _file(self, number: int) -> Iterator[tuple[DrawRequest, PinnedBatch]]:
         core, read = self._core, SegmentReader(self._core.table.spec)
-        self.ended = False
+        self.ended, behind = False, 0
         for entry in read_file(self._folder, number, self._run_id):
             if isinstance(entry, Lost):
                 self.lost.append(entry.text)
                 if entry.accepted is not None:
-                    self._count(entry.accepted)
+                    behind += self._count(entry.accepted)
                 continue
             kind, payload, accepted = entry
             if kind == SEGMENT:
                 segment = read(wire.decode(payload))
                 self._count(accepted - segment.steps)
+                behind = 0
                 core.apply_insert(segment)
                 self._accepted = accepted
                 continue
             self._count(accepted)
+            behind = 0
             if kind == DRAW:
                 request, ids = read_draw(payload)
                 if self.lost and len(core.table) < request.batch_size:
@@ -107,9 +113,11 @@ class Replaying:
             elif kind == LIMITER:
                 core.restore_limiter(read_limiter(payload))
             self.ended = kind == END
+        self.behind += behind
 
-    def _count(self, accepted: int) -> None:
+    def _count(self, accepted: int) -> int:
         """Count what is lost before a record at which the run had accepted so many transitions."""
-        if self.lost:
-            self.transitions_lost += max(0, accepted - self._accepted)
+        lost = max(0, accepted - self._accepted) if self.lost else 0
+        self.transitions_lost += lost
         self._accepted = accepted
+        return lost

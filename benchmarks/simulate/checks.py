@@ -1,0 +1,451 @@
+"""What must hold, after each event and at the end."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.simulate.roles import ACTOR_NUMBERS, SPEC, STEPS
+from benchmarks.simulate.world import Process, Violation
+from coop.common.messaging import wire
+from coop.common.messaging.messages.evaluate import EvaluationRow
+from coop.common.messaging.messages.weights import Role
+from coop.common.transitions import Batch, Drawn, DrawRequest, Segment
+from coop.learner.roster import Roster
+from coop.learner.trainer import Effects, Trainer
+from coop.records.checkpoints import DONE, Damaged, checkpoint_numbers
+from coop.records.learner_checkpoints import load_learner
+from coop.replay.core import ReplayCore, Reply, RetryLater
+from coop.replay.persistence.checkpoints import ReplayCheckpoints, part_path
+from coop.replay.persistence.storage import load_snapshot
+from coop.replay.service import ReplayService
+
+if TYPE_CHECKING:
+    from benchmarks.simulate.cluster import Cluster
+
+STALE = 6.0  # seconds of good weather after which an actor must know what the learner broadcast last
+CHECKED_EVERY = 12  # inserts between two looks at the whole table
+EXPECTED = (  # how processes end that meet faults, in words
+    "killed",
+    "its machine has died",
+    "JoinError: ",
+    "uses it",
+    "No space left",
+    "serves this run",
+    "has taken over from this one",
+    "has been gone for",
+    "the journal can't be flushed",
+    "another learner",
+    "no checkpoint to resume from",
+)
+
+
+class Checks:
+    """Knows what was promised: which segments have been acknowledged, what was drawn, broadcast and saved.
+
+    Attributes:
+        done: how often each invariant was looked at.
+    """
+
+    def __init__(self, cluster: Cluster) -> None:
+        self.cluster = cluster
+        self.done: Counter[str] = Counter()
+        self._believed: Counter[int] = Counter()  # transitions acknowledged to each actor
+        self.serving = -1  # incarnation of the replay service that the learner has admitted
+        self.acked: dict[tuple[int, int], str] = {}  # segments, with when
+        self.forgiven = 0
+        self._sent: dict[tuple[int, int], int] = {}  # first transition of each segment
+        self._forgive = False  # what was acknowledged may be lost: nothing says that it survives what has happened
+        self._folder: object = None
+        self._draws: dict[tuple[int, int], tuple[int, ...]] = {}
+        self._owners: dict[int, tuple[Reply, int]] = {}
+        self._evaluations: set[float] = set()
+        self._sealed: object = None  # the checkpoint that was looked at last
+        self._bases: dict[int, int] = {}
+        self._learner, self._counted = -1, 0
+        self._last_ack = self._last_save = -1.0
+        self._flats: dict[tuple[int, int], set[bytes]] = defaultdict(set)
+        self._roles: list[tuple[float, int, tuple[int, int]]] = []  # when, who acts, and versions
+        self._saved: dict[int, set[bytes]] = defaultdict(set)  # agents after so many updates
+        self._trainer: Trainer | None = None
+        self._core: ReplayCore | None = None
+        self._began_at = 0.0
+        checks = self
+
+        class Core(ReplayCore):
+            """The real core, watched."""
+
+            since = 0
+
+            def insert(self, segment: Segment, payload: bytes = b"") -> int | RetryLater:
+                before, ahead = self.table.inserted, self.limiter.ahead(self.table.inserted, checks.counted(self))
+                outcome = super().insert(segment, payload)
+                if self.table.inserted > before:
+                    start, slack = (
+                        checks.cluster.plan.starts,
+                        max(checks.cluster.plan.tolerance, 0.5 / checks.cluster.plan.ratio),
+                    )
+                    checks.hold("ratio", before < start or ahead <= slack + 1e-9, f"inserted {ahead:.1f} steps ahead")
+                    checks.hold("ratio", before < checks.cluster.plan.total, "inserted beyond the run's end")
+                    self.since += 1
+                    if self.since % CHECKED_EVERY == 0:
+                        checks.look_at(self)
+                return outcome
+
+            def draw(self, request: DrawRequest) -> Reply | RetryLater:
+                known = request.sequence < checks.counted(self)
+                checks.asked(request)
+                outcome = super().draw(request)
+                if not isinstance(outcome, RetryLater):
+                    checks.drawn(self, request, outcome, known)
+                return outcome
+
+        class Service(ReplayService):
+            """The real service, whose core is looked at before it serves."""
+
+            def __init__(self, node: Any, core: Any, *rest: Any, **named: Any) -> None:  # noqa: ANN401
+                super().__init__(node, core, *rest, **named)
+                checks.service_begins(node.process, core)
+
+        class Members(Roster):
+            """The real roster, which tells whom it admits."""
+
+            def replay(self, *args: Any) -> int:  # noqa: ANN401
+                index = super().replay(*args)
+                checks.serving = self.serving
+                return index
+
+        self.core_kind, self.service_kind, self.roster_kind = Core, Service, Members
+
+    def hold(self, what: str, holds: bool, words: str) -> None:
+        """Count a look at an invariant; raise Violation if it does not hold."""
+        self.done[what] += 1
+        if not holds:
+            self.broken(f"{what}: {words}")
+
+    def broken(self, words: str) -> None:
+        """Raise Violation, and make sure that it ends the run."""
+        world = self.cluster.world
+        world.broken = world.broken or Violation(words)
+        raise world.broken
+
+    # ------------------------------------------------------------------------------------------------------------------
+    # Acknowledgements and the table
+
+    def sent(self, segment: Segment) -> None:
+        """An actor has made a segment."""
+        self._sent[segment.incarnation, segment.sequence] = int(segment.rewards[0])
+
+    def on_reply(self, node: Any, key: str, message: wire.Message, reply: bytes) -> None:  # noqa: ANN401
+        """An answer leaves."""
+        if node.role == "learner" and key.endswith("/config/replay") and message.kind == "leave":
+            self._departs(message.fields["incarnation"], wire.decode(reply).kind)
+        if node.role != "replay" or not key.endswith(("/insert", "/sample")):
+            return
+        beginning = reply[:100]  # which holds the kind
+        if b"\xa5retry" in beginning:
+            return
+        self.hold("one service", node.incarnation == self.serving, f"{node.process.name} serves, another was admitted")
+        if b"\xa3ack" in beginning and key.endswith("/insert"):
+            who = message.fields["incarnation"], message.fields["sequence"]
+            self.hold("acknowledged", who in self._sent, "a segment that nobody sent")
+            core = node.process.state["core"]
+            self.hold(
+                "acknowledged", core._seen.seen(who[0], 0, who[1]), f"segment {who[1]}, which is not in the table"
+            )
+            if who not in self.acked:
+                self.acked[who] = f"{self.cluster.world.now:.3f}"
+                self._believed[who[0]] += STEPS
+            self._last_ack = self.cluster.world.now
+
+    def _departs(self, incarnation: int, answer: str) -> None:
+        """The learner answers a replay service that wants to leave."""
+        if answer != "farewell" or incarnation != self.serving or self._trainer is None:
+            return
+        learner = self.cluster.roles["learner"]
+        if learner.stop.is_set() or self._trainer.outcome() or not self._trainer.agent.updates:
+            return
+        self.hold(
+            "departure", self._last_save > self._last_ack, "a replay service leaves with what is in no checkpoint"
+        )
+
+    def said(self, process: Process, text: str) -> None:
+        """A role has said something."""
+        if process.role == "learner" and ("saved, " in text or "goes on without it" in text):
+            self._last_save = self.cluster.world.now
+            numbers = checkpoint_numbers(self.cluster.root / "learner" / "run", DONE)
+            parts = [part_path(folder, numbers[-1]) for folder in self._folders()] if numbers else []
+            there = not parts or any((part / DONE).exists() for part in parts)
+            self.hold("checkpoint", there, f"{numbers[-1:]} is sealed without the replay service's part")
+
+    def _folders(self) -> list[Path]:
+        """Where replay services keep their parts."""
+        return [self.cluster.root / place / "table" for place in ("replay", "elsewhere")]
+
+    def service_begins(self, process: Process, core: ReplayCore) -> None:
+        """A replay service has restored what it holds."""
+        process.state["core"] = core
+        folder = process.state["folder"]
+        if self._folder not in (None, folder):
+            self._forgive = True
+        self._folder, self._core = folder, core
+        for who, when in list(self.acked.items()):
+            if not core._seen.seen(who[0], 0, who[1]):
+                if self._forgive:
+                    del self.acked[who]
+                    self.forgiven += STEPS
+                    continue
+                text = f"segment {who[1]} of actor {who[0]:x}, acknowledged at {when} s, is not in the restored table"
+                self.broken(f"acknowledged: {text}")
+        if self._forgive:
+            self._draws.clear()
+        self._forgive = False
+        self.look_at(core)
+        self.look_at_checkpoints()
+
+    def look_at(self, core: ReplayCore) -> None:
+        """Look at all that a table holds."""
+        table = core.table
+        size = len(table)
+        accepted = 0
+        for stream in core._seen._streams.values():
+            accepted += stream.highest + 1 - sum(len(gap) for gap in stream.gaps)
+        self.hold("exactly once", table.inserted == STEPS * accepted, f"{table.inserted} of {accepted} segments")
+        self.hold("eviction", size == min(table.capacity, table.inserted), f"holds {size} of {table.inserted}")
+        if not size:
+            return
+        rows = np.arange(size)
+        columns = table._columns.read(rows)
+        numbers, ids = columns["rewards"].astype(np.int64), np.sort(columns["ids"])
+        obs, following = table._observations(rows, False)[:, 0], table._observations(rows, True)[:, 0]
+        self.hold("content", bool((obs == numbers).all() and (following == numbers + 1).all()), "frames of others")
+        self.hold("exactly once", len(set(numbers.tolist())) == size, "a transition twice")
+        self.hold("eviction", ids[-1] == table.inserted - 1 and ids[0] == table.inserted - size, "not the newest")
+        known = {first + step for first in self._sent.values() for step in range(STEPS)}
+        self.hold("content", known.issuperset(numbers.tolist()), "a transition that nobody sent")
+        for who in self.acked:
+            self.hold("acknowledged", core._seen.seen(who[0], 0, who[1]), f"segment {who[1]} has disappeared")
+        if table.capacity >= table.inserted:
+            held = set(numbers.tolist())
+            for who in self.acked:
+                self.hold("acknowledged", self._sent[who] in held, f"segment {who[1]} was not evicted, but is gone")
+
+    # ------------------------------------------------------------------------------------------------------------------
+    # Draws and updates
+
+    def asked(self, request: DrawRequest) -> None:
+        """A learner asks: it will not ask for batches below its base again."""
+        self._bases[request.incarnation] = max(self._bases.get(request.incarnation, 0), request.base)
+
+    def drawn(self, core: Any, request: DrawRequest, reply: Reply, known: bool) -> None:  # noqa: ANN401
+        """A batch has been drawn, or drawn again."""
+        plan = self.cluster.plan
+        if request.incarnation != self._learner:
+            self._learner, self._counted = request.incarnation, request.base
+        self._counted = max(self._counted, request.base, request.sequence + 1)
+        ids = tuple(reply.batch.columns["ids"].tolist())
+        key = request.incarnation, request.sequence
+        _, owner = self._owners.setdefault(id(reply), (reply, request.incarnation))
+        self.hold("incarnation", owner == request.incarnation, f"draw {request.sequence} was another learner's")
+        base = self._bases[request.incarnation]
+        if key in self._draws and request.sequence >= base:  # below, a late copy, whose answer nobody awaits
+            self.hold("repeated draw", self._draws[key] == ids, f"draw {request.sequence} is another one now")
+        if request.sequence >= base:
+            self._draws[key] = ids
+        if not known and core.table.inserted < plan.total:
+            ahead = core.limiter.ahead(core.table.inserted, self._counted)
+            slack = max(plan.tolerance, 0.5 / plan.ratio)
+            self.hold("ratio", ahead >= -slack - 1e-9, f"draws are {-ahead:.1f} steps ahead")
+
+    def counted(self, core: ReplayCore) -> int:
+        """Draws as the present learner counts them; as the core does before its first one."""
+        return self._counted if self._learner in core._learners[-1:] else core.drawn
+
+    def trainer_kind(self, process: Process) -> type[Trainer]:
+        """The real trainer of a learner, watched."""
+        checks, incarnation = self, process.state["incarnation"]
+
+        class Watched(Trainer):
+            """See `Trainer`."""
+
+            def __init__(self, *args: Any) -> None:  # noqa: ANN401
+                super().__init__(*args)
+                checks._trainer = self
+
+            def train(self, batch: Batch, drawn: Drawn, now: float) -> Effects:
+                number, agent = self.agent.updates, self.agent
+                checks.hold("order", drawn.sequence == number, f"batch {drawn.sequence} in update {number}")
+                expected = checks._draws.get((incarnation, number))
+                same = expected is None or expected == tuple(batch.ids.tolist())
+                checks.hold("batch", same, f"batch {number} is not the one that was drawn")
+                obs, following = batch.frames[batch.obs_index[:, 0], 0], batch.frames[batch.next_index[:, 0], 0]
+                checks.hold("batch", bool((obs == batch.rewards).all()), "frames of others")
+                checks.hold("batch", bool((following == batch.rewards + 1).all()), "next frames of others")
+                effects = super().train(batch, drawn, now)
+                checks._note(agent)
+                if effects.broadcast:
+                    checks._broadcast(agent)
+                return effects
+
+            def load_state(self, state: dict[str, Any], now: float) -> None:
+                super().load_state(state, now)
+                digest = _digest(self.agent)
+                checks.hold("checkpoint", digest in checks._saved[self.agent.updates], "a state that never was")
+
+        return Watched
+
+    def _note(self, agent: Any) -> None:  # noqa: ANN401
+        self._saved[agent.updates].add(_digest(agent))
+        for number, network in enumerate(agent.networks):
+            self._flats[number, agent.versions[number]].add(network.flat.tobytes())
+
+    def _broadcast(self, agent: Any) -> None:  # noqa: ANN401
+        self._roles.append((self.cluster.world.now, agent.acting, (agent.versions[0], agent.versions[1])))
+
+    # ------------------------------------------------------------------------------------------------------------------
+    # Weights
+
+    def evaluated(self, row: EvaluationRow) -> None:
+        """The learner has recorded an evaluation, whose seconds no other has."""
+        self.hold("evaluation", row.seconds not in self._evaluations, "recorded twice by one learner")
+        self._evaluations.add(row.seconds)
+        assert self._trainer is not None
+        known = row.env_step <= self._trainer.drawn.inserted or self.forgiven > 0
+        self.hold("evaluation", known, f"after {row.env_step} steps")
+
+    def learner_begins(self, process: Process) -> None:
+        """A learner's process has begun."""
+        self._evaluations.clear()
+        self._roles.clear()
+        self._began_at = self.cluster.world.now
+        self._learner_look = self.look_at_checkpoints()
+
+    def look(self, process: Process, weights: Any, policy: Any) -> None:  # noqa: ANN401
+        """An actor has looked for weights: those that it acts with must be whole, and after a while the newest."""
+        now, network = self.cluster.world.now, self.cluster.network
+        acked = process.state["inserts"].acked
+        given = self._believed[process.state["incarnation"]]
+        self.hold("acknowledged", acked <= given, f"{process.name} counts {acked} acknowledged, but {given} were")
+        if not weights.ready:
+            return
+        told, process.state["roles"] = process.state.get("roles", []), []
+        acting = {Role.decode(wire.decode(raw)).acting - 1 for raw in (process.state.get("last role"), *told) if raw}
+        process.state["last role"] = told[-1] if told else process.state.get("last role")
+        self.hold("role", policy.acting in acting, f"{process.name} acts with network {policy.acting + 1}")
+        for number, each in enumerate(policy.networks):
+            held = weights._held[number]
+            expected = self._flats.get((number, held))
+            if held and expected is not None:
+                self.hold("weights", each.flat.tobytes() in expected, f"network {number + 1} is not version {held}")
+        learner = self.cluster.roles.get("learner")
+        calm = max(network.disturbed, process.since, 0.0 if learner is None else learner.since, self._began_at)
+        node = process.nodes[0]
+        linked = [link for link in node.links if link.other(node).role == "learner"]
+        weather = network.weather
+        if now - calm < STALE or network.cuts or weather.lost or weather.delay > 0.01 or not linked:
+            process.state.pop("calm", None)
+            return
+        if learner is None or learner.frozen or not learner.alive:
+            return
+        since = process.state.setdefault("calm", now)
+        old = [each for each in self._roles if each[0] <= now - STALE]
+        if now - since < STALE or not old:
+            return
+        recent = [old[-1], *(each for each in self._roles if each[0] > now - STALE)]
+        acting = {role for _, role, _ in recent}
+        self.hold("role", policy.acting in acting, f"{process.name} acts with network {policy.acting + 1}")
+        told = old[-1][2][policy.acting]
+        held = weights._held[policy.acting]
+        self.hold("role", held >= told, f"{process.name} acts with version {held}, {told} was broadcast")
+
+    # ------------------------------------------------------------------------------------------------------------------
+    # Checkpoints
+
+    def look_at_checkpoints(self) -> None:
+        """The newest checkpoint that is said to be whole must be so."""
+        root = self.cluster.root
+        path = root / "learner" / "run"
+        numbers = checkpoint_numbers(path, DONE)
+        if not numbers:
+            return
+        newest = numbers[-1]
+        sealed = newest, (path / "checkpoints" / str(newest) / DONE).stat().st_mtime_ns
+        if sealed != self._sealed:
+            state = load_learner(path / "checkpoints" / str(newest))
+            self.hold("checkpoint", state["agent"]["updates"] == newest, f"{newest} holds another number of updates")
+        for folder in self._folders():
+            if newest in ReplayCheckpoints(folder, -1).intact():
+                if sealed != self._sealed:
+                    self._restore(folder, newest)
+                self._sealed = sealed
+                return
+        self.broken(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
+
+    def _restore(self, folder: Any, number: int) -> None:  # noqa: ANN401
+        core = ReplayCore(self.cluster.config, SPEC)
+        from coop.records.run_ids import read_run_id  # noqa: PLC0415
+
+        try:
+            load_snapshot(core, part_path(folder, number), read_run_id(folder), number)
+        except Damaged as damaged:
+            self.broken(f"checkpoint: part of {number}: {damaged}")
+        acked, self.acked = self.acked, {}
+        self.look_at(core)
+        self.acked = acked
+        # Where draws may be lost, the learner's next request says how many there were.
+        exact = self.cluster.plan.journal != "off" and not self.cluster.met["crash"]
+        self.hold("checkpoint", core.drawn >= number or not exact, f"part of {number} has drawn {core.drawn}")
+
+    # ------------------------------------------------------------------------------------------------------------------
+    # Ends
+
+    def ended(self, process: Process, reason: str) -> None:
+        """A process has ended."""
+        expected = not reason or any(words in reason for words in EXPECTED)
+        expected |= process.stop.is_set() and ("was not begun" in reason or "no answer to" in reason)
+        self.hold("ends", expected, f"{process.name}: {reason}")
+        if process.role == "replay" and self.cluster.plan.journal == "off":
+            self._forgive = True
+
+    def crashed(self, top: str) -> None:
+        """A machine dies."""
+        self._draws.clear()
+        if self.cluster.plan.journal != "sync":
+            self._forgive = True
+
+    def concluded(self, summary: Any) -> None:  # noqa: ANN401
+        """The run is complete."""
+        plan = self.cluster.plan
+        self.hold("end", summary.env_steps >= plan.total, f"complete after {summary.env_steps} steps")
+        lost = summary.transitions_lost
+        self.hold("end", not lost or self.forgiven > 0, f"{lost} transitions lost")
+
+    def at_the_end(self) -> None:
+        """Look at everything once more."""
+        if self._core is not None:
+            self.look_at(self._core)
+        self.look_at_checkpoints()
+
+    def state_of(self, process: Process) -> str:
+        """What a process is about, in words."""
+        if not process.alive:
+            return "has ended"
+        inserts = process.state.get("inserts")
+        if inserts is not None:
+            return f"has {inserts.acked} acknowledged, {inserts.waiting or 'waits for nothing'}"
+        core = process.state.get("core")
+        if core is not None:
+            return (
+                f"holds {core.table.inserted}, has drawn {core.drawn}: {core.inserts_wait_for}; {core.samples_wait_for}"
+            )
+        return "lives"
+
+
+def _digest(agent: Any) -> bytes:  # noqa: ANN401
+    return b"".join(network.flat.tobytes() for network in agent.networks) + bytes([agent.acting])
+
+
+__all__ = ["ACTOR_NUMBERS", "Checks"]

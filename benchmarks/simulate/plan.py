@@ -1,0 +1,149 @@
+"""What a seed stands for: the settings of a small run, and the faults that it meets, in bursts."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+ROLES = ("learner", "replay", "actor 0", "actor 1", "evaluator")
+MACHINES = ("learner", "replay", "actors")
+KINDS = (
+    "kill",
+    "freeze",
+    "stop",
+    "crash",
+    "deadly",
+    "cut",
+    "partition",
+    "weather",
+    "full",
+    "slow",
+    "leap",
+    "second",
+    "second actor",
+)
+_WEIGHTS = (6, 5, 4, 6, 8, 4, 3, 6, 2, 3, 1, 4, 1)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    at: seconds from the run's beginning. length: seconds that it lasts, if it does. number: what its kind says.
+    """
+
+    at: float
+    kind: str
+    target: str
+    other: str = ""
+    length: float = 0.0
+    number: float = 0.0
+
+    def __str__(self) -> str:
+        words = {
+            "kill": f"{self.target} is killed",
+            "freeze": f"{self.target} is frozen for {self.length:.2f} s",
+            "stop": f"{self.target} is asked to stop, and started again",
+            "crash": f"the machine of {self.target} dies; what was not flushed is lost",
+            "deadly": f"{self.target} is killed after {self.number:.0f} more calls for its files",
+            "cut": f"nothing gets from {self.target} to {self.other} for {self.length:.2f} s",
+            "partition": f"nothing gets from {self.target} to {self.other}, nor back, for {self.length:.2f} s",
+            "weather": f"for {self.length:.2f} s messages are up to {self.number:.2f} s late, lost or doubled",
+            "full": f"the disk of {self.target} is full for {self.length:.2f} s",
+            "slow": f"the disk of {self.target} is slow for {self.length:.2f} s: up to {self.number:.1f} s",
+            "leap": f"the clock of {self.target} leaps by {self.number:.2f} s",
+            "second": f"a second replay service starts, {self.other}",
+            "second actor": "another actor joins",
+        }
+        return f"{self.at:7.3f} s  {words[self.kind]}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The settings of a run, and its faults."""
+
+    total: int
+    capacity: int
+    ratio: float
+    tolerance: float
+    starts: int
+    batch: int
+    swap: int
+    publish: int
+    checkpoint: int
+    prefetch: int
+    window: int
+    journal: str
+    mirror: str
+    sampling: str
+    every: float
+    actors: int
+    evaluator: bool
+    faults: tuple[Fault, ...]
+
+    def __str__(self) -> str:
+        return (
+            f"{self.total} steps, a table of {self.capacity}, ratio {self.ratio}, journal {self.journal}, "
+            f"checkpoints every {self.checkpoint} updates, {self.sampling}, mirror {self.mirror}"
+        )
+
+
+def make_plan(seed: int) -> Plan:
+    """The plan of a seed."""
+    draw = random.Random(f"plan {seed}")
+    total, every, actors = draw.choice((48, 64, 96)), draw.choice((0.05, 0.1, 0.2)), draw.choice((1, 2, 2))
+    lasts = 0.5 + total / 4 / actors * every  # seconds, if nothing happens
+    return Plan(
+        total=total,
+        capacity=draw.choice((16, 32, total, total)),
+        ratio=draw.choice((0.25, 0.5)),
+        tolerance=draw.choice((4.0, 16.0)),
+        starts=draw.choice((4, 16)),
+        batch=4,
+        swap=draw.choice((3, 7)),
+        publish=draw.choice((1, 2, 5)),
+        checkpoint=draw.choice((5, 9, 12)),
+        prefetch=draw.choice((1, 2, 4, 8)),
+        window=draw.choice((1, 2, 4)),
+        journal=draw.choice(("sync", "sync", "async", "async", "async", "off")),
+        mirror=draw.choice(("auto", "off")),
+        sampling=draw.choice(("uniform", "uniform", "prioritized")),
+        every=every,
+        actors=actors,
+        evaluator=draw.random() < 0.3,
+        faults=tuple(sorted(_faults(draw, lasts), key=lambda fault: fault.at)),
+    )
+
+
+def _faults(draw: random.Random, lasts: float) -> list[Fault]:
+    found = []
+    for _ in range(draw.choice((0, 1, 1, 2, 2, 3))):
+        begins = draw.uniform(0.2, 1.2 * lasts)
+        if draw.random() < 0.15:  # one replay service can't be reached while another waits for its place
+            kind, other = draw.choice((("freeze", ""), ("partition", "learner"), ("partition", "actors")))
+            found.append(Fault(begins, kind, "replay", other, draw.uniform(1.0, 6.0)))
+            found.append(Fault(max(0.1, begins + draw.uniform(-1.0, 2.0)), "second", "replay", "elsewhere"))
+        for _ in range(draw.randrange(1, 6)):
+            at = begins + draw.random() ** 2 * draw.choice((0.3, 2.0))
+            kind = draw.choices(KINDS, _WEIGHTS)[0]
+            target, other = draw.choice(ROLES), ""
+            length, number = draw.choice((draw.uniform(0.05, 1.0), draw.uniform(1.0, 6.0))), 0.0
+            if kind in ("crash", "full", "slow", "deadly"):
+                target = draw.choice(("learner", "replay", "replay"))
+            if kind == "stop":
+                target = draw.choice(("replay", "replay", "learner", "actor 0", "evaluator"))
+            if kind == "deadly":
+                number = draw.randrange(60)
+            if kind == "leap":
+                target, number = draw.choice(MACHINES), draw.uniform(0.1, 5.0)
+            if kind in ("cut", "partition"):
+                target, other = draw.sample(MACHINES, 2)
+            if kind == "weather":
+                number = draw.choice((0.02, 0.3, 2.0))
+                target = draw.choice(("late", "lost", "doubled", "all"))
+            if kind == "slow":
+                number = draw.uniform(0.2, 3.0)
+            if kind == "second":
+                other = draw.choice(("elsewhere", "elsewhere", "on the same folder"))
+            found.append(Fault(at, kind, target, other, length, number))
+    return found

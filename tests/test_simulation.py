@@ -1,0 +1,74 @@
+"""Whole runs in made-up time, with faults from a seed: `benchmarks/simulate`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.simulate.plan import KINDS, Fault, make_plan
+from benchmarks.simulate.planted import PLANTED, planted
+from benchmarks.simulate.runner import Outcome, explain, find, shrink, simulate
+
+SEEDS = 150
+AT_ONCE = 25
+
+
+def _assert_holds(outcome: Outcome) -> None:
+    assert not outcome.problem, explain(outcome)
+
+
+@pytest.mark.parametrize("first", range(0, SEEDS, AT_ONCE))
+def test_no_fault_breaks_a_promise(first: int) -> None:
+    met: Counter[str] = Counter()
+    for seed in range(first, first + AT_ONCE):
+        outcome = simulate(seed)
+        _assert_holds(outcome)
+        assert outcome.checks["order"], "updates were made"
+        met += outcome.met
+    assert len(met) > len(KINDS) / 2
+
+
+def test_the_same_seed_is_the_same_run() -> None:
+    one, two = (simulate(9, words=True) for _ in range(2))
+    _assert_holds(one)
+    assert one.trace == two.trace
+    assert one.events == two.events > 300
+    assert simulate(10, words=True).trace != one.trace
+
+
+def test_a_planted_bug_is_found_said_and_made_small() -> None:
+    count, found = find("ack-before-write", 0, 60)
+    assert found is not None, f"not found in {count} seeds"
+    with planted("ack-before-write"):
+        small = shrink(found)
+        text = explain(found, "ack-before-write")
+    assert small.problem.startswith("acknowledged: ")
+    assert 1 <= len(small.plan.faults) < len(found.plan.faults)
+    assert f"python -m benchmarks.simulate --seed {found.seed} --planted ack-before-write" in text
+    assert str(small.plan.faults[0]) in text
+    _assert_holds(simulate(found.seed))  # it is the bug
+
+
+@pytest.mark.parametrize("bug", ["skipped-batch", "short-window"])
+def test_other_planted_bugs_are_found(bug: str) -> None:
+    count, found = find(bug, 0, 60)
+    assert found is not None, f"{PLANTED[bug][0]}: not found in {count} seeds"
+
+
+def test_time_passes_without_faults() -> None:
+    plan = replace(make_plan(5), faults=(), journal="off")
+    outcome = simulate(5, plan)
+    _assert_holds(outcome)
+    assert outcome.simulated < 20.0
+
+
+def test_a_machine_that_dies_loses_only_what_no_promise_covers() -> None:
+    crash = (Fault(1.0, "crash", "replay"), Fault(3.0, "crash", "learner"))
+    for journal in ("sync", "async"):
+        for seed in range(3):
+            outcome = simulate(seed, replace(make_plan(seed), faults=crash, journal=journal, every=0.2))
+            _assert_holds(outcome)
+            assert outcome.met["crash"] > 0
+            assert not outcome.forgiven or journal == "async"
