@@ -18,6 +18,7 @@ import pytest
 import torch
 from forked import SERVER, forked_children, serve
 
+from coop.common.messaging.conversation import RESTING
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.limits import use_threads
@@ -105,7 +106,7 @@ def _left(before: tuple[set[int], set[str], set[threading.Thread]]) -> str:
     left = [f"process {pid}" for pid in _children() - children]
     left += [f"socket {name}" for name in _sockets() - sockets]
     # pytest-timeout's own timer of the running test is still there when the session's fixtures end.
-    own = [thread for thread in threading.enumerate() if thread.name.startswith("pytest_timeout")]
+    own = [thread for thread in threading.enumerate() if thread.name.startswith(("pytest_timeout", RESTING))]
     left += [f"thread {thread!r}" for thread in set(threading.enumerate()) - threads - set(own)]
     return ", ".join(left)
 

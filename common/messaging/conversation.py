@@ -25,6 +25,7 @@ NO_ANSWER = "the replay service does not answer"
 BAD_ANSWER = "the replay service's answer is bad"
 
 T = TypeVar("T")
+RESTING = "resting"  # name of a thread that waits for its next task
 _THREADS = ThreadPoolExecutor(16)
 
 
@@ -162,6 +163,8 @@ class _Started:
             drive(conversation)
         except BaseException:  # reported as what ends any other thread
             threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), thread)))
+        finally:
+            thread.name = RESTING
 
 
 def start(name: str, conversation: Conversation[None], stop: Stop | None = None) -> Task:
