@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from contextlib import suppress
 from typing import Any
 
 import gymnasium
@@ -42,7 +41,7 @@ class GymnasiumEnv:
         envs, self._limit = _make(settings, len(seeds), render_mode)
         observations, actions = _spaces(settings, envs[0])
         self._frame = FrameMaker(settings, observations)
-        self.spec = _spec_of(settings, actions, self._frame)
+        self.spec = _spec_of(settings, actions, self._frame, envs[0])
         self.num_envs = len(seeds)
         several = self.num_envs > 1
         self._envs = [
@@ -204,7 +203,7 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
     """
     (env,), _ = _make(settings, 1)
     observations, actions = _spaces(settings, env)
-    spec = _spec_of(settings, actions, FrameMaker(settings, observations))
+    spec = _spec_of(settings, actions, FrameMaker(settings, observations), env)
     CheckedEnv(env, settings.id, observations, spec.num_actions).close()
     return spec
 
@@ -255,23 +254,20 @@ def _one_line(space: object) -> str:
     return " ".join(str(space).split())
 
 
-def _spec_of(settings: EnvSettings, actions: Discrete, frame: FrameMaker) -> EnvSpec:
+def _spec_of(settings: EnvSettings, actions: Discrete, frame: FrameMaker, env: gymnasium.Env[Any, Any]) -> EnvSpec:
     for what, most, limit in (
         ("actions", int(actions.n), MAX_ACTIONS),
         ("values on a side", max(frame.shape), MAX_SIDE),
     ):
         if most > limit:
             raise UsageError(f"env.id: {settings.id!r} has {most:,} {what}; allowed: at most {limit:,}")
-    masks = _has_masks(settings)
+    masks = _has_masks(settings, env)
     return EnvSpec(settings.id, frame.shape, frame.dtype, settings.stack, int(actions.n), masks)
 
 
-def _has_masks(settings: EnvSettings) -> bool:
-    """Whether the environment gives action masks: one that is not played is asked, once in a process."""
+def _has_masks(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> bool:
+    """Whether the environment gives action masks: one is asked before it is played, once in a process."""
     key = repr((settings.id, settings.kwargs, find_registered(settings).entry_point))
     if key not in _MASKED:
-        (env,), _ = _make(settings, 1)
         _MASKED[key] = gives_masks(env)
-        with suppress(Exception):
-            env.close()
     return _MASKED[key]
