@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
 from coop.common.bounds import LONGEST_EPISODE, MAX_ACTIONS, MAX_SIDE
-from coop.common.envs.checked import CheckedEnv, raised
+from coop.common.envs.checked import CheckedEnv, FirstReset, raised
 from coop.common.envs.observations import FrameMaker
 from coop.common.envs.pictures import coloured
 from coop.common.envs.protocol import Steps
@@ -40,11 +40,21 @@ class GymnasiumEnv:
         envs, self._limit = _make(settings, len(seeds), render_mode)
         observations, actions = _spaces(settings, envs[0])
         self._frame = FrameMaker(settings, observations)
-        self.spec = _spec_of(settings, actions, self._frame)
+        first = FirstReset(envs[0], seeds[0])
+        self.spec = _spec_of(settings, actions, self._frame, masks=first.masks)
         self.num_envs = len(seeds)
         several = self.num_envs > 1
         self._envs = [
-            CheckedEnv(env, settings.id, observations, row if several else None) for row, env in enumerate(envs)
+            CheckedEnv(
+                env,
+                settings.id,
+                observations,
+                self.spec.num_actions,
+                masks=self.spec.masks,
+                first=None if row else first,
+                emulator=row if several else None,
+            )
+            for row, env in enumerate(envs)
         ]
         self._seeds = seeds
         self._bounded = bounded and not self._limit
@@ -55,6 +65,7 @@ class GymnasiumEnv:
         self._first_action, self._action_dtype = actions.start, actions.dtype
         self._lengths = [0] * self.num_envs
         self._obs = np.empty(0)
+        self.mask: NDArray[np.bool_] | None = None
         self._actions = np.empty(0, np.int32)
         # Shared by all steps in which no episode ends, so it must not be written to.
         self._none = np.zeros(self.num_envs, bool)
@@ -71,6 +82,7 @@ class GymnasiumEnv:
         self._obs = np.zeros((self.num_envs, *self.spec.obs_shape), self.spec.frame_dtype)
         for row, seed in enumerate(self._seeds):
             self._put(self._obs, row, self._envs[row].reset(seed))
+        self.mask = self._masks()
         return self._obs
 
     def send(self, actions: NDArray[np.int32]) -> None:
@@ -100,9 +112,15 @@ class GymnasiumEnv:
                     self._tell_cut()
         raw_rewards = np.array(rewards, np.float64)
         learned = np.clip(raw_rewards, -1.0, 1.0) if self._clip else raw_rewards
-        self._obs = self._restart(next_obs, over) if over else next_obs
-        ended = self._mask(over)
-        return Steps(self._obs, next_obs, learned.astype(np.float32), raw_rewards, self._mask(terminal), ended, ended)
+        mask, next_mask = self.mask, self._masks()
+        self._obs, self.mask = next_obs, next_mask
+        if over:
+            self._obs, self.mask = self._restart(next_obs, over), self._masks()
+        ended = self._flags(over)
+        return Steps(
+            self._obs, next_obs, learned.astype(np.float32), raw_rewards, self._flags(terminal), ended, ended,
+            mask, next_mask,
+        )  # fmt: skip
 
     def step(self, actions: NDArray[np.int32]) -> Steps:
         """`send`, then `recv`; raises as `recv`."""
@@ -136,12 +154,17 @@ class GymnasiumEnv:
             "there; env.max_episode_steps sets a limit"
         )
 
-    def _mask(self, rows: list[int]) -> NDArray[np.bool_]:
+    def _masks(self) -> NDArray[np.bool_] | None:
+        """The masks of all emulators' present states, bool [envs, actions]."""
+        found = [env.mask for env in self._envs] if self.spec.masks else []
+        return np.array(found) if found else None
+
+    def _flags(self, rows: list[int]) -> NDArray[np.bool_]:
         if not rows:
             return self._none
-        mask = np.zeros(self.num_envs, bool)
-        mask[rows] = True
-        return mask
+        flags = np.zeros(self.num_envs, bool)
+        flags[rows] = True
+        return flags
 
 
 class FilmedGymnasium(GymnasiumEnv):
@@ -150,9 +173,9 @@ class FilmedGymnasium(GymnasiumEnv):
     def __init__(self, settings: EnvSettings, seed: int) -> None:
         """Raise UsageError for an environment that has no pictures, or lacks a package for them."""
         (env,), _ = _make(settings, 1)
-        observations, _ = _spaces(settings, env)
+        observations, actions = _spaces(settings, env)
         metadata, vectors = env.metadata or {}, len(FrameMaker(settings, observations).shape) == 1
-        CheckedEnv(env, settings.id, observations).close()
+        CheckedEnv(env, settings.id, observations, int(actions.n)).close()
         if vectors and "rgb_array" not in (metadata.get("render_modes") or ()):
             raise UsageError(f"env.id: {settings.id!r} has no pictures to film")
         super().__init__(settings, [seed], "rgb_array" if vectors else None, bounded=True)
@@ -181,8 +204,9 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
     """
     (env,), _ = _make(settings, 1)
     observations, actions = _spaces(settings, env)
-    spec = _spec_of(settings, actions, FrameMaker(settings, observations))
-    CheckedEnv(env, settings.id, observations).close()
+    masks = FirstReset(env, 0).masks
+    spec = _spec_of(settings, actions, FrameMaker(settings, observations), masks=masks)
+    CheckedEnv(env, settings.id, observations, spec.num_actions).close()
     return spec
 
 
@@ -232,11 +256,11 @@ def _one_line(space: object) -> str:
     return " ".join(str(space).split())
 
 
-def _spec_of(settings: EnvSettings, actions: Discrete, frame: FrameMaker) -> EnvSpec:
+def _spec_of(settings: EnvSettings, actions: Discrete, frame: FrameMaker, *, masks: bool) -> EnvSpec:
     for what, most, limit in (
         ("actions", int(actions.n), MAX_ACTIONS),
         ("values on a side", max(frame.shape), MAX_SIDE),
     ):
         if most > limit:
             raise UsageError(f"env.id: {settings.id!r} has {most:,} {what}; allowed: at most {limit:,}")
-    return EnvSpec(settings.id, frame.shape, frame.dtype, settings.stack, int(actions.n))
+    return EnvSpec(settings.id, frame.shape, frame.dtype, settings.stack, int(actions.n), masks)

@@ -37,6 +37,8 @@ class Buffer:
         reuse: int32 [n], how often each had been drawn.
         param_version: int64 [n], updates behind the parameters that chose each action.
         priority: float64 [n]; None if neither eviction nor sampling goes by priorities.
+        mask, next_mask: bool [n, actions], the actions allowed at each observation and at the next one; None for an
+            environment without action masks.
         episode: int64 [n], numbers of episodes in order of their first transition; None unless a policy uses them.
     """
 
@@ -54,6 +56,8 @@ class Buffer:
     param_version: NDArray[np.int64]
     priority: NDArray[np.float64] | None = None
     episode: NDArray[np.int64] | None = None
+    mask: NDArray[np.bool_] | None = None
+    next_mask: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.actions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -75,7 +76,8 @@ def evaluate(
     """Play full episodes by a policy in its own environment, or in another one.
 
     Args:
-        policy: of `SavedRun.policy`, or any function of a batch of stacked observations that gives an action for each.
+        policy: of `SavedRun.policy`, or any function of a batch of stacked observations that gives an action for each;
+            in an environment with action masks it is called with those, bool [batch, actions], as well.
         env: an environment's id; or settings that replace those of the policy's environment, as a table
             ({"kwargs": {"side": 12}}).
         seed: of the emulators and the random actions.
@@ -172,5 +174,17 @@ def _returns(
     policy: Acting, settings: EnvSettings, episodes: int, seed: int, epsilon: float, at_once: int
 ) -> list[float]:
     with closing(make_vector_env(settings, min(episodes, at_once), seed, bounded=True)) as env:
+        if env.spec.masks:
+            _check_takes_masks(policy, settings)
         act = exploring(policy, epsilon, env.spec, np.random.default_rng(seed))
         return play(env, act, episodes)
+
+
+def _check_takes_masks(policy: Acting, settings: EnvSettings) -> None:
+    """Raise UsageError for a function that can't be called with observations and masks."""
+    try:
+        inspect.signature(policy).bind(None, None)
+    except TypeError:
+        raise UsageError(f"policy: must take observations and action masks, which {settings.id!r} has") from None
+    except ValueError:  # a function without a signature; what it says to its arguments is told as it is played
+        return

@@ -46,7 +46,7 @@ class Film:
             obs = self._env.reset()
             while not self.over:
                 yield _enlarged(self._env.picture())
-                steps = self._env.step(chosen(self._act, obs, self._env.spec))
+                steps = self._env.step(chosen(self._act, obs, self._env.spec, self._env.mask))
                 obs, self.over = steps.obs, bool(steps.episode_over[0])
                 self.steps += 1
                 self.episode_return += float(steps.raw_rewards[0])
