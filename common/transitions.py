@@ -63,7 +63,17 @@ FRAME_INDICES = Column(None, kept=False)
 MASK = Column((0, 1), of_actions=True)
 
 
-class Transitions(Struct, frozen=True, kw_only=True):
+class Masked(Struct, frozen=True, kw_only=True):
+    """Action masks of n transitions; None unless `EnvSpec.masks`.
+
+    mask, next_mask: bool [n, actions], the actions allowed at obs and at next_obs.
+    """
+
+    mask: Annotated[NDArray[np.bool_] | None, MASK] = None
+    next_mask: Annotated[NDArray[np.bool_] | None, MASK] = None
+
+
+class Transitions(Masked, frozen=True):
     """What segments and batches say of each of n transitions.
 
     frames: <frame_dtype>[n_frames, *frame_shape], each frame once.
@@ -71,7 +81,6 @@ class Transitions(Struct, frozen=True, kw_only=True):
     actions: int32 [n]. rewards: float32 [n], n-step returns. terminated: bool [n].
     param_version: int64 [n], the version of the parameters that chose each action.
     span: uint8 [n], environment steps from obs to next_obs.
-    mask, next_mask: bool [n, actions], the actions allowed at obs and at next_obs; None unless `EnvSpec.masks`.
     """
 
     frames: Array
@@ -82,8 +91,6 @@ class Transitions(Struct, frozen=True, kw_only=True):
     terminated: Annotated[NDArray[np.bool_], Column((0, 1))]
     param_version: Annotated[NDArray[np.int64], Column((0, MAX_UPDATES))]
     span: Annotated[NDArray[np.uint8], Column((1, MAX_N_STEP), usual=1)]
-    mask: Annotated[NDArray[np.bool_] | None, MASK] = None
-    next_mask: Annotated[NDArray[np.bool_] | None, MASK] = None
 
     def __len__(self) -> int:
         return len(self.actions)
