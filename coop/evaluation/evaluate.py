@@ -144,10 +144,13 @@ def evaluate_checkpoint(
     return (one(network, epsilon) for network in chosen for epsilon in epsilons)
 
 
-def film_checkpoint(run_dir: Path, video: Path, seed: int, networks: Sequence[NetworkChoice]) -> str:
-    """Film an episode of greedy play by a run's newest checkpoint; return a line that describes it.
+def film_checkpoint(
+    run_dir: Path, video: Path, seed: int, networks: Sequence[NetworkChoice], epsilon: float = 0.0
+) -> str:
+    """Film an episode of play by a run's newest checkpoint, as far as a film goes; return a line that describes it.
 
     seed: as of `evaluate_checkpoint`. networks: the one to play; if there are several, the acting network plays.
+    epsilon: probability of a random action.
 
     Raises:
         UsageError: the folder holds no run, or no checkpoint; or its environment can't be filmed, or not so.
@@ -157,12 +160,16 @@ def film_checkpoint(run_dir: Path, video: Path, seed: int, networks: Sequence[Ne
     run = SavedRun(run_dir)
     checkpoint = run.checkpoint()
     network: NetworkChoice = networks[0] if len(networks) == 1 else checkpoint.acting + 1  # type: ignore[assignment]
-    film = Film(run.policy(network), run.config.env, _derived(run, seed))
+    policy, derived = run.policy(network), _derived(run, seed)
+    act = exploring(policy, epsilon, policy.spec, np.random.default_rng(derived))
+    film = Film(act, run.config.env, derived)
     try:
         write_video(film, video)
     except OSError as error:
         raise RunError(f"{video}: {error.strerror or error}") from error
-    return f"{video}: network {network}, return {exact(film.episode_return)} in {film.steps:,} steps"
+    played = f"network {network}{f', epsilon {epsilon:g}' if epsilon else ''}"
+    end = "" if film.over else ", where the film ends; the episode does not"
+    return f"{video}: {played}, return {exact(film.episode_return)} in {film.steps:,} steps{end}"
 
 
 def _derived(run: SavedRun, seed: int) -> int:
