@@ -13,11 +13,11 @@ from typing import Any
 import pydantic
 import tomli_w
 
-from coop.common.errors import RunError, UsageError, not_among
+from coop.common.errors import ALSO_CALLED, RunError, UsageError, closest, not_among, refusal
 from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
-from coop.common.settings.overrides import merged, of_method
+from coop.common.settings.overrides import leaves, merged, of_method
 from coop.common.settings.rules import check_rules, fitted
 
 _ADAPTER = pydantic.TypeAdapter(RunConfig)
@@ -237,13 +237,19 @@ def first_problem(
     name = (prefix + ".".join(str(part) for part in first["loc"])).removesuffix(".")
     if first["type"] == "unexpected_keyword_argument":
         text = _no_such_field(name, first["input"], _siblings(first["loc"], example))
+    elif first["type"] == "tuple_type":
+        text = f"{name} = {first['input']!r}: must be a list, such as [64, 64]"
     else:
         text = f"{name} = {first['input']!r}: {first['msg'][0].lower()}{first['msg'][1:]}"
     return f"{text} (and {len(rest)} more)" if rest else text
 
 
 def _no_such_field(name: str, value: object, allowed: Sequence[str]) -> str:
-    return f"{name} = {value!r}: {not_among(allowed, name.rpartition('.')[2], 'no such field')}"
+    last = name.rpartition(".")[2]
+    elsewhere = (".".join(path) for path, _ in leaves(asdict(RunConfig())) if path[-1] == last)
+    near = ALSO_CALLED.get(last) or next(elsewhere, None)
+    text = refusal("no such field", near or closest(last, allowed), f"allowed: {', '.join(allowed)}")
+    return f"{name} = {value!r}: {text}"
 
 
 def _siblings(path: tuple[int | str, ...], example: Any) -> list[str]:  # noqa: ANN401
