@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -18,6 +19,7 @@ from coop.common.envs.observations import FrameMaker
 from coop.common.envs.pictures import coloured
 from coop.common.envs.protocol import Steps
 from coop.common.envs.registry import find_registered
+from coop.common.envs.vectors import Row, make_rows
 from coop.common.errors import UsageError
 from coop.common.process.output import warn_once
 from coop.common.settings.environment import EnvSettings
@@ -37,7 +39,8 @@ class GymnasiumEnv:
         self, settings: EnvSettings, seeds: list[int], render_mode: str | None = None, *, bounded: bool = False
     ) -> None:
         """bounded: see `make_vector_env`."""
-        envs, self._limit = _make(settings, len(seeds), render_mode)
+        envs, self._limit = _make(settings, seeds, render_mode)
+        self._rows = [env for env in envs if isinstance(env, Row)]
         observations, actions = _spaces(settings, envs[0])
         self._frame = FrameMaker(settings, observations)
         first = FirstReset(envs[0], seeds[0])
@@ -98,7 +101,10 @@ class GymnasiumEnv:
         terminal: list[int] = []
         over: list[int] = []
         # What Discrete.sample gives, numpy's integers, is what environments are written for.
-        for row, action in enumerate(self._actions.astype(self._action_dtype) + self._first_action):
+        actions = self._actions.astype(self._action_dtype) + self._first_action
+        for emulator, action in zip(self._rows, actions, strict=False):
+            emulator.chosen = action
+        for row, action in enumerate(actions):
             frame, reward, terminated, truncated = self._envs[row].step(action)
             self._put(next_obs, row, frame)
             rewards.append(reward)
@@ -172,7 +178,7 @@ class FilmedGymnasium(GymnasiumEnv):
 
     def __init__(self, settings: EnvSettings, seed: int) -> None:
         """Raise UsageError for an environment that has no pictures, or lacks a package for them."""
-        (env,), _ = _make(settings, 1)
+        (env,), _ = _make(settings, [0])
         observations, actions = _spaces(settings, env)
         metadata, vectors = env.metadata or {}, len(FrameMaker(settings, observations).shape) == 1
         CheckedEnv(env, settings.id, observations, int(actions.n)).close()
@@ -202,7 +208,7 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
     Raises:
         UsageError: the id is unknown, or a space or setting is not supported.
     """
-    (env,), _ = _make(settings, 1)
+    (env,), _ = _make(settings, [0])
     observations, actions = _spaces(settings, env)
     masks = FirstReset(env, 0).masks
     spec = _spec_of(settings, actions, FrameMaker(settings, observations), masks=masks)
@@ -211,26 +217,38 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
 
 
 def _make(
-    settings: EnvSettings, count: int, render_mode: str | None = None
-) -> tuple[list[gymnasium.Env[Any, Any]], int]:
-    """Make environments without gymnasium's checks and step limit; return them and that limit (0: none)."""
+    settings: EnvSettings, seeds: list[int], render_mode: str | None = None
+) -> tuple[Sequence[gymnasium.Env[Any, Any]], int]:
+    """Make an environment for each seed, without gymnasium's checks and step limit; return them and that limit.
+
+    The limit is 0 if there is none, or if vector environments of one's own see to it themselves.
+    """
     registered = find_registered(settings)
+    mode, limit = settings.vectorization_mode, settings.max_episode_steps or registered.max_episode_steps or 0
+    if mode is None and registered.entry_point is None and registered.vector_entry_point is not None:
+        mode = "vector_entry_point"
+    keeps_limit = mode == "vector_entry_point"
     # By the specification and not by the id, because `make` warns about ids that have a newer version.
     plain = dataclasses.replace(
         registered,
         order_enforce=False,
         disable_env_checker=True,
-        max_episode_steps=None,
+        max_episode_steps=limit or None if keeps_limit else None,
         kwargs={**registered.kwargs, **settings.kwargs, **({"render_mode": render_mode} if render_mode else {})},
     )
     try:
-        envs = [gymnasium.make(plain) for _ in range(count)]
+        if mode is None:
+            envs: Sequence[gymnasium.Env[Any, Any]] = [gymnasium.make(plain) for _ in seeds]
+        else:
+            envs = make_rows(f"env.id: {settings.id!r}", plain, mode, seeds)
+    except UsageError:
+        raise
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"env.id: {settings.id!r} needs a package that is not installed: {error}") from None
     except BaseException as error:
         text = f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {raised(error)}"
         raise UsageError(text) from error
-    return envs, settings.max_episode_steps or registered.max_episode_steps or 0
+    return envs, 0 if keeps_limit else limit
 
 
 def _spaces(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> tuple[Box, Discrete]:
