@@ -57,7 +57,7 @@ class Player:
         env_step: environment steps of the whole run so far, for epsilon. version: of the acting parameters.
         """
         epsilon = self._epsilon(env_step)
-        self._play(self._policy.act(self._obs, epsilon), epsilon, version)
+        self._play(self._policy.act(self._obs, epsilon, self._env.mask), epsilon, version)
 
     def replay(self, actions: NDArray[np.int32]) -> Turn:
         """Play recorded actions, int32 [envs], to bring emulators back to an earlier state."""
@@ -85,7 +85,8 @@ class Player:
     def _end(self, stream: int, steps: Steps, epsilon: float, version: int) -> EpisodeEnd:
         """Build a stream's episode record and reset its counters; the segment assembler sets `step_in_segment`."""
         # Diverged networks give non-finite values, which segments must not contain; the learner ends such a run.
-        q1_mean, q2_mean = np.nan_to_num(self._policy.mean_values(steps.next_obs[stream])).tolist()
+        mask = None if steps.next_mask is None else steps.next_mask[stream]
+        q1_mean, q2_mean = np.nan_to_num(self._policy.mean_values(steps.next_obs[stream], mask)).tolist()
         episode_return, length = float(self._returns[stream]), int(self._lengths[stream])
         self._returns[stream], self._lengths[stream] = 0.0, 0
         return EpisodeEnd(0, episode_return, length, epsilon, q1_mean, q2_mean, version)

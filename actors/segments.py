@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from coop.actors.frame_block import FrameBlock
 from coop.actors.returns import n_step_returns
 from coop.common.envs.protocol import Steps
-from coop.common.transitions import Segment
+from coop.common.transitions import MASKS, Segment
 from coop.common.types import Array, EnvSpec, EpisodeEnd
 
 
@@ -48,6 +49,7 @@ class SegmentAssembler:
         self._terminated = np.zeros(shape, np.bool_)
         self._ends = np.ones(shape, np.bool_)  # no transition waits before the first step
         self._versions = np.zeros(shape[0], np.int64)
+        self._masks = [np.zeros((*shape, spec.num_actions), np.bool_) for _ in MASKS] if spec.masks else []
         self._before = np.arange(-1, shape[0] - 1)  # the step before each row's
         self._episodes: dict[int, list[EpisodeEnd]] = {}
         self._waiting = [0] * num_envs  # number of each stream's earlier steps whose transitions are not complete
@@ -81,6 +83,8 @@ class SegmentAssembler:
         self._terminated[now] = steps.terminated
         np.logical_or(steps.terminated, steps.restarted, out=self._ends[now])
         self._versions[now] = param_version
+        for column, mask in zip(self._masks, (steps.mask, steps.next_mask), strict=False):
+            column[now] = mask
         for stream, end in episode_ends.items():
             place = self._waiting[stream] + self._steps
             self._episodes.setdefault(stream, []).append(msgspec.structs.replace(end, step_in_segment=place))
@@ -102,6 +106,10 @@ class SegmentAssembler:
             first = history - self._waiting[stream]
             if first < stop:
                 final = last[first:stop, stream]
+                masks: dict[str, Any] = {}
+                if self._masks:
+                    mask, next_mask = (column[:, stream] for column in self._masks)
+                    masks = {"mask": mask[first:stop].copy(), "next_mask": next_mask.take(final, axis=0)}
                 segments.append(
                     Segment(
                         incarnation=self._incarnation,
@@ -117,6 +125,7 @@ class SegmentAssembler:
                         span=(final - self._before[first:stop]).astype(np.uint8),
                         carried=self._carried[stream],
                         episodes=tuple(self._episodes.get(stream, ())),
+                        **masks,
                     )
                 )
                 self._sequences[stream] += 1
@@ -124,6 +133,6 @@ class SegmentAssembler:
         self._waiting = waiting
         self._episodes = {}
         if history:
-            for column in (self._actions, self._rewards, self._terminated, self._ends, self._versions):
+            for column in (self._actions, self._rewards, self._terminated, self._ends, self._versions, *self._masks):
                 column[:history] = column[steps:end].copy()
         return segments

@@ -69,6 +69,19 @@ def first_line(error: BaseException | None) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
+ALSO_CALLED = {
+    "lr": "learner.learning_rate",
+    "discount": "learner.gamma",
+    "buffer_size": "replay.capacity",
+    "target_update_interval": "learner.target_update_every",
+    "n_envs": "actor.num_envs",
+    "timesteps": "total_steps",
+    "total_timesteps": "total_steps",
+    "n_steps": "replay.n_step",
+}
+"""Fields of a run by what other libraries call them."""
+
+
 def not_among(known: Sequence[str], name: str, problem: str = "unknown") -> str:
     """Why a name is refused that is none of the known ones: "unknown; did you mean fifo? allowed: fifo, reservoir"."""
     return refusal(problem, closest(name, known), f"allowed: {', '.join(known)}")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 RETURN_WINDOW = 100  # episodes
+SHORT_WINDOW = 20  # episodes: few enough to show what play has just reached
 METRICS_EVERY = 200  # updates from one row of metrics to the next
 
 

@@ -6,6 +6,7 @@ table, and the estimates of memory follow from the declarations.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
@@ -40,12 +41,13 @@ class Column:
 
     limits: least and largest value, or what gives them for an environment and the arrays beside this one; None for
     indices of frames. kept: by the table, for each transition that it holds. usual: the value where nothing else is
-    known, see `filled`.
+    known, see `filled`. of_actions: a row has a value for each action; only environments with masks have such a column.
     """
 
     limits: Bounds | Callable[[EnvSpec, Mapping[str, Array]], Bounds] | None
     kept: bool = True
     usual: int = 0
+    of_actions: bool = False
 
 
 def _actions(spec: EnvSpec, arrays: Mapping[str, Array]) -> Bounds:
@@ -58,9 +60,20 @@ def _summed_rewards(spec: EnvSpec, arrays: Mapping[str, Array]) -> Bounds:
 
 
 FRAME_INDICES = Column(None, kept=False)
+MASK = Column((0, 1), of_actions=True)
 
 
-class Transitions(Struct, frozen=True):
+class Masked(Struct, frozen=True, kw_only=True):
+    """Action masks of n transitions; None unless `EnvSpec.masks`.
+
+    mask, next_mask: bool [n, actions], the actions allowed at obs and at next_obs.
+    """
+
+    mask: Annotated[NDArray[np.bool_] | None, MASK] = None
+    next_mask: Annotated[NDArray[np.bool_] | None, MASK] = None
+
+
+class Transitions(Masked, frozen=True):
     """What segments and batches say of each of n transitions.
 
     frames: <frame_dtype>[n_frames, *frame_shape], each frame once.
@@ -121,15 +134,20 @@ class Batch(Transitions, frozen=True):
 
     def columns(self) -> dict[str, Array]:
         """All arrays except the frames, by name."""
-        return {name: getattr(self, name) for name in IN_BATCH}
+        return arrays_of(self, IN_BATCH)
 
 
 class Field(NamedTuple):
-    """A column with its dtype; stacked: a row has an index for each frame of a stack."""
+    """A column with its dtype."""
 
     dtype: np.dtype[Any]
-    stacked: bool
     column: Column
+
+    def row_shape(self, spec: EnvSpec) -> tuple[int, ...]:
+        """Of one transition's entry."""
+        if self.column.of_actions:
+            return (spec.num_actions,)
+        return (spec.stack,) if self.column is FRAME_INDICES else ()
 
     def bounds(self, spec: EnvSpec, arrays: Mapping[str, Array]) -> Bounds | None:
         """Least and largest value beside these arrays, of at least one row; None for indices of frames."""
@@ -143,43 +161,63 @@ def _fields(kind: type[Transitions]) -> dict[str, Field]:
         array, *extras = get_args(hint) or (hint,)
         for column in extras:
             if isinstance(column, Column):
-                fields[name] = Field(_dtype(array), column is FRAME_INDICES, column)
+                fields[name] = Field(_dtype(array), column)
     return fields
 
 
 def _dtype(hint: Any) -> np.dtype[Any]:  # noqa: ANN401
     """The dtype of NDArray[...]: an alias of its own from numpy 2.5 on, before that ndarray[..., dtype[...]]."""
-    while parts := get_args(hint):
+    while parts := [part for part in get_args(hint) if part is not type(None)]:
         hint = parts[-1]
     dtype: np.dtype[Any] = np.dtype(hint)
     return dtype
 
 
-IN_SEGMENT, IN_BATCH = _fields(Segment), _fields(Batch)
+MASKS = {name: field for name, field in _fields(Transitions).items() if field.column.of_actions}
+IN_SEGMENT, IN_BATCH = (
+    {name: field for name, field in _fields(kind).items() if name not in MASKS} for kind in (Segment, Batch)
+)
 FIELDS = {**IN_SEGMENT, **IN_BATCH}
 KEPT = {name: field for name, field in FIELDS.items() if field.column.kept}
 
 
-def row_bytes(fields: Mapping[str, Field], stack: int) -> int:
+def columns_of(fields: Mapping[str, Field], spec: EnvSpec) -> Mapping[str, Field]:
+    """These columns as this environment's transitions have them: with masks, if it has masks."""
+    return {**fields, **MASKS} if spec.masks else fields
+
+
+def arrays_of(transitions: Transitions, fields: Mapping[str, Field]) -> dict[str, Array]:
+    """The arrays in these columns, by name, and the masks if there are any."""
+    names = fields if transitions.mask is None else (*fields, *MASKS)
+    return {name: getattr(transitions, name) for name in names}
+
+
+def row_bytes(fields: Mapping[str, Field], spec: EnvSpec) -> int:
     """Bytes of one transition in all these columns."""
-    return sum(field.dtype.itemsize * (stack if field.stacked else 1) for field in fields.values())
+    found = columns_of(fields, spec).values()
+    return sum(field.dtype.itemsize * math.prod(field.row_shape(spec)) for field in found)
 
 
 def layout(fields: Mapping[str, Field], spec: EnvSpec, rows: str) -> dict[str, tuple[str, tuple[int | str, ...]]]:
     """Dtype and shape of the frames and of these columns; the words "frames" and `rows` stand for the lengths."""
     found: dict[str, tuple[str, tuple[int | str, ...]]] = {"frames": (spec.frame_dtype, ("frames", *spec.frame_shape))}
-    for name, field in fields.items():
-        found[name] = field.dtype.name, (rows, spec.stack) if field.stacked else (rows,)
+    for name, field in columns_of(fields, spec).items():
+        found[name] = field.dtype.name, (rows, *field.row_shape(spec))
     return found
 
 
-def filled(fields: Mapping[str, Field], rows: int, given: Mapping[str, Array]) -> dict[str, Array]:
-    """These columns of so many transitions: the given ones, with their dtypes, and usual values in the others."""
+def filled(fields: Mapping[str, Field], rows: int, given: Mapping[str, Array | None]) -> dict[str, Array]:
+    """These columns of so many transitions: the given ones, with their dtypes, and usual values in the others.
+
+    Of masks only those that are given.
+    """
+    there = {name: array for name, array in given.items() if array is not None}
+    masks = {name: field for name, field in MASKS.items() if name in there}
     return {
-        name: given[name].astype(field.dtype, copy=False)
-        if name in given
+        name: there[name].astype(field.dtype, copy=False)
+        if name in there
         else np.full(rows, field.column.usual, field.dtype)
-        for name, field in fields.items()
+        for name, field in {**fields, **masks}.items()
     }
 
 

@@ -23,7 +23,7 @@ from coop.common.bounds import (
 Array = NDArray[Any]
 
 
-class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
+class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """The properties of an environment that networks and tables need.
 
     frame_shape: shape of one stored frame: a vector, e.g. (4,) on CartPole, or a picture, (height, width) or (height,
@@ -31,6 +31,7 @@ class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
     frame_dtype: "uint8", "bool" or "float32".
     stack: frames in one observation (1: the frame is the observation).
     num_actions: size of the Discrete action space.
+    masks: the environment says in each state which actions are allowed.
     """
 
     env_id: Name
@@ -38,6 +39,7 @@ class EnvSpec(Struct, frozen=True, forbid_unknown_fields=True):
     frame_dtype: Annotated[str, Meta(pattern="^(uint8|bool|float32)$")]
     stack: Annotated[int, Meta(ge=1, le=MAX_STACK)]
     num_actions: Annotated[int, Meta(ge=1, le=MAX_ACTIONS)]
+    masks: bool = False
 
     @property
     def obs_shape(self) -> tuple[int, ...]:

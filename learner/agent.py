@@ -26,6 +26,7 @@ from torch import Tensor
 
 from coop.common.errors import UsageError, first_line
 from coop.common.networks.devices import usable_device
+from coop.common.networks.masks import allowed
 from coop.common.networks.network import FlatNetwork
 from coop.common.numbers import generator_state, set_generator_state
 from coop.common.process.output import warn
@@ -35,7 +36,7 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.transitions import Batch
 from coop.common.types import Array, EnvSpec
-from coop.learner.edl.arrays import chosen, convert_like
+from coop.learner.edl.arrays import chosen, convert_like, namespace
 from coop.learner.edl.branches import Branches
 from coop.learner.given import Given
 from coop.learner.losses import LOSSES, Values, output_error, td_errors
@@ -136,7 +137,8 @@ class Agent:
         """
         # (roles of the networks)
         online, target, settings = self._networks[acting], self._networks[1 - acting], self.config.learner
-        inputs, size = online.inputs(given.frames, given.index), len(given.columns.actions)
+        held = given.columns
+        inputs, size = online.inputs(given.frames, given.index), len(held.actions)
         first = None
         for _ in range(self.rule.passes):
             branches = Branches(inputs)
@@ -145,20 +147,23 @@ class Agent:
             tape = online.forward(inputs if settings.double else inputs[:size])
             values = as_float32(tape.output)
             branches.join()
+            next_values = allowed(next_values, held.next_mask)
+            q, q_next = allowed(values[:size], held.mask), next_values
+            if settings.double:
+                q_next = allowed(values[size:], held.next_mask)
             step = None
             if self.rule.hooks:
                 step = self._step(acting, given, batch, inputs)
-                step.know(q=values[:size], target_q_next=next_values)
+                step.know(q=q, target_q_next=next_values)
                 if settings.double:
-                    step.know(q_next=values[size:])
+                    step.know(q_next=q_next)
             if step is not None and "targets" in self.rule.hooks:
-                errors = self._own_errors(step, given, values[:size])
+                errors = self._own_errors(step, given, q)
             else:
-                bootstrap = self._bootstrap(next_values, values[size:] if settings.double else next_values)
-                errors = td_errors(given.columns, values[:size], bootstrap, settings.value_bound)
-            error = output_error(given.columns, self.loss.slope(errors), next_values)
+                errors = td_errors(held, q, self._bootstrap(next_values, q_next), settings.value_bound)
+            error = output_error(held, self.loss.slope(errors), next_values)
             if step is not None and self.rule.hooks & AUTOGRAD:
-                error = self._own_error(step, given, errors, error, values[:size])
+                error = self._own_error(step, given, errors, error, q)
             online.backward(tape.head(size), error, given.s)
             if step is not None:
                 self.rule.add_gradient(step)
@@ -195,7 +200,8 @@ class Agent:
             error = convert_like(slope_of(self.rule.loss, step, values), values)
         if "extra_cost" in hooks:
             error = error + convert_like(slope_of(self.rule.extra_cost, step, values), values)
-        return error
+        mask = given.columns.mask
+        return error if mask is None else namespace(error).where(mask, error, 0.0)
 
     def own_td_errors(self, batch: Batch) -> Values | None:
         """The TD errors of a batch by the rule's own targets, float32 [batch]; None if it has none of its own."""

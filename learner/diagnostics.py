@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from coop.common.networks.forward import preprocess
+from coop.common.networks.masks import allowed
 from coop.common.transitions import Batch
 from coop.learner.losses import columns, td_errors
 from coop.learner.protocol import AnyAgent
@@ -64,18 +65,19 @@ class Diagnostics:
         before = generator.state
         errors = agent.own_td_errors(archive)
         if errors is None:
-            bootstrap = agent.rule.bootstrap(next_values, preferred)
+            mask = archive.next_mask
+            bootstrap = agent.rule.bootstrap(allowed(next_values, mask), allowed(preferred, mask))
             held = columns(archive, settings.gamma)
             errors = td_errors(held, q[acting, :size], bootstrap, settings.value_bound)
         generator.state = before
-        q = q[:, :size]
+        q, among = q[:, :size], True if archive.mask is None else archive.mask
         return {
-            "q_gap": float(np.linalg.norm(q[0] - q[1], axis=1).mean()),
-            "q1_mean": float(q[0].mean()),
-            "q2_mean": float(q[1].mean()),
-            "q_abs_mean": float(np.abs(q).mean()),
+            "q_gap": float(np.linalg.norm((q[0] - q[1]) * among, axis=1).mean()),
+            "q1_mean": float(q[0].mean(where=among)),
+            "q2_mean": float(q[1].mean(where=among)),
+            "q_abs_mean": float(np.abs(q).mean(where=among)),
             "archive_td_error": float(np.abs(errors).mean()),
-            **self._changes(q if agent.config.two_networks else q[:1]),
+            **self._changes(q if agent.config.two_networks else q[:1], archive.mask),
             **_plasticity([layer.float() if layer.is_cuda else on_host(layer) for layer in hidden]),
         }
 
@@ -93,15 +95,22 @@ class Diagnostics:
         self.archive = Batch(**{name: tensor.numpy() for name, tensor in arrays.items()}) if arrays else None
         self._before = None if before is None else before.numpy()
 
-    def _changes(self, q: NDArray[np.float32]) -> dict[str, float]:
+    def _changes(self, q: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> dict[str, float]:
         before, self._before = self._before, q
         if before is None:
             return {}
         now = q[:, : before.shape[1]]  # the archive may have been filled since
+        mask = None if mask is None else mask[: before.shape[1]]
+        among = True if mask is None else mask
         return {
-            "archive_drift": float(np.abs(now - before).mean()),
-            "policy_churn": float((now.argmax(2) != before.argmax(2)).mean()),
+            "archive_drift": float(np.abs(now - before).mean(where=among)),
+            "policy_churn": float((_best(now, mask) != _best(before, mask)).mean()),
         }
+
+
+def _best(q: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDArray[np.intp]:
+    """The best allowed actions, int [networks, states], of Q [networks, states, actions]."""
+    return np.stack([allowed(values, mask).argmax(1) for values in q])
 
 
 def hidden_layers(module: nn.Module, x: Tensor) -> list[Tensor]:

@@ -34,7 +34,7 @@ class Given(NamedTuple):
         # Copies, because arrays from the wire are read-only and PyTorch warns about views of those.
         if not isinstance(frames, torch.Tensor):
             frames = torch.tensor(frames, device=device)
-        places, *parts = (torch.tensor(array, device=device) for array in (index, *held))
+        places, *parts = (None if array is None else torch.tensor(array, device=device) for array in (index, *held))
         return cls(frames, places, BatchColumns(*parts), s, rate)
 
 

@@ -72,18 +72,23 @@ class BatchColumns(NamedTuple, Generic[ArrayT]):
 
     actions: int64 [batch]. rewards: float32 [batch]. discounts: float32 [batch], gamma^k of the k steps that a
     transition spans, 0 for a terminal next state. weights: float32 [batch], of importance sampling.
+    mask, next_mask: bool [batch, actions], the actions allowed at obs and at next_obs, or None.
     """
 
     actions: ArrayT
     rewards: ArrayT
     discounts: ArrayT
     weights: ArrayT
+    mask: ArrayT | None = None
+    next_mask: ArrayT | None = None
 
 
 def columns(batch: Batch, gamma: float) -> BatchColumns[NDArray[Any]]:
     """The columns of a batch, in numpy."""
     discounts = _powers(gamma)[batch.span] * ~batch.terminated
-    return BatchColumns(batch.actions.astype(np.int64), batch.rewards, discounts, batch.weights)
+    return BatchColumns(
+        batch.actions.astype(np.int64), batch.rewards, discounts, batch.weights, batch.mask, batch.next_mask
+    )
 
 
 def td_errors(

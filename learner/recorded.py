@@ -20,7 +20,7 @@ from torch import Tensor
 from coop.common.errors import first_line
 from coop.common.process.output import warn
 from coop.common.settings.config import RunConfig
-from coop.common.transitions import Batch
+from coop.common.transitions import MASKS, Batch
 from coop.common.types import EnvSpec
 from coop.learner.edl.branches import branching
 from coop.learner.given import Given, indices
@@ -214,7 +214,7 @@ class Feed:
         lanes = _LANES if frames is None else _SMALL_LANES
         self._lanes = deque(_Lane(self._layout, self._place, self._copies) for _ in range(lanes))
         views = self._layout.views(self._place)
-        held = BatchColumns(*(views[name] for name in BatchColumns._fields))
+        held = BatchColumns(**{name: views[name] for name in BatchColumns._fields if name in views})
         self._with_frames = frames is None
         self.given = Given(
             views["frames"] if frames is None else frames,
@@ -227,7 +227,8 @@ class Feed:
         self._lanes.rotate(-1)
         lane.await_copied()
         for name, values in zip(BatchColumns._fields, held, strict=True):
-            lane.arrays[name][...] = values
+            if values is not None:
+                lane.arrays[name][...] = values
         lane.arrays["index"][...] = indices(batch)
         lane.arrays["s"][...] = s
         lane.arrays["rate"][...] = rate
@@ -290,6 +291,8 @@ class _Layout:
             "rate": (torch.float32, (1,)),
             "index": (torch.int32, (rows,)),
         }
+        if spec.masks:
+            self._parts |= dict.fromkeys(MASKS, (torch.bool, (size, spec.num_actions)))
         if with_frames:
             self._parts["frames"] = (getattr(torch, spec.frame_dtype), (rows, *spec.frame_shape))
         self.offsets: dict[str, int] = {}

@@ -193,6 +193,10 @@ def test_one_of_several_emulators_is_named() -> None:
         (odd("", shape=[4, 0, 3]), "there are no values in it"),
         (EnvSettings(id="ALE/Breakout-v9"), "unknown environment .*ALE's ids have version 5: ALE/Breakout-v5"),
         (EnvSettings(id="ALE/Pong-v4"), "ALE/Pong-v5"),
+        (
+            odd("", dtype="uint8", shape=[3, 20, 24]),
+            r"'test/Odd-v0' has observations \[3, 20, 24\], pictures with .*\[20, 24, 3\], as .*TransformObservation",
+        ),
         (EnvSettings(id="BreakoutNoFrameskip-v4"), "ALE's game is 'breakout' here"),
         (EnvSettings(id="SpaceInvaders-v0"), "ALE's game is 'space_invaders' here"),
     ],
@@ -215,7 +219,6 @@ def test_the_interface_of_old_environments_is_named() -> None:
     ("settings", "words"),
     [
         (odd("", dtype="uint8", shape=[4, 4], most=1), "uint8 observations of only 0 and 1"),
-        (odd("", dtype="uint8", shape=[3, 20, 20]), "height 3, width 20 and 20 channels"),
         (EnvSettings(id="ALE/Breakout-v5"), "sticky actions"),
     ],
 )

@@ -223,6 +223,13 @@ def test_a_gif_of_a_run_s_network(
     assert re.match(rf"{video}: network 1, return -?1 in 6 steps\nrun ", text)
     with Image.open(video) as gif:
         assert (gif.n_frames, gif.size, gif.info["duration"]) == (6, (252, 252), 100)
+    greedy = video.read_bytes()
+    status, text = printed_by(
+        monkeypatch, capsys, tmp_path / "run", "--episodes", 1, "--networks", 1, "--epsilon", 1, "--video", video
+    )
+    assert status == 0
+    assert text.startswith(f"{video}: network 1, epsilon 1, return ")
+    assert video.read_bytes() != greedy, "from the same start"
 
 
 def test_a_gif_for_tensorboard_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,6 +241,54 @@ def test_a_gif_for_tensorboard_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     content = short_gif(Film(lambda obs: np.array([0]), EnvSettings(id="coop/Catch-v0"), 0))
     with Image.open(io.BytesIO(content)) as gif:
         assert gif.n_frames == 2, "half of what would be too large to send"
+
+
+class Endless(gymnasium.Env[Any, Any]):
+    """Pictures that move for ever."""
+
+    closed = False
+
+    def __init__(self) -> None:
+        self.observation_space = gymnasium.spaces.Box(0, 255, (20, 20), np.uint8)
+        self.action_space = gymnasium.spaces.Discrete(2)
+        self._count = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        return self._seen(), 1.0, False, False, {}
+
+    def _seen(self) -> NDArray[np.uint8]:
+        self._count += 1
+        return np.full((20, 20), 9 * self._count % 256, np.uint8)
+
+    def close(self) -> None:
+        Endless.closed = True
+
+
+@pytest.mark.parametrize(
+    ("bound", "value", "suffix", "pictures"),
+    [("MOST", 12, ".mp4", 12), ("MOST", 12, ".gif", 12), ("LONGEST_GIF", 8, ".gif", 8), ("LONGEST_S", 0.7, ".mp4", 7),
+     ("LONGEST_S", 0.7, ".gif", 7)],
+)  # fmt: skip
+def test_a_film_of_an_endless_episode_ends(
+    bound: str, value: float, suffix: str, pictures: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg") if suffix == ".mp4" else None
+    monkeypatch.setattr(f"coop.evaluation.film.{bound}", value)
+    spec = gymnasium.envs.registration.EnvSpec("tests/Endless-v0", entry_point=Endless)
+    monkeypatch.setitem(gymnasium.registry, "tests/Endless-v0", spec)
+    film, video = Film(lambda obs: np.array([0]), EnvSettings(id="tests/Endless-v0"), 0), tmp_path / f"x{suffix}"
+    Endless.closed = False
+    write_video(film, video)
+    if ffmpeg is None:
+        with Image.open(video) as gif:
+            written = gif.n_frames
+    else:
+        written, _ = ffmpeg.count_frames_and_secs(video)
+    assert (written, film.steps, film.over, Endless.closed) == (pictures, pictures, False, True)
 
 
 @pytest.mark.parametrize("name", ["coop/Catch-v0", "CartPole-v0"])

@@ -106,7 +106,7 @@ def test_the_card_and_the_parameters(tmp_path: Path) -> None:
         },
         "spec": {
             "env_id": "CartPole-v0", "frame_shape": [4], "frame_dtype": "float32", "stack": 1, "num_actions": 2,
-            "obs_shape": [4], "input_shape": [4],
+            "masks": False, "obs_shape": [4], "input_shape": [4],
         },
         "method": "coop",
         "seed": 0,

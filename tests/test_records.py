@@ -5,8 +5,10 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from matplotlib.axes import Axes
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from coop.common.numbers import exact, strict_json
@@ -14,6 +16,7 @@ from coop.common.process.lifecycle import Stop
 from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.run import LockstepRun
+from coop.records.curve import draw_curve
 from coop.records.resumption import Start
 from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
@@ -106,3 +109,19 @@ def test_tensorboard_is_cut_back_with_the_records(tmp_path: Path) -> None:
     assert [each.step for each in board.Histograms("replay/reuse")] == rows
     kept = [each.step for each in EventAccumulator(str(mine)).Reload().Scalars("charts/episodic_return")]
     assert kept == before[: len(kept)] != before, "nothing behind the checkpoint is left in the old file"
+
+
+def test_the_closing_curve_shows_what_play_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[str, list[float]] = {}
+    plot = Axes.plot
+
+    def noted(self: Axes, steps: Any, returns: Any, *style: Any, label: str, **others: Any) -> Any:
+        drawn[label] = list(returns)
+        return plot(self, steps, returns, *style, label=label, **others)
+
+    monkeypatch.setattr(Axes, "plot", noted)
+    returns = [0.0] * 100 + [80.0] * 20
+    path = draw_curve(range(120), returns, "a run", tmp_path / "x.png")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert drawn["episode"] == returns
+    assert drawn["mean of the last 20"][-20:] == [4.0 * count for count in range(1, 21)]

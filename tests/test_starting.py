@@ -13,6 +13,8 @@ from coop.common.errors import UsageError
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import load_tables, resolve, to_tables
 from coop.records.run_options import RunOptions, parse_run
+from coop.studies.sweep.cli import settings_of
+from coop.studies.sweep.folder import CellFolder
 from coop.studies.sweep.grid import parse_grid
 
 OWN = ("--env.id", "my_envs:Room-v0")
@@ -107,6 +109,23 @@ def test_grids_without_a_preset(tmp_path: Path) -> None:
     assert catch.actor.num_envs == 1, "lockstep cells play one emulator"
 
 
+def test_a_sweep_says_what_its_cells_share(tmp_path: Path) -> None:
+    def said(text: str) -> str:
+        grid = parse_grid(text, "g")
+        return settings_of(grid.file, [CellFolder(tmp_path, cell, "none") for cell in grid.cells])
+
+    assert said('methods = ["dqn"]\npreset = "catch"\nseeds = [0, 1]\n').startswith(
+        "settings: preset catch; method: dqn; gamma: 0.99; replay: capacity "
+    )
+    assert said(
+        'methods = ["dqn", "stream-q"]\n[fixed]\nenv.id = "CartPole-v1"\nreplay.eviction = "reservoir"\n'
+        "[vary]\nreplay.capacity = [500, 1000]\nlearner.gamma = [0.9, 0.99]\n"
+    ) == (
+        "settings: no preset: neutral; method: varying; gamma: varying; "
+        "replay: capacity varying, eviction reservoir, sampling uniform, ratio 1; network: mlp-128-128-128"
+    )
+
+
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
@@ -126,6 +145,25 @@ def test_what_others_would_write_gets_the_right_answer(
     with pytest.raises(UsageError) as caught:
         options(monkeypatch, *flags).run_config()
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"lr": 1e-3}, "lr = 0.001: no such field; did you mean learner.learning_rate? allowed: run, method"),
+        ({"gamma": 0.9}, "did you mean learner.gamma?"),
+        ({"learner": {"lr": 1e-3}}, "did you mean learner.learning_rate?"),
+        ({"replay": {"gamma": 0.9}}, "did you mean learner.gamma?"),
+        ({"replay": {"capacty": 9}}, "did you mean capacity?"),
+        ({"network": {"hidden": "64,64"}}, "network.hidden = '64,64': must be a list, such as [64, 64]"),
+        ({"method": "double-dqn"}, "did you mean dqn with learner.double = true"),
+    ],
+)
+def test_so_it_does_in_python_files_and_grids(tables: dict[str, Any], words: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError) as caught:
+        coop.train(run_dir=tmp_path / "a", **tables)
+    assert words in str(caught.value)
+    assert resolve({"total_steps": 1e6, "replay": {"capacity": 1e4}}).total_steps == 1_000_000
 
 
 @pytest.mark.parametrize("hidden", [["64,32"], ["64", "32"], ["=64,32"]])

@@ -215,6 +215,7 @@ def test_interrupted_killed_and_started_again(tmp_path: Path) -> None:
     before = summaries(folder)["dqn-seed=0"]
     done = sweep(*flags)
     assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("settings: preset cartpole; method: varying; gamma: 0.95; replay: capacity 300, ")
     assert "2 cells in" in done.stdout
     assert "1 of them finished before" in done.stdout
     assert summaries(folder)["dqn-seed=0"] == before

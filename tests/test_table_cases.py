@@ -12,7 +12,7 @@ from table_reference import Copies, Stream, check_references, make_spec, table_s
 
 from coop.common.errors import UsageError
 from coop.common.settings.capacity import estimated_bytes
-from coop.common.transitions import Batch, Segment
+from coop.common.transitions import Segment
 from coop.common.types import EnvSpec
 from coop.replay.table import streams
 from coop.replay.table.table import Table, _reuse_histogram
@@ -274,7 +274,7 @@ def test_types_of_a_batch() -> None:
     table = Table(make_spec(1), 10, rng=np.random.default_rng(0))
     table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(4))
     batch = table.sample(3)
-    types = {name: getattr(batch, name).dtype.name for name in Batch.__struct_fields__}
+    types = {name: array.dtype.name for name, array in {"frames": batch.frames, **batch.columns()}.items()}
     assert types == {
         **{"frames": "float32", "obs_index": "int32", "next_index": "int32", "actions": "int32", "rewards": "float32"},
         **{"terminated": "bool", "span": "uint8", "weights": "float32", "ids": "int64", "param_version": "int64"},

@@ -34,6 +34,7 @@ class AtariEnv:
     def __init__(self, settings: EnvSettings, game: str, seeds: list[int]) -> None:
         self.spec = atari_spec(settings, game)
         self.num_envs = len(seeds)
+        self.mask: NDArray[np.bool_] | None = None
         self._seeds = np.array(seeds)
         self._clip = settings.clip_rewards
         self._limit_terminal = settings.time_limit_terminal

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -24,6 +24,8 @@ _STEP = "gymnasium's step gives (observation, reward, terminated, truncated, inf
 _RESET = "gymnasium's reset takes seed and options, and gives (observation, info)"
 _BOUND = f"allowed: finite, from -{MAX_MAGNITUDE:,.0f} to {MAX_MAGNITUDE:,.0f}"
 MOST_FLAGS = 100  # observations with no other values than 0 and 1, and some of each, after which there is a warning
+
+MASK = "action_mask"  # in the info of resets and steps, as gymnasium's own environments give it
 
 T = TypeVar("T")
 
@@ -85,6 +87,85 @@ class ObservationCheck:
         return Unfit(f"gives observations {found.dtype}{list(found.shape)}", self._says)
 
 
+class MaskCheck:
+    """Reads the masks of one environment: those of its method `action_masks()`, or `info["action_mask"]` without one.
+
+    mask: bool [actions], the newest one; None if there are none.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], actions: int, *, masks: bool) -> None:
+        """masks: whether it gives masks (`FirstReset`)."""
+        self._actions, self._masks = actions, masks
+        self._method = mask_method(env) if masks else None
+        self._given = f'info["{MASK}"]' if self._method is None else "action_masks()"
+        self._says = f"allowed: bool or int8[{actions}], 1 for each allowed action and 0 for the others"
+        self.mask: NDArray[np.bool_] | None = None
+
+    def __call__(self, info: Any, *, terminal: bool) -> None:  # noqa: ANN401 (whatever there is)
+        """Read the mask of a state, with the info that came with it; raises Unfit.
+
+        terminal: nothing follows, so a mask that allows nothing is as good as one that allows all.
+        """
+        if not self._masks:
+            if isinstance(info, Mapping) and MASK in info:
+                raise Unfit(f'gives info["{MASK}"]', "allowed: in each state, the first one included, or in none")
+            return
+        if self._method is not None:
+            given = self._method()
+        elif not isinstance(info, Mapping) or (given := info.get(MASK)) is None:
+            raise Unfit(f'gives no info["{MASK}"]', "allowed: in each state, the first one included, or in none")
+        found = _as_array(given, "action mask")
+        flags = found.dtype == np.bool_ or (found.dtype.kind in "iu" and not (found & ~1).any())
+        if found.shape != (self._actions,) or not flags:
+            values = (
+                f"with values to {found.max()} " if found.shape == (self._actions,) and found.dtype.kind in "iu" else ""
+            )
+            raise Unfit(f"gives the action mask {found.dtype}{list(found.shape)} {values}by {self._given}", self._says)
+        mask = found.astype(np.bool_)  # a copy: the environment may write to its own
+        if not mask.any():
+            if not terminal:
+                raise Unfit(f"gives an action mask that allows no action by {self._given}", self._says)
+            mask[:] = True
+        self.mask = mask
+
+
+def mask_method(env: gymnasium.Env[Any, Any]) -> Callable[[], Any] | None:
+    """The method `action_masks` of an environment or of one of its wrappers, as sb3-contrib has it; or None."""
+    method = env.get_wrapper_attr("action_masks") if env.has_wrapper_attr("action_masks") else None
+    return method if callable(method) else None
+
+
+class FirstReset:
+    """The first reset of an environment, done ahead of play because it may show whether there are action masks.
+
+    Networks and tables, which need to know it, are made before play begins.
+
+    masks: whether the environment gives masks, by its method or in the info of this reset.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
+        self._env = env
+        self._seed: int | None = seed
+        self._given: Any = None
+        self._error: BaseException | None = None
+        self.masks = False
+        try:
+            self._given = env.reset(seed=seed)
+            self.masks = mask_method(env) is not None or MASK in self._given[1]
+        except BaseException as error:
+            raised(error)
+            self._error = error
+
+    def reset(self, *, seed: int | None) -> Any:  # noqa: ANN401 (whatever there is)
+        """What that reset gave, or the exception that it raised; another reset where this was taken already."""
+        if seed is None or seed != self._seed:
+            return self._env.reset(seed=seed)
+        self._seed = None
+        if self._given is None and self._error is not None:
+            raise self._error
+        return self._given
+
+
 class CheckedEnv:
     """An environment that gives what gymnasium's interface and its own space promise, or fails in words.
 
@@ -92,29 +173,46 @@ class CheckedEnv:
     line, with the environment's id and the step.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], env_id: str, space: Box, emulator: int | None = None) -> None:
-        """emulator: its number, if there are others."""
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        env_id: str,
+        space: Box,
+        actions: int,
+        *,
+        masks: bool = False,
+        first: FirstReset | None = None,
+        emulator: int | None = None,
+    ) -> None:
+        """actions: how many. masks: whether it gives masks. emulator: its number, if there are others.
+
+        first: its first reset, where that is done already.
+        """
         self._env, self._name = env, f"env.id: {env_id!r}"
         self._of = "" if emulator is None else f" of emulator {emulator}"
         self._observation = ObservationCheck(self._name, space)
+        self._masks = MaskCheck(env, actions, masks=masks)
+        self._reset = env.reset if first is None else first.reset
         self._steps = 0
+
+    @property
+    def mask(self) -> NDArray[np.bool_] | None:
+        """The actions allowed now, bool [actions]; None in an environment without masks."""
+        return self._masks.mask
 
     def reset(self, seed: int | None = None) -> Array:
         """Begin an episode; return its first observation. With a seed, steps are counted anew."""
         if seed is not None:
             self._steps = 0
         try:
-            given = self._env.reset(seed=seed)
+            given = self._reset(seed=seed)
         except BaseException as error:
             if isinstance(error, TypeError) and "argument 'seed'" in str(error):
                 self._refuse(f"raised {raised(error)}", _RESET, reset=True)
             self._failed(error, reset=True)
         if not isinstance(given, tuple) or len(given) != 2:
             self._refuse(f"gives {_shown(given)}", _RESET, reset=True)
-        try:
-            return self._observation(given[0])
-        except Unfit as problem:
-            self._refuse(problem.what, problem.why, reset=True)
+        return self._seen(*given, reset=True)
 
     def step(self, action: np.integer[Any]) -> tuple[Array, float, bool, bool]:
         """Play an action; return observation, reward, terminated and truncated."""
@@ -124,7 +222,7 @@ class CheckedEnv:
         except BaseException as error:
             self._failed(error)
         try:
-            observation, reward, terminated, truncated, _ = given
+            observation, reward, terminated, truncated, info = given
         except (TypeError, ValueError):
             self._refuse(f"gives {_shown(given)}", _STEP)
         if type(reward) is not float:
@@ -135,10 +233,18 @@ class CheckedEnv:
             terminated = self._scalar("terminated", terminated, bool)
         if type(truncated) is not bool:
             truncated = self._scalar("truncated", truncated, bool)
+        return self._seen(observation, info, terminal=terminated), reward, terminated, truncated
+
+    def _seen(self, observation: Any, info: Any, *, reset: bool = False, terminal: bool = False) -> Array:  # noqa: ANN401
+        """The observation of a state, once its mask is read."""
         try:
-            return self._observation(observation), reward, terminated, truncated
+            found = self._observation(observation)
+            self._masks(info, terminal=terminal)
         except Unfit as problem:
-            self._refuse(problem.what, problem.why)
+            self._refuse(problem.what, problem.why, reset=reset)
+        except BaseException as error:  # of the environment's own method
+            self._failed(error, reset=reset)
+        return found
 
     def render(self) -> NDArray[Any]:
         """The picture that it renders: [height, width] or [height, width, channels]; raises UsageError."""
@@ -205,8 +311,8 @@ def _shown(value: object) -> str:
     return text if len(text) <= 40 else type(value).__name__
 
 
-def _as_array(given: object) -> Array:
+def _as_array(given: object, what: str = "observation") -> Array:
     try:
         return np.asarray(given)
     except Exception:  # numbers of unequal lengths, or an object that fails to convert; numpy's or its own
-        raise Unfit(f"gives the observation {_shown(given)}", "allowed: an array") from None
+        raise Unfit(f"gives the {what} {_shown(given)}", "allowed: an array") from None

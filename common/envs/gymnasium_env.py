@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -13,11 +14,12 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
 from coop.common.bounds import LONGEST_EPISODE, MAX_ACTIONS, MAX_SIDE
-from coop.common.envs.checked import CheckedEnv, raised
+from coop.common.envs.checked import CheckedEnv, FirstReset, raised
 from coop.common.envs.observations import FrameMaker
 from coop.common.envs.pictures import coloured
 from coop.common.envs.protocol import Steps
 from coop.common.envs.registry import find_registered
+from coop.common.envs.vectors import Row, make_rows
 from coop.common.errors import UsageError
 from coop.common.process.output import warn_once
 from coop.common.settings.environment import EnvSettings
@@ -37,14 +39,25 @@ class GymnasiumEnv:
         self, settings: EnvSettings, seeds: list[int], render_mode: str | None = None, *, bounded: bool = False
     ) -> None:
         """bounded: see `make_vector_env`."""
-        envs, self._limit = _make(settings, len(seeds), render_mode)
+        envs, self._limit = _make(settings, seeds, render_mode)
+        self._rows = [env for env in envs if isinstance(env, Row)]
         observations, actions = _spaces(settings, envs[0])
         self._frame = FrameMaker(settings, observations)
-        self.spec = _spec_of(settings, actions, self._frame)
+        first = FirstReset(envs[0], seeds[0])
+        self.spec = _spec_of(settings, actions, self._frame, masks=first.masks)
         self.num_envs = len(seeds)
         several = self.num_envs > 1
         self._envs = [
-            CheckedEnv(env, settings.id, observations, row if several else None) for row, env in enumerate(envs)
+            CheckedEnv(
+                env,
+                settings.id,
+                observations,
+                self.spec.num_actions,
+                masks=self.spec.masks,
+                first=None if row else first,
+                emulator=row if several else None,
+            )
+            for row, env in enumerate(envs)
         ]
         self._seeds = seeds
         self._bounded = bounded and not self._limit
@@ -55,6 +68,7 @@ class GymnasiumEnv:
         self._first_action, self._action_dtype = actions.start, actions.dtype
         self._lengths = [0] * self.num_envs
         self._obs = np.empty(0)
+        self.mask: NDArray[np.bool_] | None = None
         self._actions = np.empty(0, np.int32)
         # Shared by all steps in which no episode ends, so it must not be written to.
         self._none = np.zeros(self.num_envs, bool)
@@ -71,6 +85,7 @@ class GymnasiumEnv:
         self._obs = np.zeros((self.num_envs, *self.spec.obs_shape), self.spec.frame_dtype)
         for row, seed in enumerate(self._seeds):
             self._put(self._obs, row, self._envs[row].reset(seed))
+        self.mask = self._masks()
         return self._obs
 
     def send(self, actions: NDArray[np.int32]) -> None:
@@ -86,7 +101,10 @@ class GymnasiumEnv:
         terminal: list[int] = []
         over: list[int] = []
         # What Discrete.sample gives, numpy's integers, is what environments are written for.
-        for row, action in enumerate(self._actions.astype(self._action_dtype) + self._first_action):
+        actions = self._actions.astype(self._action_dtype) + self._first_action
+        for emulator, action in zip(self._rows, actions, strict=False):
+            emulator.chosen = action
+        for row, action in enumerate(actions):
             frame, reward, terminated, truncated = self._envs[row].step(action)
             self._put(next_obs, row, frame)
             rewards.append(reward)
@@ -100,9 +118,15 @@ class GymnasiumEnv:
                     self._tell_cut()
         raw_rewards = np.array(rewards, np.float64)
         learned = np.clip(raw_rewards, -1.0, 1.0) if self._clip else raw_rewards
-        self._obs = self._restart(next_obs, over) if over else next_obs
-        ended = self._mask(over)
-        return Steps(self._obs, next_obs, learned.astype(np.float32), raw_rewards, self._mask(terminal), ended, ended)
+        mask, next_mask = self.mask, self._masks()
+        self._obs, self.mask = next_obs, next_mask
+        if over:
+            self._obs, self.mask = self._restart(next_obs, over), self._masks()
+        ended = self._flags(over)
+        return Steps(
+            self._obs, next_obs, learned.astype(np.float32), raw_rewards, self._flags(terminal), ended, ended,
+            mask, next_mask,
+        )  # fmt: skip
 
     def step(self, actions: NDArray[np.int32]) -> Steps:
         """`send`, then `recv`; raises as `recv`."""
@@ -136,12 +160,17 @@ class GymnasiumEnv:
             "there; env.max_episode_steps sets a limit"
         )
 
-    def _mask(self, rows: list[int]) -> NDArray[np.bool_]:
+    def _masks(self) -> NDArray[np.bool_] | None:
+        """The masks of all emulators' present states, bool [envs, actions]."""
+        found = [env.mask for env in self._envs] if self.spec.masks else []
+        return np.array(found) if found else None
+
+    def _flags(self, rows: list[int]) -> NDArray[np.bool_]:
         if not rows:
             return self._none
-        mask = np.zeros(self.num_envs, bool)
-        mask[rows] = True
-        return mask
+        flags = np.zeros(self.num_envs, bool)
+        flags[rows] = True
+        return flags
 
 
 class FilmedGymnasium(GymnasiumEnv):
@@ -149,10 +178,10 @@ class FilmedGymnasium(GymnasiumEnv):
 
     def __init__(self, settings: EnvSettings, seed: int) -> None:
         """Raise UsageError for an environment that has no pictures, or lacks a package for them."""
-        (env,), _ = _make(settings, 1)
-        observations, _ = _spaces(settings, env)
+        (env,), _ = _make(settings, [0])
+        observations, actions = _spaces(settings, env)
         metadata, vectors = env.metadata or {}, len(FrameMaker(settings, observations).shape) == 1
-        CheckedEnv(env, settings.id, observations).close()
+        CheckedEnv(env, settings.id, observations, int(actions.n)).close()
         if vectors and "rgb_array" not in (metadata.get("render_modes") or ()):
             raise UsageError(f"env.id: {settings.id!r} has no pictures to film")
         super().__init__(settings, [seed], "rgb_array" if vectors else None, bounded=True)
@@ -179,34 +208,47 @@ def gymnasium_spec(settings: EnvSettings) -> EnvSpec:
     Raises:
         UsageError: the id is unknown, or a space or setting is not supported.
     """
-    (env,), _ = _make(settings, 1)
+    (env,), _ = _make(settings, [0])
     observations, actions = _spaces(settings, env)
-    spec = _spec_of(settings, actions, FrameMaker(settings, observations))
-    CheckedEnv(env, settings.id, observations).close()
+    masks = FirstReset(env, 0).masks
+    spec = _spec_of(settings, actions, FrameMaker(settings, observations), masks=masks)
+    CheckedEnv(env, settings.id, observations, spec.num_actions).close()
     return spec
 
 
 def _make(
-    settings: EnvSettings, count: int, render_mode: str | None = None
-) -> tuple[list[gymnasium.Env[Any, Any]], int]:
-    """Make environments without gymnasium's checks and step limit; return them and that limit (0: none)."""
+    settings: EnvSettings, seeds: list[int], render_mode: str | None = None
+) -> tuple[Sequence[gymnasium.Env[Any, Any]], int]:
+    """Make an environment for each seed, without gymnasium's checks and step limit; return them and that limit.
+
+    The limit is 0 if there is none, or if vector environments of one's own see to it themselves.
+    """
     registered = find_registered(settings)
+    mode, limit = settings.vectorization_mode, settings.max_episode_steps or registered.max_episode_steps or 0
+    if mode is None and registered.entry_point is None and registered.vector_entry_point is not None:
+        mode = "vector_entry_point"
+    keeps_limit = mode == "vector_entry_point"
     # By the specification and not by the id, because `make` warns about ids that have a newer version.
     plain = dataclasses.replace(
         registered,
         order_enforce=False,
         disable_env_checker=True,
-        max_episode_steps=None,
+        max_episode_steps=limit or None if keeps_limit else None,
         kwargs={**registered.kwargs, **settings.kwargs, **({"render_mode": render_mode} if render_mode else {})},
     )
     try:
-        envs = [gymnasium.make(plain) for _ in range(count)]
+        if mode is None:
+            envs: Sequence[gymnasium.Env[Any, Any]] = [gymnasium.make(plain) for _ in seeds]
+        else:
+            envs = make_rows(f"env.id: {settings.id!r}", plain, mode, seeds)
+    except UsageError:
+        raise
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"env.id: {settings.id!r} needs a package that is not installed: {error}") from None
     except BaseException as error:
         text = f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {raised(error)}"
         raise UsageError(text) from error
-    return envs, settings.max_episode_steps or registered.max_episode_steps or 0
+    return envs, 0 if keeps_limit else limit
 
 
 def _spaces(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> tuple[Box, Discrete]:
@@ -232,11 +274,11 @@ def _one_line(space: object) -> str:
     return " ".join(str(space).split())
 
 
-def _spec_of(settings: EnvSettings, actions: Discrete, frame: FrameMaker) -> EnvSpec:
+def _spec_of(settings: EnvSettings, actions: Discrete, frame: FrameMaker, *, masks: bool) -> EnvSpec:
     for what, most, limit in (
         ("actions", int(actions.n), MAX_ACTIONS),
         ("values on a side", max(frame.shape), MAX_SIDE),
     ):
         if most > limit:
             raise UsageError(f"env.id: {settings.id!r} has {most:,} {what}; allowed: at most {limit:,}")
-    return EnvSpec(settings.id, frame.shape, frame.dtype, settings.stack, int(actions.n))
+    return EnvSpec(settings.id, frame.shape, frame.dtype, settings.stack, int(actions.n), masks)

@@ -24,10 +24,10 @@ class FrameMaker:
     """
 
     def __init__(self, settings: EnvSettings, space: Box) -> None:
-        """Raise UsageError for a change of pictures that is not supported."""
+        """Raise UsageError for pictures with their channels first, or a change of pictures that is not supported."""
         self._name, self._space = f"env.id: {settings.id!r}", space
         self.shape: tuple[int, ...] = space.shape
-        self._warn()
+        self._check()
         self.dtype = str(space.dtype) if str(space.dtype) in KEPT else "float32"
         self._to_gray = settings.grayscale
         if settings.grayscale:
@@ -48,15 +48,16 @@ class FrameMaker:
         picture = picture if self._resize is None else self._resize(picture)
         return np.rint(picture) if self.dtype == "uint8" else picture
 
-    def _warn(self) -> None:
-        """Warn of spaces that are probably meant otherwise than they are taken."""
+    def _check(self) -> None:
+        """Refuse or warn of spaces that are meant otherwise than they would be taken."""
         space, shape = self._space, list(self._space.shape)
         if space.dtype == np.uint8 and space.high.max() <= 1:
             warn_once(of_flags(self._name))
         if len(shape) == 3 and shape[0] < min(shape[1:]):
-            warn_once(
-                f"{self._name}: observations {shape} are read as pictures of height {shape[0]}, width {shape[1]} and "
-                f"{shape[2]} channels; if the channels come first, move them to the end"
+            moved = [*shape[1:], shape[0]]
+            raise UsageError(
+                f"{self._name} has observations {shape}, pictures with their channels first; allowed: height x width x "
+                f"channels, {moved}, as gymnasium.wrappers.TransformObservation gives with np.moveaxis(obs, 0, -1)"
             )
 
     def _need(self, asked: str, holds: bool, what: str) -> None:

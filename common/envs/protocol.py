@@ -17,6 +17,8 @@ class Steps:
 
     obs: <frame_dtype>[envs, *obs_shape], the next observation to act on (of the new episode if one began).
     next_obs: <frame_dtype>[envs, *obs_shape], the result of the step; the same object as `obs` if nothing restarted.
+    mask, next_mask: bool [envs, actions], the actions that were allowed in the step, and those allowed at `next_obs`;
+        None in an environment without masks.
     rewards: float32 [envs], for learning. raw_rewards: float64 [envs], unclipped, for reported returns.
     terminated: bool [envs], for learning: the next state has no value. A truncated step is not terminal.
     restarted: bool [envs], the emulator was reset, so obs does not continue next_obs.
@@ -30,13 +32,20 @@ class Steps:
     terminated: NDArray[np.bool_]
     restarted: NDArray[np.bool_]
     episode_over: NDArray[np.bool_]
+    mask: NDArray[np.bool_] | None = None
+    next_mask: NDArray[np.bool_] | None = None
 
 
 class VectorEnv(Protocol):
-    """`num_envs` emulators that step together and reset themselves."""
+    """`num_envs` emulators that step together and reset themselves.
+
+    mask: bool [envs, actions], the actions allowed now, at the observations of the last `reset` or `recv`; None unless
+        `spec.masks`. Never written to again.
+    """
 
     spec: EnvSpec
     num_envs: int
+    mask: NDArray[np.bool_] | None
 
     def reset(self) -> Array:
         """Start every emulator from its seed: <frame_dtype>[envs, *obs_shape]."""

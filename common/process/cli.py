@@ -18,7 +18,7 @@ from typing import Any, NoReturn, TypeVar
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from coop.common.errors import UsageError, closest, not_among, refusal
+from coop.common.errors import ALSO_CALLED, UsageError, closest, not_among, refusal
 from coop.common.places import absolute
 from coop.common.process.flags import READERS, Flag, Section, sections
 from coop.common.process.lifecycle import ProcessExit
@@ -114,16 +114,6 @@ def _width() -> int:
 PACKAGE = "coop-rl"
 _ALONE = {"--replay.journal": "async"}  # what flags mean that are given without a value
 _JOINED = re.compile(r"((?P<flag>--[^=]+)=)?(?P<numbers>[-+.\de_]+(,[-+.\de_]+)+)")
-_ALSO_CALLED = {  # what other libraries call a flag
-    "--lr": "--learner.learning-rate",
-    "--discount": "--learner.gamma",
-    "--buffer-size": "--replay.capacity",
-    "--target-update-interval": "--learner.target-update-every",
-    "--n-envs": "--actor.num-envs",
-    "--timesteps": "--total-steps",
-    "--total-timesteps": "--total-steps",
-    "--n-steps": "--replay.n-step",
-}
 ANSWERS = ("--help", "--help-all", "--version", "--completion")
 
 T = TypeVar("T")
@@ -287,6 +277,11 @@ def _misread(flag: Flag, reader: PrimitiveConstructorSpec[Any], words: list[str]
     return None
 
 
+def _flag(name: str) -> str:
+    """The flag of a field's dotted name."""
+    return f"--{name.replace('_', '-')}"
+
+
 def _unknown(token: str, flags: Iterable[Flag]) -> str:
     """What to say of an unknown word; of a flag with the one that it resembles, with or without its section.
 
@@ -296,7 +291,8 @@ def _unknown(token: str, flags: Iterable[Flag]) -> str:
     known = {name: name for flag in flags for name in (flag.name, flag.negative)}
     if not token.startswith("-"):
         return refusal("unknown", known.get(f"--{word}"), "it follows no flag that takes it")
-    first = known.get(_ALSO_CALLED.get(word, "")) or next((name for name in known if name.startswith(f"{word}.")), None)
+    elsewhere = ALSO_CALLED.get(word[2:].replace("-", "_"), "")
+    first = known.get(_flag(elsewhere)) or next((name for name in known if name.startswith(f"{word}.")), None)
     without = {f"--{name.rpartition('.')[2]}": name for name in reversed(known) if "." in name}
     known = {**without, **known, **{name: name for name in ANSWERS}}
     near = first or closest(word, known)

@@ -29,7 +29,7 @@ def frame_bytes(spec: EnvSpec) -> int:
 
 def estimated_bytes(spec: EnvSpec, capacity: int) -> int:
     """Bytes of a full table with one frame per transition, including the frames' counters; uniform sampling."""
-    return capacity * (frame_bytes(spec) + SLOT_BYTES + row_bytes(KEPT, spec.stack) + 2 * 4 * spec.stack)
+    return capacity * (frame_bytes(spec) + SLOT_BYTES + row_bytes(KEPT, spec) + 2 * 4 * spec.stack)
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
@@ -69,8 +69,8 @@ def check_messages(config: RunConfig, spec: EnvSpec) -> None:
     episode ends with it; a segment may also contain n_step - 1 steps that waited for it.
     """
     room = MAX_PAYLOAD - HEADER_BYTES
-    batch = room // ((spec.stack + 1) * (frame_bytes(spec) + NAME_BYTES) + row_bytes(IN_BATCH, spec.stack))
-    step = 2 * frame_bytes(spec) + row_bytes(IN_SEGMENT, spec.stack)
+    batch = room // ((spec.stack + 1) * (frame_bytes(spec) + NAME_BYTES) + row_bytes(IN_BATCH, spec))
+    step = 2 * frame_bytes(spec) + row_bytes(IN_SEGMENT, spec)
     segment = (room - spec.stack * frame_bytes(spec)) // step - (config.replay.n_step - 1)
     allowed = {
         "learner.batch_size": (config.learner.batch_size, batch),

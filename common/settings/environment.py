@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
@@ -21,6 +21,8 @@ class EnvSettings:
     """A gymnasium id ("CartPole-v0", "my_envs:Room-v0" of the module my_envs) or an ALE game ("breakout")."""
     kwargs: Table = field(default_factory=dict, hash=False)
     """Keyword arguments of the environment, a TOML table, such as {side = 12}; not for ALE games."""
+    vectorization_mode: Annotated[Literal["sync", "async", "vector_entry_point"] | None, NONE] = None
+    """Play the emulators of an actor in one vector environment, as gymnasium.make_vec makes it; not for ALE games."""
     noop_max: Annotated[int, Meta(ge=0, le=MAX_NOOPS)] = 30
     """Largest number of no-ops at the start of a game, which is drawn from 0..noop_max; ALE only."""
     episodic_life: bool = False

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 import msgspec
 
-from coop.common.errors import UsageError, not_among
+from coop.common.errors import ALSO_CALLED, UsageError, closest, refusal
 
 T = TypeVar("T")
 _PROBLEM = re.compile(r"^(?P<problem>.*?)(?: - at .*`\$(?P<path>[^`]*)`)?$", re.DOTALL)  # msgspec's error texts
@@ -30,7 +30,7 @@ def checked(kind: type[T], tables: Any, prefix: str = "") -> T:  # noqa: ANN401 
     Raises:
         UsageError: an unknown field or a value that is not allowed, with the field, the value and what is allowed.
     """
-    tables = _read(kind, tables, prefix)
+    tables = _read(kind, tables, prefix, kind)
     try:
         return msgspec.convert(tables, kind, strict=False)
     except msgspec.ValidationError as error:
@@ -44,7 +44,7 @@ def fields_of(kind: type[Any]) -> dict[str, Any]:
     return {name: hints[name] for name in kind.__dataclass_fields__ if name != "method_settings"}
 
 
-def _read(kind: Any, value: Any, place: str) -> Any:  # noqa: ANN401 (any type, any value)
+def _read(kind: Any, value: Any, place: str, whole: Any) -> Any:  # noqa: ANN401 (any types, any value)
     base, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
     for mark in marks:
         if isinstance(mark, Read):
@@ -57,11 +57,28 @@ def _read(kind: Any, value: Any, place: str) -> Any:  # noqa: ANN401 (any type, 
         known = fields_of(base)  # type: ignore[arg-type] # a class
         for name, each in value.items():
             if name not in known:
-                raise UsageError(f"{place}{name} = {each!r}: {not_among(list(known), str(name), 'no such field')}")
-        return {name: _read(known[name], each, f"{place}{name}") for name, each in value.items()}
-    if get_origin(base) is tuple and isinstance(value, list | tuple):
-        return [_read(get_args(base)[0], each, f"{place}[{n}]") for n, each in enumerate(value)]
+                near = _elsewhere(whole).get(ALSO_CALLED.get(str(name), str(name))) or closest(str(name), known)
+                problem = refusal("no such field", near, f"allowed: {', '.join(known)}")
+                raise UsageError(f"{place}{name} = {each!r}: {problem}")
+        return {name: _read(known[name], each, f"{place}{name}", whole) for name, each in value.items()}
+    if get_origin(base) is tuple and not isinstance(value, list | tuple):
+        raise UsageError(f"{place} = {value!r}: must be a list, such as [64, 64]")
+    if get_origin(base) is tuple:
+        return [_read(get_args(base)[0], each, f"{place}[{n}]", whole) for n, each in enumerate(value)]
     return value
+
+
+@cache
+def _elsewhere(kind: Any) -> dict[str, str]:  # noqa: ANN401 (any dataclass)
+    """The dotted names of nested dataclasses' fields, by themselves and by their last part."""
+    found: dict[str, str] = {}
+    for name, each in fields_of(kind).items():
+        base: Any = get_args(each)[0] if get_origin(each) is Annotated else each
+        inner = [f"{name}.{path}" for path in _elsewhere(base).values()] if is_dataclass(base) else [name]  # type: ignore[arg-type]
+        for path in inner:
+            found[path] = path
+            found.setdefault(path.rpartition(".")[2], path)
+    return found
 
 
 def _explained(error: msgspec.ValidationError, kind: Any, tables: Any, prefix: str) -> str:  # noqa: ANN401

@@ -62,7 +62,7 @@ def _problems(config: RunConfig) -> Iterator[str]:
         )
     if config.env.atari:
         plain = EnvSettings()
-        for name in ("kwargs", "resize", "grayscale"):
+        for name in ("kwargs", "resize", "grayscale", "vectorization_mode"):
             if (value := getattr(config.env, name)) != getattr(plain, name):
                 yield f"env.{name} = {value!r}: not for {config.env.id!r}; ALE's games show 84x84 grayscale pictures"
     if config.soft_targets is not None and learner.swap_unit == "steps":

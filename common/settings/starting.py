@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -47,20 +47,36 @@ def source_of(preset: str | None, file: object | None, resumed: bool, env_id: st
     return "no preset: those of the Atari presets" if EnvSettings(env_id).atari else "no preset: neutral"
 
 
-def settings_line(config: RunConfig, source: str) -> str:
-    """The settings that matter most, in one line; source: see `source_of`."""
-    replay, network = config.replay, config.network
-    table = (
-        f"capacity {replay.capacity:,}, eviction {replay.eviction}, sampling {replay.sampling}, ratio {replay.ratio:g}"
-    )
+def settings_line(*runs: tuple[RunConfig, str]) -> str:
+    """The settings that matter most, in one line: "varying" where runs differ.
+
+    runs: each run's config and where that comes from, see `source_of`.
+    """
+
+    def of(texts: Sequence[str]) -> str:
+        return texts[0] if len(set(texts)) == 1 else "varying"
+
+    configs = [config for config, _ in runs]
+    tables = [config.replay for config in configs if not config.streaming]
+    of_tables = {
+        "capacity": [f"{table.capacity:,}" for table in tables],
+        "eviction": [table.eviction for table in tables],
+        "sampling": [table.sampling for table in tables],
+        "ratio": [f"{table.ratio:g}" for table in tables],
+    }
     parts = {
-        "settings": source,
-        "method": config.method,
-        "gamma": f"{config.learner.gamma:g}",
-        "replay": "no buffer" if config.streaming else table,
-        "network": "-".join((network.kind, *map(str, network.hidden))) if network.kind == "mlp" else network.kind,
+        "settings": of([source for _, source in runs]),
+        "method": of([config.method for config in configs]),
+        "gamma": of([f"{config.learner.gamma:g}" for config in configs]),
+        "replay": ", ".join(f"{name} {of(texts)}" for name, texts in of_tables.items()) if tables else "no buffer",
+        "network": of([_layers(config) for config in configs]),
     }
     return "; ".join(f"{name}: {value}" for name, value in parts.items())
+
+
+def _layers(config: RunConfig) -> str:
+    kind, hidden = config.network.kind, config.network.hidden
+    return "-".join((kind, *map(str, hidden))) if kind == "mlp" else kind
 
 
 def stated(tables: Mapping[str, Any]) -> set[str]:

@@ -43,6 +43,8 @@ class Buffer:
         reuse: int32 [n], how often each had been drawn.
         param_version: int64 [n], updates behind the parameters that chose each action.
         priority: float64 [n]; None if neither eviction nor sampling goes by priorities.
+        mask, next_mask: bool [n, actions], the actions allowed at each observation and at the next one; None for an
+            environment without action masks.
         episode: int64 [n], numbers of episodes in order of their first transition; -1 of what `replay.preload` has
             brought. None if the transitions are of several emulators and no policy of the table numbers episodes.
         length: int64 [n], transitions of that episode, 0 while it goes on; None if `episode` is not from the records.
@@ -64,6 +66,8 @@ class Buffer:
     episode: NDArray[np.int64] | None = None
     truncated: NDArray[np.bool_] | None = None
     length: NDArray[np.int64] | None = None
+    mask: NDArray[np.bool_] | None = None
+    next_mask: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.actions)

@@ -51,7 +51,8 @@ class EvalOptions(RoleOptions):
     seed: int = 0
     """Seed of the emulators that play a folder's networks."""
     video: Path | None = None
-    """An .mp4 or .gif to film an episode in: one folder's acting network, or the one of --networks, plays greedily."""
+    """An .mp4 or .gif to film an episode in, its first 9,000 steps (.gif: 3,000) at most: one folder's acting network,
+    or the one of --networks, plays with the first --epsilon."""
     every: float | None = None
     """Seconds between the evaluations of a live run; without this and the next, the run's eval_every steps."""
     every_steps: int | None = None
@@ -86,7 +87,8 @@ def _run() -> None:
     networks = [_NETWORKS[name] for name in options.networks]
     episodes, epsilons = options.episodes or EPISODES, options.epsilon or EPSILONS
     if options.video is not None:
-        print(film_checkpoint(options.run_dir[0], options.video, options.seed, networks), file=out(), flush=True)
+        line = film_checkpoint(options.run_dir[0], options.video, options.seed, networks, epsilons[0])
+        print(line, file=out(), flush=True)
     runs = [
         evaluate_checkpoint(path, episodes, options.seed, networks, epsilons, options.envs) for path in options.run_dir
     ]

@@ -17,12 +17,14 @@ from coop.common.errors import CoopError, UsageError
 from coop.common.imports import describe
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.networks.acting import ActingNetwork
+from coop.common.networks.masks import allowed, random_actions
 from coop.common.process.console import say
 from coop.common.settings.config import RunConfig
 from coop.common.types import Array, EnvSpec
 
-Acting = Callable[[Array], Any]
-"""Actions, int [envs], for observations <frame_dtype>[envs, *obs_shape]."""
+Acting = Callable[..., Any]
+"""Actions, int [envs], for observations <frame_dtype>[envs, *obs_shape]; in an environment with action masks it gets
+those, bool [envs, actions], as well."""
 
 T = TypeVar("T")
 
@@ -39,7 +41,7 @@ def play(env: VectorEnv, act: Acting, episodes: int, stopped: Callable[[], bool]
     returns: list[float] = []
     obs = env.reset()
     while len(returns) < episodes and not stopped():
-        steps = env.step(chosen(act, obs, env.spec))
+        steps = env.step(chosen(act, obs, env.spec, env.mask))
         obs = steps.obs
         totals += steps.raw_rewards
         for number in np.flatnonzero(steps.episode_over & (left > 0)).tolist():
@@ -49,12 +51,15 @@ def play(env: VectorEnv, act: Acting, episodes: int, stopped: Callable[[], bool]
     return returns
 
 
-def chosen(act: Acting, obs: Array, spec: EnvSpec) -> NDArray[np.int32]:
-    """The actions, int32 [envs], of a policy; raises UsageError if they are none."""
-    given = np.asarray(act(obs))
+def chosen(act: Acting, obs: Array, spec: EnvSpec, mask: NDArray[np.bool_] | None) -> NDArray[np.int32]:
+    """The actions, int32 [envs], of a policy; raises UsageError if they are none, or not allowed."""
+    given = np.asarray(act(obs) if mask is None else act(obs, mask))
     if given.size == len(obs) and given.dtype.kind in "iu":
         actions = given.reshape(len(obs))
         if actions.min() >= 0 and actions.max() < spec.num_actions:
+            if mask is not None and not (fit := mask[np.arange(len(obs)), actions]).all():
+                bad = actions[~fit][0]
+                raise UsageError(f"policy: gives {bad}, which the mask of {spec.env_id!r}'s state does not allow")
             return actions.astype(np.int32)
     what = f"{given.dtype}{list(given.shape)}" if given.size > 1 else repr(given.tolist())
     raise UsageError(
@@ -65,15 +70,15 @@ def chosen(act: Acting, obs: Array, spec: EnvSpec) -> NDArray[np.int32]:
 
 def greedy(network: ActingNetwork, spec: EnvSpec) -> Acting:
     """A policy that always takes the best action of a network."""
-    return lambda obs: network.q_values(obs, spec).argmax(1)
+    return lambda obs, mask=None: allowed(network.q_values(obs, spec), mask).argmax(1)
 
 
 def exploring(act: Acting, epsilon: float, spec: EnvSpec, rng: np.random.Generator) -> Acting:
     """A policy that takes a random action with probability `epsilon`, and otherwise the one of `act`."""
 
-    def explore(obs: Array) -> Array:
-        random = rng.integers(spec.num_actions, size=len(obs), dtype=np.int32)
-        return np.where(rng.random(len(obs)) < epsilon, random, chosen(act, obs, spec))
+    def explore(obs: Array, mask: NDArray[np.bool_] | None = None) -> Array:
+        random = random_actions(rng, len(obs), spec.num_actions, mask)
+        return np.where(rng.random(len(obs)) < epsilon, random, chosen(act, obs, spec, mask))
 
     return explore if epsilon else act
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -75,7 +76,8 @@ def evaluate(
     """Play full episodes by a policy in its own environment, or in another one.
 
     Args:
-        policy: of `SavedRun.policy`, or any function of a batch of stacked observations that gives an action for each.
+        policy: of `SavedRun.policy`, or any function of a batch of stacked observations that gives an action for each;
+            in an environment with action masks it is called with those, bool [batch, actions], as well.
         env: an environment's id; or settings that replace those of the policy's environment, as a table
             ({"kwargs": {"side": 12}}).
         seed: of the emulators and the random actions.
@@ -142,10 +144,13 @@ def evaluate_checkpoint(
     return (one(network, epsilon) for network in chosen for epsilon in epsilons)
 
 
-def film_checkpoint(run_dir: Path, video: Path, seed: int, networks: Sequence[NetworkChoice]) -> str:
-    """Film an episode of greedy play by a run's newest checkpoint; return a line that describes it.
+def film_checkpoint(
+    run_dir: Path, video: Path, seed: int, networks: Sequence[NetworkChoice], epsilon: float = 0.0
+) -> str:
+    """Film an episode of play by a run's newest checkpoint, as far as a film goes; return a line that describes it.
 
     seed: as of `evaluate_checkpoint`. networks: the one to play; if there are several, the acting network plays.
+    epsilon: probability of a random action.
 
     Raises:
         UsageError: the folder holds no run, or no checkpoint; or its environment can't be filmed, or not so.
@@ -155,12 +160,16 @@ def film_checkpoint(run_dir: Path, video: Path, seed: int, networks: Sequence[Ne
     run = SavedRun(run_dir)
     checkpoint = run.checkpoint()
     network: NetworkChoice = networks[0] if len(networks) == 1 else checkpoint.acting + 1  # type: ignore[assignment]
-    film = Film(run.policy(network), run.config.env, _derived(run, seed))
+    policy, derived = run.policy(network), _derived(run, seed)
+    act = exploring(policy, epsilon, policy.spec, np.random.default_rng(derived))
+    film = Film(act, run.config.env, derived)
     try:
         write_video(film, video)
     except OSError as error:
         raise RunError(f"{video}: {error.strerror or error}") from error
-    return f"{video}: network {network}, return {exact(film.episode_return)} in {film.steps:,} steps"
+    played = f"network {network}{f', epsilon {epsilon:g}' if epsilon else ''}"
+    end = "" if film.over else ", where the film ends; the episode does not"
+    return f"{video}: {played}, return {exact(film.episode_return)} in {film.steps:,} steps{end}"
 
 
 def _derived(run: SavedRun, seed: int) -> int:
@@ -172,5 +181,17 @@ def _returns(
     policy: Acting, settings: EnvSettings, episodes: int, seed: int, epsilon: float, at_once: int
 ) -> list[float]:
     with closing(make_vector_env(settings, min(episodes, at_once), seed, bounded=True)) as env:
+        if env.spec.masks:
+            _check_takes_masks(policy, settings)
         act = exploring(policy, epsilon, env.spec, np.random.default_rng(seed))
         return play(env, act, episodes)
+
+
+def _check_takes_masks(policy: Acting, settings: EnvSettings) -> None:
+    """Raise UsageError for a function that can't be called with observations and masks."""
+    try:
+        inspect.signature(policy).bind(None, None)
+    except TypeError:
+        raise UsageError(f"policy: must take observations and action masks, which {settings.id!r} has") from None
+    except ValueError:  # a function without a signature; what it says to its arguments is told as it is played
+        return

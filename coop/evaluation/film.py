@@ -6,7 +6,7 @@ import html
 import io
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -23,17 +23,19 @@ Picture = NDArray[np.uint8]
 """uint8 [height, width, 3]."""
 
 SMALLEST = 240  # pixels: smaller pictures are enlarged
-LONGEST = 900  # pictures of a film that goes to TensorBoard; a minute of an Atari game
-LONGEST_GIF = 3000  # pictures of a GIF, which is made in memory
+MOST = 9000  # pictures, and so steps, of any film; ten minutes of an Atari game
+LONGEST = 900  # of one that goes to TensorBoard
+LONGEST_GIF = 3000  # of a GIF, which is made in memory
+LONGEST_S = 3600  # seconds of any film, where pictures are slow
 LONGEST_STILL = 600_000  # milliseconds of one picture; a GIF has 16 bits for hundredths of a second
 FORMATS = (".mp4", ".gif")
 
 
 class Film:
-    """The pictures of an episode in which `act` chooses the actions, as they are played.
+    """The pictures of an episode in which `act` chooses the actions, as they are played, up to `MOST` or `LONGEST_S`.
 
     pictures_per_s: at the game's usual speed. steps, episode_return: of what has been played so far. over: the episode
-    has ended.
+    has ended; False behind the last picture of one that was cut.
     """
 
     def __init__(self, act: Acting, settings: EnvSettings, seed: int) -> None:
@@ -45,11 +47,16 @@ class Film:
 
     def __iter__(self) -> Iterator[Picture]:
         """Yield a picture of each state in which the policy acts."""
+        return self.pictures(MOST)
+
+    def pictures(self, most: int) -> Iterator[Picture]:
+        """Yield the first pictures, at most so many."""
+        most = max(1, min(most, MOST, int(LONGEST_S * self.pictures_per_s)))
         try:
             obs = self._env.reset()
-            while not self.over:
+            while not self.over and self.steps < most:
                 yield _enlarged(self._env.picture())
-                steps = self._env.step(chosen(self._act, obs, self._env.spec))
+                steps = self._env.step(chosen(self._act, obs, self._env.spec, self._env.mask))
                 obs, self.over = steps.obs, bool(steps.episode_over[0])
                 self.steps += 1
                 self.episode_return += float(steps.raw_rewards[0])
@@ -108,7 +115,7 @@ def check_video(path: Path) -> None:
 def write_video(film: Film, path: Path) -> None:
     """Write an episode to a file of one of `FORMATS`; a GIF holds at most `LONGEST_GIF` pictures of it."""
     if path.suffix == ".gif":
-        path.write_bytes(_gif(islice(film, LONGEST_GIF), film.pictures_per_s))
+        path.write_bytes(_gif(film.pictures(LONGEST_GIF), film.pictures_per_s))
         return
     import imageio_ffmpeg  # noqa: PLC0415
 
@@ -129,7 +136,7 @@ def write_video(film: Film, path: Path) -> None:
 
 def short_gif(film: Film) -> bytes:
     """The first `LONGEST` pictures of an episode as an animated GIF of at most `MAX_VIDEO` bytes."""
-    pictures = list(islice(film, LONGEST))
+    pictures = list(film.pictures(LONGEST))
     while len(content := _gif(pictures, film.pictures_per_s)) > MAX_VIDEO:
         pictures = pictures[: len(pictures) // 2]
     return content

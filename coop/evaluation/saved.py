@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from coop.common.envs.make import env_spec
 from coop.common.errors import UsageError
 from coop.common.imports import hand_over, permit
+from coop.common.networks.masks import allowed
 from coop.common.networks.network import FlatNetwork
 from coop.common.places import absolute
 from coop.common.process.untrusted import check_links
@@ -67,9 +68,16 @@ class SavedPolicy:
     spec: EnvSpec
     networks: tuple[FlatNetwork, ...]
 
-    def __call__(self, obs: ArrayLike) -> Any:  # noqa: ANN401 (depends on the observation's shape)
-        """The best action, int, for one observation; int64 [batch] for a batch. Takes what `q_values` takes."""
-        best = self.q_values(obs).argmax(-1)
+    def __call__(self, obs: ArrayLike, mask: ArrayLike | None = None) -> Any:  # noqa: ANN401 (depends on obs)
+        """The best action, int, for one observation; int64 [batch] for a batch. Takes what `q_values` takes.
+
+        mask: bool or 0 and 1, [actions] or [batch, actions], the actions that are allowed; None: all.
+
+        Raises:
+            UsageError: as `q_values`; or the mask has another shape or other values, or allows no action.
+        """
+        values = self.q_values(obs)
+        best = allowed(values, None if mask is None else self._as_mask(mask, values.shape)).argmax(-1)
         return int(best) if best.ndim == 0 else best
 
     def q_values(self, obs: ArrayLike) -> NDArray[np.float32]:
@@ -87,6 +95,18 @@ class SavedPolicy:
         each = [network.q_values(batch, self.spec) for network in self.networks]
         values: NDArray[np.float32] = np.mean(each, axis=0)
         return values if batch is given else values[0]
+
+    def _as_mask(self, mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        try:
+            given = np.asarray(mask)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"mask: not an array: {error}") from error
+        if given.shape != shape or given.dtype.kind not in "biu" or not np.isin(given, (0, 1)).all():
+            wanted = f"bool or 0 and 1, {list(shape)}"
+            raise UsageError(f"mask {given.dtype}{list(given.shape)}: {self.spec.env_id} has {wanted}")
+        if not given.any(-1).all():
+            raise UsageError("mask: allows no action")
+        return given.astype(np.bool_)
 
     def _as_stored(self, obs: ArrayLike) -> Array:
         """An observation in the dtype of the environment's; numbers in lists may stand for it if they fit exactly."""

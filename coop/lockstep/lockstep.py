@@ -83,7 +83,9 @@ class Lockstep:
         self._actions.append(int(turn.actions[0]))
         steps = turn.steps
         newest = steps.next_obs[0, -1] if self.env.spec.stack > 1 else steps.next_obs
-        for shown in (newest, steps.raw_rewards, steps.terminated, *([steps.obs] if steps.restarted[0] else [])):
+        restarted = [steps.obs] if steps.restarted[0] else []
+        masks = [] if steps.next_mask is None else [steps.next_mask]
+        for shown in (newest, steps.raw_rewards, steps.terminated, *restarted, *masks):
             self._seen = zlib.crc32(shown.tobytes(), self._seen)
 
     def save(self, directory: RunDirectory) -> None:

@@ -182,6 +182,7 @@ class LatestTransition:
         given = {
             "obs_index": obs_index, "next_index": next_index, "actions": turn.actions, "rewards": steps.rewards,
             "terminated": steps.terminated, "ids": np.array([step - 1]), "param_version": np.array([turn.version]),
+            "mask": steps.mask, "next_mask": steps.next_mask,
         }  # fmt: skip
         restart = steps.obs[0] if steps.restarted[0] else None
         yield Transition(frames=frames, restart=restart, **filled(IN_BATCH, 1, given))

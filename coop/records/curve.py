@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coop.common.numbers import RETURN_WINDOW, running_mean
+from coop.common.numbers import SHORT_WINDOW, running_mean
 from coop.common.process.files import write_atomic
 from coop.records.checkpoints import EVALUATIONS, RECORDS
 from coop.records.reading import Floats, column, read_csv, returns_by_step
@@ -63,7 +63,7 @@ def curve_png(steps: ArrayLike, returns: ArrayLike, title: str, evaluated: Float
         figure = Figure(figsize=(8, 4.5), layout="constrained")
         axes = figure.subplots()
         axes.plot(steps, returns, ".", markersize=2, alpha=0.35, label="episode")
-        axes.plot(steps, running_mean(returns), linewidth=2, label=f"mean of the last {RETURN_WINDOW}")
+        axes.plot(steps, running_mean(returns, SHORT_WINDOW), linewidth=2, label=f"mean of the last {SHORT_WINDOW}")
         if evaluated.size:
             axes.plot(*evaluated, "o-", markersize=4, label="evaluation")
         axes.set(xlabel="environment steps", ylabel="return", title=title)

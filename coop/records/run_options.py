@@ -90,7 +90,7 @@ class RunOptions(RunConfig):
     def settings(self) -> str:
         """The settings that matter most, and where they come from, in one line."""
         resumed = self.start.goes_on and self.run_dir is not None and (self.run_dir / CONFIG).exists()
-        return settings_line(self, source_of(self.preset, self.config and shown(self.config), resumed, self.env.id))
+        return settings_line((self, source_of(self.preset, self.config and shown(self.config), resumed, self.env.id)))
 
     @property
     def start(self) -> Start:

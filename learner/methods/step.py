@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from coop.common.networks.masks import allowed
 from coop.common.transitions import Batch
 from coop.learner.given import Given
 from coop.learner.qnetwork import QNetwork, on_host
@@ -16,6 +17,9 @@ from coop.learner.qnetwork import QNetwork, on_host
 
 class Step:
     """One step of the optimizer, as a rule sees it. Values are computed when they are first asked for, and kept.
+
+    In an environment with action masks, the values of actions that are not allowed are `LEAST`, in `q`, `q_next`,
+    `target_q` and `target_q_next`; those that `online` and `target` compute are as they are.
 
     Arrays are numpy's for a rule that does not say `on_device`, tensors in `loss` and `extra_cost`, and otherwise those
     of the networks. Those of `online` and `target` themselves are always the networks' own.
@@ -68,25 +72,35 @@ class Step:
         """Weights of importance sampling, float32 [batch]."""
         return self._give(self._given.columns.weights)
 
+    @property
+    def mask(self) -> Any:  # noqa: ANN401
+        """The actions allowed at obs, bool [batch, actions]; None in an environment without masks."""
+        return self._maybe(self._given.columns.mask)
+
+    @property
+    def next_mask(self) -> Any:  # noqa: ANN401
+        """The actions allowed at next_obs, as `mask`."""
+        return self._maybe(self._given.columns.next_mask)
+
     @cached_property
     def q(self) -> Any:  # noqa: ANN401
         """Q of the trained network at obs, float32 [batch, actions]."""
-        return self._give(self.online.values(self._half(0)))
+        return self._values(self.online, 0)
 
     @cached_property
     def q_next(self) -> Any:  # noqa: ANN401
         """Q of the trained network at next_obs, float32 [batch, actions]."""
-        return self._give(self.online.values(self._half(1)))
+        return self._values(self.online, 1)
 
     @cached_property
     def target_q(self) -> Any:  # noqa: ANN401
         """Q of the target network at obs, float32 [batch, actions]."""
-        return self._give(self.target.values(self._half(0)))
+        return self._values(self.target, 0)
 
     @cached_property
     def target_q_next(self) -> Any:  # noqa: ANN401
         """Q of the target network at next_obs, float32 [batch, actions]."""
-        return self._give(self.target.values(self._half(1)))
+        return self._values(self.target, 1)
 
     def know(self, **values: Any) -> None:  # noqa: ANN401
         """Note values that are computed already, in the networks' arrays."""
@@ -100,9 +114,14 @@ class Step:
         step.targets = give(self.targets)
         return step
 
-    def _half(self, number: int) -> Any:  # noqa: ANN401
-        size = len(self.inputs) // 2
-        return self.inputs[number * size : (number + 1) * size]
+    def _maybe(self, mask: Any) -> Any:  # noqa: ANN401
+        return None if mask is None else self._give(mask)
+
+    def _values(self, network: QNetwork, half: int) -> Any:  # noqa: ANN401
+        """Q of a network at obs (0) or next_obs (1), float32 [batch, actions]."""
+        size, held = len(self.inputs) // 2, self._given.columns
+        values = network.values(self.inputs[half * size : (half + 1) * size])
+        return self._give(allowed(values, (held.mask, held.next_mask)[half]))
 
 
 def slope_of(cost: Callable[[Step, Tensor], Tensor], step: Step, values: Any) -> Tensor:  # noqa: ANN401

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from coop.common.networks.forward import preprocess
+from coop.common.networks.masks import allowed
 from coop.common.networks.network import FlatNetwork
 from coop.common.networks.normalised import NormalisedNetwork
 from coop.common.settings import schedules
@@ -94,7 +95,7 @@ class StreamAgent:
         values = records[-1].normalised[0]
         self._observe(next_obs)
         reward = self._scale(float(batch.rewards[0]), ended=ended)
-        bootstrap = 0.0 if terminated else float(self._form(next_obs).max())
+        bootstrap = 0.0 if terminated else float(allowed(self._form(next_obs), batch.next_mask).max())
         delta = reward + gamma * bootstrap - float(values[action])
         self._traces.add(records, action, gamma * settings.trace_decay)
         norm = float(torch.linalg.vector_norm(self._traces.z, 1))
@@ -102,7 +103,7 @@ class StreamAgent:
         self._network.flat.add_(self._traces.z, alpha=step * delta)
         if batch.restart is not None:
             self.begin(batch.restart)
-        elif ended or action != values.argmax():
+        elif ended or action != allowed(values[None], batch.mask).argmax():
             self._traces.reset()
         self.updates += 1
         return Update(np.array([delta], np.float32), 0.0, swapped=False)

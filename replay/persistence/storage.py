@@ -21,7 +21,7 @@ from coop.common.messaging import wire
 from coop.common.messaging.messages.sample import BatchReader, encode_batch
 from coop.common.process.files import PIECE, FileDigest, SyncedFile, make_folder, sync_folder
 from coop.common.process.untrusted import load_array, read_bytes
-from coop.common.transitions import KEPT
+from coop.common.transitions import KEPT, columns_of
 from coop.common.types import Array, EnvSpec, EpisodeEnd, EpisodeRecord
 from coop.records.checkpoints import Damaged, Manifest, check_part, read_manifest, remove, write_manifest
 from coop.records.run_ids import check_owner
@@ -141,7 +141,11 @@ def read_table(path: Path, number: int) -> SavedTable:
         env_id, frame_shape, *rest = meta["settings"]["spec"]
         spec = EnvSpec(env_id, tuple(frame_shape), *rest)
         order = np.argsort(arrays["ids"])
-        names = [name for name in (*KEPT, "priorities", EPISODES) if len(arrays.get(name, ())) == len(order)]
+        names = [
+            name
+            for name in (*columns_of(KEPT, spec), "priorities", EPISODES)
+            if len(arrays.get(name, ())) == len(order)
+        ]
         found = {name: arrays[name][order] for name in names}
         slots, frames = arrays["slots"][order], arrays["frames"]  # mapped: each is read from the disk as it is copied
         for name, index in (("obs", slots[:, : spec.stack]), ("next_obs", slots[:, spec.stack :])):

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from coop.common.transitions import IN_BATCH, IN_SEGMENT, KEPT, Segment
-from coop.common.types import Array
+from coop.common.transitions import IN_BATCH, IN_SEGMENT, KEPT, Segment, columns_of
+from coop.common.types import Array, EnvSpec
 from coop.replay.table.frames import Slots
-
-_WRITTEN = [name for name in IN_SEGMENT if name in KEPT]
-_READ = [name for name in IN_BATCH if name in KEPT]
 
 
 class Columns:
@@ -22,9 +19,14 @@ class Columns:
     terminal: rows whose next state is terminal.
     """
 
-    def __init__(self, capacity: int, stack: int, *, prioritized: bool) -> None:
-        self.slots = np.zeros((capacity, 2 * stack), np.int32)
-        self.named: dict[str, Array] = {name: np.zeros(capacity, field.dtype) for name, field in KEPT.items()}
+    def __init__(self, capacity: int, spec: EnvSpec, *, prioritized: bool) -> None:
+        self.slots = np.zeros((capacity, 2 * spec.stack), np.int32)
+        fields = columns_of(KEPT, spec)
+        self._written = [name for name in columns_of(IN_SEGMENT, spec) if name in fields]
+        self._read = [name for name in columns_of(IN_BATCH, spec) if name in fields]
+        self.named: dict[str, Array] = {
+            name: np.zeros((capacity, *field.row_shape(spec)), field.dtype) for name, field in fields.items()
+        }
         self.ids, self.reuse, self._terminated = (self.named[name] for name in ("ids", "reuse", "terminated"))
         self.priorities = self.named["priorities"] = np.zeros(capacity if prioritized else 0)
         self.terminal = 0
@@ -38,7 +40,7 @@ class Columns:
         """Put transitions `kept` of a segment, whose first one has the number `first`, into `rows`, never drawn yet."""
         self.terminal -= int(np.count_nonzero(self._terminated[rows]))
         self.slots[rows] = slots
-        for name in _WRITTEN:
+        for name in self._written:
             self.named[name][rows] = getattr(segment, name)[kept]
         self.terminal += int(np.count_nonzero(segment.terminated[kept]))
         self.ids[rows] = np.arange(first, first + segment.steps)[kept]
@@ -46,7 +48,7 @@ class Columns:
 
     def read(self, rows: Slots) -> dict[str, Array]:
         """Copy the fields of `rows` that a batch carries, by name."""
-        return {name: self.named[name][rows] for name in _READ}
+        return {name: self.named[name][rows] for name in self._read}
 
     def state(self, size: int) -> dict[str, Array]:
         """Copy the first `size` rows of each column, without the slots."""

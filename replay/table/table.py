@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from coop.common.errors import UsageError
 from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
-from coop.common.transitions import IN_SEGMENT, Batch, Segment
+from coop.common.transitions import IN_SEGMENT, MASKS, Batch, Segment
 from coop.common.types import Array, EnvSpec
 from coop.replay.table.columns import Columns
 from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
@@ -92,7 +92,10 @@ class Table:
         self.inserted = self.preloaded = self.preload_sum = 0
         self.batches = 0
         self._settings = {
-            "spec": [spec.env_id, list(spec.frame_shape), spec.frame_dtype, spec.stack, spec.num_actions],
+            "spec": [
+                *(spec.env_id, list(spec.frame_shape), spec.frame_dtype, spec.stack, spec.num_actions),
+                *([True] if spec.masks else []),
+            ],
             "capacity": capacity,
             "eviction": eviction,
             "sampling": sampling,
@@ -103,7 +106,7 @@ class Table:
         self._frames = FrameStore(spec.frame_shape, spec.frame_dtype, shared_memory=shared_memory)
         evicts, draws = EVICTIONS.get(eviction), SAMPLERS.get(sampling)
         self._prioritized = evicts.priorities or draws.priorities
-        self._columns = seen = Columns(capacity, spec.stack, prioritized=self._prioritized)
+        self._columns = seen = Columns(capacity, spec, prioritized=self._prioritized)
         self._max_priority = 1.0
         self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
         self._held = 0
@@ -156,7 +159,13 @@ class Table:
 
     def repeated(self) -> int:
         """Count the transitions held that equal another one in their frames, action, reward, end and span."""
-        own = ("ids", "reuse", "param_version", "priorities")  # these differ where a transition has come in twice
+        own = (
+            "ids",
+            "reuse",
+            "param_version",
+            "priorities",
+            *MASKS,
+        )  # these differ where a transition has come in twice
         slots = self._columns.slots[: len(self)].astype(np.intp)
         columns = (column for name, column in self._columns.named.items() if name not in own)
         values = zip(slots, *columns, strict=False)

@@ -23,10 +23,12 @@ class Layout:
     """The arrays of a kind of message.
 
     arrays: by name (dtype, shape); a word in a shape stands for any length, equal throughout the message.
+    names: of those, and of arrays that such messages have for other environments.
     """
 
-    def __init__(self, arrays: Mapping[str, tuple[str, tuple[int | str, ...]]]) -> None:
+    def __init__(self, arrays: Mapping[str, tuple[str, tuple[int | str, ...]]], others: Set[str] = frozenset()) -> None:
         self.arrays = arrays
+        self.names = arrays.keys() | others
         self.lengths = functools.lru_cache(_LENGTHS)(self._lengths)
 
     def _lengths(self, table: ArrayTable) -> Mapping[str, int]:
@@ -78,7 +80,7 @@ def to_struct(message: Message, kind: type[T], layout: Layout = NO_ARRAYS) -> T:
     """Convert a message's fields, and its arrays checked against `layout`, into a struct; raises BadMessage."""
     fields, expected = message.fields, _names(kind)
     if layout.arrays:
-        expected = expected - layout.arrays.keys()
+        expected = expected - layout.names
     if fields.keys() != expected:
         raise BadMessage("fields", _difference(fields.keys(), expected))
     try:

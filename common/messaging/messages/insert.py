@@ -11,18 +11,17 @@ from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.messages.body import Layout, check_kind, to_struct
 from coop.common.messaging.wire import Message
-from coop.common.transitions import FIELDS, IN_SEGMENT, Segment, layout
+from coop.common.transitions import FIELDS, IN_SEGMENT, MASKS, Segment, arrays_of, columns_of, layout
 from coop.common.types import Array, EnvSpec
 
 KIND = "insert"
-_ARRAYS = ("frames", *IN_SEGMENT)
-_FIELDS = tuple(name for name in Segment.__struct_fields__ if name not in _ARRAYS)
+_FIELDS = tuple(name for name in Segment.__struct_fields__ if name not in {"frames", *IN_SEGMENT, *MASKS})
 
 
 def encode_segment(run: str, segment: Segment, into: bytearray | None = None) -> bytearray:
     """Build an insert request; into: see `wire.encode`."""
     fields = {name: getattr(segment, name) for name in _FIELDS}
-    return wire.encode(KIND, run, fields, {name: getattr(segment, name) for name in _ARRAYS}, into)
+    return wire.encode(KIND, run, fields, {"frames": segment.frames, **arrays_of(segment, IN_SEGMENT)}, into)
 
 
 def check_indices(arrays: Mapping[str, Array], frames: int) -> None:
@@ -38,8 +37,9 @@ def check_values(spec: EnvSpec, arrays: Mapping[str, Array]) -> None:
         check_range("arrays.frames", frames.view(np.uint8), 0, 1)
     elif frames.dtype == np.float32:
         check_range("arrays.frames", frames, -MAX_MAGNITUDE, MAX_MAGNITUDE)
+    fields = columns_of(FIELDS, spec)
     for name, array in arrays.items():
-        if name in FIELDS and (bounds := FIELDS[name].bounds(spec, arrays)) is not None:
+        if name in fields and (bounds := fields[name].bounds(spec, arrays)) is not None:
             check_range(f"arrays.{name}", array.view(np.uint8) if array.dtype == np.bool_ else array, *bounds)
 
 
@@ -57,7 +57,7 @@ class SegmentReader:
 
     def __init__(self, spec: EnvSpec) -> None:
         self._spec = spec
-        self._layout = Layout(layout(IN_SEGMENT, spec, "steps"))
+        self._layout = Layout(layout(IN_SEGMENT, spec, "steps"), MASKS.keys())
 
     def __call__(self, message: Message) -> Segment:
         """Read one; raises BadMessage for anything that the table could not store."""

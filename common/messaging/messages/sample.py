@@ -18,7 +18,7 @@ from coop.common.messaging.messages.body import Body, Layout, check_kind, to_str
 from coop.common.messaging.messages.insert import check_indices, check_range, check_values
 from coop.common.messaging.wire import Message, Source
 from coop.common.process.shared_memory import ADDRESS
-from coop.common.transitions import IN_BATCH, Batch, Drawn, DrawRequest, layout
+from coop.common.transitions import IN_BATCH, Batch, Drawn, DrawRequest, columns_of, layout
 from coop.common.types import Array, EnvSpec
 
 KIND = "batch"
@@ -146,6 +146,7 @@ class NamedBatchReader:
             "numbers": ("int64", ("named",)),
             "carried": ("int32", ("frames",)),
         }
+        self._columns = columns_of(IN_BATCH, spec)
         self._layout = Layout({**layout(IN_BATCH, spec, "batch"), **named})
 
     def __call__(self, message: Message) -> tuple[Draws, list[NamedBatch]]:
@@ -171,7 +172,7 @@ class NamedBatchReader:
             stop = start + frames
             low, high = (0, len(carried)) if count == 1 else carried.searchsorted((start, stop))
             rows = slice(place * size, (place + 1) * size)
-            columns = {name: arrays[name][rows] for name in IN_BATCH}
+            columns = {name: arrays[name][rows] for name in self._columns}
             check_indices(columns, frames)
             batches.append(
                 NamedBatch(

@@ -10,10 +10,9 @@ import gymnasium
 import numpy as np
 import pandas as pd
 
-from coop.common.numbers import RETURN_WINDOW, running_mean
+from coop.common.numbers import RETURN_WINDOW, SHORT_WINDOW, running_mean
 from coop.studies.report.study import Floats, Run, Study
 
-SHORT = 20  # episodes in the running mean that decides whether a run is healthy or has collapsed
 FALL = 3 / 13  # share of the threshold by which a healthy run must fall to collapse; for CartPole from 195 to 150
 
 
@@ -51,8 +50,8 @@ def area(run: Run) -> float:
 
 def course(run: Run, threshold: float) -> Course:
     """Compute a run's `Course`."""
-    means = running_mean(run.returns, SHORT)[SHORT - 1 :]
-    steps = run.end_steps[SHORT - 1 :]
+    means = running_mean(run.returns, SHORT_WINDOW)[SHORT_WINDOW - 1 :]
+    steps = run.end_steps[SHORT_WINDOW - 1 :]
     fallen = threshold - FALL * abs(threshold)
     collapses, healthy_steps, since = 0, 0.0, math.nan
     for step, mean in zip(steps, means, strict=True):

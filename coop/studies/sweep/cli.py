@@ -22,6 +22,7 @@ from coop.common.process.cli import parse
 from coop.common.process.console import say
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.limits import cores
+from coop.common.settings.starting import settings_line, source_of
 from coop.monitor.display import LiveDisplay
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.studies.sweep import slurm
@@ -141,7 +142,13 @@ def _run() -> None:
         print(*(submitted or ["every cell is finished"]), sep="\n")
         return
     with _executor(options, grid.file, cells) as executor:
-        _work(Runner(cells, executor), folder)
+        _work(Runner(cells, executor), folder, settings_of(grid.file, cells))
+
+
+def settings_of(grid: GridFile, cells: Sequence[CellFolder]) -> str:
+    """The settings of a sweep's cells that matter most, in one line."""
+    configs = [cell.cell.config for cell in cells]
+    return settings_line(*((config, source_of(grid.preset, None, False, config.env.id)) for config in configs))
 
 
 def _executor(options: SweepOptions, grid: GridFile, folders: Sequence[CellFolder]) -> AbstractContextManager[Executor]:
@@ -167,7 +174,7 @@ def chosen(options: SweepOptions, grid: Grid, folder: Path) -> list[CellFolder]:
     return [CellFolder(folder, cell, options.log) for cell in there.values() or grid.cells]
 
 
-def _work(runner: Runner, folder: Path) -> None:
+def _work(runner: Runner, folder: Path, settings: str) -> None:
     """Run until no cell is left or a stop is requested.
 
     Raises:
@@ -177,6 +184,7 @@ def _work(runner: Runner, folder: Path) -> None:
     stop = Stop()
     stop.on_signals()
     with SweepDisplay(runner) as display:
+        display.say(settings)
         display.say(f"{len(runner.folders)} cells in {shown(folder)}, {runner.skipped} of them finished before")
         for name, how in runner.diverged.items():
             display.say(f"{name}: {how}")
