@@ -220,7 +220,11 @@ def test_bad_input_gets_one_line(
     (tmp_path / "taken" / "notes.txt").write_text("mine")
     for flags, status, words in (
         ((tmp_path, "--out", tmp_path / "a"), 2, "holds no run"),
-        ((tmp_path / "run",), 2, "missing: --out for the networks, or --dataset for the buffer"),
+        (
+            (tmp_path / "run",),
+            2,
+            "missing: --out for the networks, --dataset for the buffer, or --hub for a model repository",
+        ),
         ((), 2, "missing: RUN_DIR"),
         (("", "--out", tmp_path / "a"), 2, "RUN_DIR: an empty value"),
         ((tmp_path / "run", "--otu", tmp_path / "a"), 2, "--otu: unknown; did you mean --out? "),

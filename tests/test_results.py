@@ -282,6 +282,7 @@ def test_what_the_pages_say_of_s() -> None:
         assert "falling to 0.002" in PAGES[page]
 
 
+@pytest.mark.timeout(300)  # 13 s of processor time, on a busy machine
 def test_what_feedback_does_to_a_step() -> None:
     """The table of docs/algorithm.md, and what the pages quote of it."""
     rows = feedback.measure(1000)
