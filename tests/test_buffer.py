@@ -99,6 +99,7 @@ def test_it_says_which_transitions_were_truncated(n_step: int, tmp_path: Path) -
     assert set(buffer.length[buffer.ids < ends[-1]]) == {7}
 
 
+@pytest.mark.timeout(300)
 def test_a_running_run_gives_its_buffer_and_goes_on(tmp_path: Path) -> None:
     run = coop.train(method="dqn", total_steps=10**6, run_dir=tmp_path, replay={**SMALL, "capacity": 10**6})
     try:

@@ -174,6 +174,7 @@ def mlflow_store(folder: Path) -> Any:
     return MlflowClient(tracking_uri=folder.as_uri())
 
 
+@pytest.mark.timeout(400)  # two processes
 def test_the_runs_of_a_sweep_are_an_experiment(tmp_path: Path) -> None:
     pytest.importorskip("mlflow", reason="needs the extra mlflow")
     done = coop.sweep(GRID, tmp_path / "study", jobs=2, stack=1, log=["mlflow"])
@@ -190,6 +191,7 @@ def test_the_runs_of_a_sweep_are_an_experiment(tmp_path: Path) -> None:
     assert {each.info.run_name: each.data.metrics["final/return_mean_100"] for each in runs} == pytest.approx(means)
 
 
+@pytest.mark.timeout(400)  # two processes
 def test_the_runs_of_a_sweep_are_a_group_with_tags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("wandb", reason="needs the extra wandb")
     from wandb.proto.wandb_internal_pb2 import Record  # noqa: PLC0415
@@ -208,6 +210,7 @@ def test_the_runs_of_a_sweep_are_a_group_with_tags(tmp_path: Path, monkeypatch: 
         assert json.loads(final["final/return_mean_100"]) == pytest.approx(row["return_mean_100"])
 
 
+@pytest.mark.timeout(400)  # two processes
 def test_hparams_compare_the_cells_of_a_grid(tmp_path: Path) -> None:
     done = coop.sweep(GRID, tmp_path, jobs=1, stack=1)
     multiplexer = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
