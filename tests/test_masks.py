@@ -30,6 +30,7 @@ from coop.learner.agent import Agent
 from coop.learner.diagnostics import Diagnostics
 from coop.learner.methods.rule import UpdateRule
 from coop.learner.recorded import _WARM_UPS
+from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.reexecute import reexecute
 from coop.replay.table.table import Table
 
@@ -305,6 +306,20 @@ def test_diagnostics_leave_out_actions_that_are_not_allowed() -> None:
     other = Diagnostics()
     other.load_state(diagnostics.state())
     np.testing.assert_array_equal(other.archive.mask, batch.mask)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("method", ["dqn", "stream-q"])
+def test_lockstep_trains_with_masks(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = {name: value for name, value in SHORT.items() if name != "replay" or method == "dqn"}
+    run = Lockstep(resolve({**tables, "env": {"id": INFO}}, method))
+    seen: list[Batch] = []
+    train = run.trainer.train
+    monkeypatch.setattr(run.trainer, "train", lambda batch, *others: seen.append(batch) or train(batch, *others))
+    for _ in range(60):
+        list(run.play())
+    assert any(batch.terminated.any() for batch in seen)
+    for batch in seen:
+        assert_own_masks(batch)
 
 
 @pytest.mark.parametrize("method", ["dqn", "coop", "medqn", "stream-q"])
