@@ -72,3 +72,15 @@ def test_a_machine_that_dies_loses_only_what_no_promise_covers() -> None:
             _assert_holds(outcome)
             assert outcome.met["crash"] > 0
             assert not outcome.forgiven or journal == "async"
+
+
+def test_a_flush_that_outlives_the_confirmation_acknowledges_nothing() -> None:
+    faults = (
+        Fault(0.5, "slow", "replay", length=5.0, number=3.0),
+        Fault(0.7, "partition", "replay", "learner", 4.0),
+        Fault(0.8, "second", "replay", "elsewhere"),
+    )
+    plan = replace(make_plan(0), faults=faults, journal="sync", every=0.1, total=96, actors=2)
+    _assert_holds(simulate(0, plan))
+    with planted("late-acknowledgement"):
+        assert simulate(0, plan).problem.startswith("one service: ")
