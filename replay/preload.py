@@ -55,6 +55,7 @@ def as_segment(rows: Rows, spec: EnvSpec, sequence: int, *, clip: bool) -> Segme
     given = {
         "obs_index": index[:, : spec.stack], "next_index": index[:, spec.stack :], "actions": rows.actions,
         "rewards": rewards, "terminated": rows.terminated, "span": rows.span,
+        "mask": rows.mask, "next_mask": rows.next_mask,
     }  # fmt: skip
     columns = filled(IN_SEGMENT, steps, given)
     check_values(spec, {"frames": frames[first], **columns})

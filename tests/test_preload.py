@@ -64,7 +64,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "data.parquet"
 
 
-@pytest.mark.parametrize("env", [{"id": "coop/Catch-v0", "stack": 2}, {"id": "CartPole-v0"}])
+@pytest.mark.parametrize("env", [{"id": "coop/Catch-v0", "stack": 2}, {"id": "CartPole-v0"}, {"id": "gates:Gates-v0"}])
 def test_a_table_begins_with_a_data_set(env: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(datasets, "ROWS", 16)
     monkeypatch.setattr("coop.evaluation.dataset.ROWS_AT_ONCE", 24)
@@ -74,7 +74,8 @@ def test_a_table_begins_with_a_data_set(env: dict[str, Any], tmp_path: Path, mon
     assert run.notices == [f"the table begins with 40 transitions of {tmp_path}/data.parquet"]
     given, buffer = coop.load(tmp_path / "run").buffer(), coop.load(tmp_path / "b").buffer()
     assert len(buffer) == 160
-    for name in SAME:
+    assert (buffer.mask is not None) == (env["id"] == "gates:Gates-v0")
+    for name in (*SAME, *(() if buffer.mask is None else ("mask", "next_mask"))):
         np.testing.assert_array_equal(getattr(buffer, name)[:40], getattr(given, name), name, strict=True)
     assert buffer.age[0] == 159
     assert buffer.reuse[:40].sum() > 0
@@ -87,6 +88,14 @@ def test_a_table_begins_with_a_data_set(env: dict[str, Any], tmp_path: Path, mon
     assert coop.load(tmp_path / "b").episodes["env_step"].max() <= 120
     counters = run.run.memory.counters()
     assert (counters["size"], counters["evicted"], counters["evicted_unsampled"]) == (160, 0, 0)
+
+
+def test_a_data_set_without_masks_is_none_of_an_environment_with_them(tmp_path: Path) -> None:
+    saved(tmp_path / "run", env={"id": "gates:Gates-v0"}, replay=SMALL)
+    export_dataset(tmp_path / "run", tmp_path / "data.parquet")
+    pq.write_table(pq.read_table(tmp_path / "data.parquet").drop_columns("next_mask"), tmp_path / "less.parquet")
+    with pytest.raises(UsageError, match="less.parquet'?: has no column next_mask; needed: .*, mask, next_mask"):
+        played(config_of(tmp_path / "less.parquet", env={"id": "gates:Gates-v0"}), tmp_path / "b")
 
 
 def test_a_table_that_is_too_small_evicts_before_the_run_begins(data: Path, tmp_path: Path) -> None:

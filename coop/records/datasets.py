@@ -22,6 +22,7 @@ from coop.common.bounds import MAX_N_STEP
 from coop.common.errors import CoopError, UsageError, first_line
 from coop.common.imports import check_extra
 from coop.common.process.untrusted import MAX_SETTINGS, page_sizes, read_text
+from coop.common.transitions import MASKS
 from coop.common.types import Array, EnvSpec
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class Rows:
         actions: int32 [n]. rewards: float32 [n]. terminated: bool [n].
         ends: bool [n], whether an episode ends with it; of the last of these only if the data say so.
         span: uint8 [n], environment steps from obs to next_obs.
+        mask, next_mask: bool [n, actions], as in `Masked`; None unless the environment has action masks.
     """
 
     obs: Array
@@ -56,6 +58,8 @@ class Rows:
     terminated: NDArray[np.bool_]
     ends: NDArray[np.bool_]
     span: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
+    next_mask: NDArray[np.bool_] | None = None
 
 
 def read_rows(path: Path, spec: EnvSpec, source: str) -> Iterator[Rows]:
@@ -103,9 +107,10 @@ def _of_parquet(path: Path, spec: EnvSpec) -> Iterator[Rows]:
         pq.ParquetFile(path, pre_buffer=False) as file,
     ):
         there = set(file.schema_arrow.names)
-        if missing := [name for name in _COLUMNS if name not in there]:
-            raise ValueError(f"has no column {missing[0]}; needed: {', '.join(_COLUMNS)}")
-        names = [*_COLUMNS, *(name for name in _OPTIONAL if name in there)]
+        needed = (*_COLUMNS, *(MASKS if spec.masks else ()))
+        if missing := [name for name in needed if name not in there]:
+            raise ValueError(f"has no column {missing[0]}; needed: {', '.join(needed)}")
+        names = [*needed, *(name for name in _OPTIONAL if name in there)]
         _check_groups(file, content, names)
         before: Rows | None = None
         episode = None  # of the last transition
@@ -140,7 +145,8 @@ def _values(name: str, column: pa.Array, spec: EnvSpec) -> Array:
     """A column's rows, <its dtype>[n] or, of observations, [n, *obs_shape]."""
     import pyarrow as pa  # noqa: PLC0415
 
-    rows, shape = len(column), spec.obs_shape if "observations" in name else ()
+    shape = spec.obs_shape if "observations" in name else (spec.num_actions,) if name in MASKS else ()
+    rows = len(column)
     if column.null_count:
         raise ValueError(f"column {name}: has rows without a value")
     if shape and not pa.types.is_primitive(column.type):
@@ -150,7 +156,8 @@ def _values(name: str, column: pa.Array, spec: EnvSpec) -> Array:
         lengths = column.value_lengths() if any_length else None
         held = {column.type.list_size} if lengths is None else {*lengths.unique().to_pylist()}
         if held != {math.prod(shape)}:
-            raise ValueError(f"column {name}: rows of {min(held)} values; an observation of {spec.env_id} has {shape}")
+            of = "a mask" if name in MASKS else "an observation"
+            raise ValueError(f"column {name}: rows of {min(held)} values; {of} of {spec.env_id} has {shape}")
         column = column.flatten()
         if column.null_count:
             raise ValueError(f"column {name}: has rows without a value")
@@ -163,6 +170,8 @@ def _values(name: str, column: pa.Array, spec: EnvSpec) -> Array:
 def _of_minari(folder: Path, spec: EnvSpec) -> Iterator[Rows]:
     import h5py  # noqa: PLC0415 (an extra)
 
+    if spec.masks:
+        raise ValueError(f"Minari data sets have no action masks, and {spec.env_id} has; Parquet files may have them")
     first, jpeg = _described(folder)
     with h5py.File(folder / MINARI, "r") as file:
         found = [(int(match[1]), name) for name in file if (match := _EPISODE.fullmatch(name))]
@@ -236,6 +245,7 @@ def _checked(columns: Mapping[str, Array], spec: EnvSpec) -> Rows:
         terminated,
         ends | columns.get("last", np.zeros_like(ends)),
         span.astype(np.uint8),
+        *(_as(name, columns[name], np.bool_) for name in MASKS if name in columns),
     )
 
 
