@@ -94,7 +94,7 @@ def test_a_data_set_without_masks_is_none_of_an_environment_with_them(tmp_path: 
     saved(tmp_path / "run", env={"id": "gates:Gates-v0"}, replay=SMALL)
     export_dataset(tmp_path / "run", tmp_path / "data.parquet")
     pq.write_table(pq.read_table(tmp_path / "data.parquet").drop_columns("next_mask"), tmp_path / "less.parquet")
-    with pytest.raises(UsageError, match="less.parquet'?: has no column next_mask; needed: .*, mask, next_mask"):
+    with pytest.raises(UsageError, match=r"less\.parquet'?: has no column next_mask; needed: .*, mask, next_mask"):
         played(config_of(tmp_path / "less.parquet", env={"id": "gates:Gates-v0"}), tmp_path / "b")
 
 
