@@ -7,7 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from commands import TESTS, run_command
+from commands import run_command
+from forked import TESTS
 from gates import ACTIONS, STATES, Gates, mask_of
 
 import coop

@@ -301,5 +301,5 @@ def test_malformed_messages_of_an_actor_are_refused_counted_and_named(run: tuple
     assert f"refused a message at coop/{RUN}/replay/0/insert: " in (folder / "replay.log").read_text()
     log = (folder / "learner.log").read_text()
     assert "error of this program" not in log
-    assert log.count(f"refused a message at coop/{RUN}/metrics/actor/*: key: ") == 1, "one line for many"
+    assert log.count(f"refused a message at coop/{RUN}/metrics/actor/*: payload: ") == 1, "one line for many"
     assert "\u202e" not in log

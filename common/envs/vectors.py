@@ -41,9 +41,9 @@ def make_rows(name: str, plain: EnvSpec, mode: str, seeds: Sequence[int]) -> lis
     envs = make(len(seeds))
     reset = _autoreset(name, envs)
     if reset != AutoresetMode.NEXT_STEP or _restarts_alone(envs, reset) or len(seeds) == 1:
-        return _Emulators(name, envs, reset, seeds).rows
+        return _VectorEmulators(name, envs, reset, seeds).rows
     envs.close()
-    return [row for seed in seeds for row in _Emulators(name, make(1), reset, [seed]).rows]
+    return [row for seed in seeds for row in _VectorEmulators(name, make(1), reset, [seed]).rows]
 
 
 def _autoreset(name: str, envs: Vector) -> AutoresetMode:
@@ -60,7 +60,7 @@ def _restarts_alone(envs: Vector, mode: AutoresetMode) -> bool:
     return mode == AutoresetMode.DISABLED or isinstance(envs.unwrapped, SyncVectorEnv | AsyncVectorEnv)
 
 
-class _Emulators:
+class _VectorEmulators:
     """The emulators of one vector environment."""
 
     def __init__(self, name: str, envs: Vector, mode: AutoresetMode, seeds: Sequence[int]) -> None:
@@ -135,7 +135,7 @@ class Row(gymnasium.Env[Any, Any]):
 
     action_masks: Callable[[], NDArray[Any]]
 
-    def __init__(self, emulators: _Emulators, number: int) -> None:
+    def __init__(self, emulators: _VectorEmulators, number: int) -> None:
         envs = emulators.envs
         self._emulators, self._number = emulators, number
         self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
