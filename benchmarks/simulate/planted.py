@@ -156,9 +156,11 @@ def _overtaking_draws() -> Patches:
 
 
 def _late_acknowledgement() -> Patches:
+    real = ReplayService._flush
+
     def flush(self: Any) -> bytearray | None:  # noqa: ANN401
-        self._synced.flush(self._changed)
-        return None
+        refusal = real(self)
+        return refusal if self._broken else None
 
     return [(ReplayService, "_flush", flush)]
 
