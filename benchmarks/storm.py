@@ -57,7 +57,7 @@ class Storm:
     def __init__(self, folder: Path, hosts: dict[str, Host], seed: int) -> None:
         self._hosts, self._chance, self._folder = hosts, random.Random(seed), folder
         learner_at, replay_at = (f"tcp/{hosts[host].address(4)}:7447" for host in ("head", "rep"))
-        joining = (f"--run={RUN}", "--connect", learner_at, "--join-timeout=120")
+        joining = (f"--run={RUN}", "--connect", learner_at, "--join-timeout=300", "--patience=300")
         settings = (f"--total-steps={STEPS}", f"--replay.capacity={STEPS}", "--replay.ratio=2", "--replay.journal")
         self._flags = {
             "learner": (
@@ -172,14 +172,16 @@ class Storm:
             self._counted = now, updates
 
     def sample(self) -> None:
-        """Note what every role that lives takes, and the files of the run."""
+        """Note what every role takes, and the files of the run, while everybody works."""
+        if self._whole_since is None or time.monotonic() < self._whole_since:
+            return
         for name, process in self.roles.processes.items():
             if name not in self._heals and process.exit_status() is None:
                 try:
                     self.samples[name].append(measure(process.pid))
                 except (OSError, KeyError):
                     continue
-        self.files.append(sum(1 for path in self._folder.rglob("*") if "journal" not in path.parts))
+        self.files.append(sum(1 for path in self._folder.rglob("*") if not {"journal", "aside"} & {*path.parts}))
 
 
 def ride(storm: Storm, kills: int, joins: int, give_up: float) -> None:
@@ -262,7 +264,9 @@ def report(storm: Storm, seconds: float) -> list[str]:
     first, last = median(storm.files[:quarter]), median(storm.files[-quarter:])
     folder = storm.roles.folder
     roster, kept = (folder / "roster.json").stat().st_size, len(checkpoint_numbers(folder))
-    print(f"{'run directory':22}{first:.0f} -> {last:.0f} files without the journal's, roster.json {roster} bytes")
+    print(
+        f"{'run directory':22}{first:.0f} -> {last:.0f} files but for journal/ and aside/, roster.json {roster} bytes"
+    )
     if last > first + 5 or kept > 3:
         problems.append("the run's files become more")
     return problems
