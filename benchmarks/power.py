@@ -200,6 +200,7 @@ def resume_sweep(at: Path, folder: Path) -> tuple[str, int, int]:
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
     assert process.stdout is not None
+    process.stdout.readline()  # the settings
     line = process.stdout.readline()
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
