@@ -272,7 +272,7 @@ class Cluster:
             replace("coop.common.process.files.time", SimpleNamespace(strftime=lambda form: "moved"))
             replace("coop.common.messaging.messages.control.JoinReply.decode", _remembered)
             replace("coop.common.messaging.joining.difference", _difference)
-            replace("benchmarks.simulate.network.SimNode.on_reply", staticmethod(checks.on_reply))
+            replace("benchmarks.simulate.node.SimNode.on_reply", staticmethod(checks.on_reply))
             yield
 
     def _present_process(self) -> Process:

@@ -12,7 +12,8 @@ from typing import Any, Self
 import numpy as np
 
 from benchmarks.simulate.agent import FewNumbers, Numbers
-from benchmarks.simulate.network import RUN, Network, SimNode
+from benchmarks.simulate.network import Network
+from benchmarks.simulate.node import RUN, SimNode
 from benchmarks.simulate.world import Process
 from coop.actors.weights import WeightsFollower
 from coop.common.errors import RunError
