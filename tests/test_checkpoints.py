@@ -16,7 +16,7 @@ from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConf
 from coop.common.transitions import DrawRequest
 from coop.common.types import EnvSpec, EpisodeRecord
 from coop.records.checkpoints import DONE, checkpoint_numbers
-from coop.records.learner_checkpoints import load_learner, newest_checkpoint, save_checkpoint
+from coop.records.learner_checkpoints import load_learner, newest_checkpoint, saving_checkpoint
 from coop.records.resumption import go_back, survey
 from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.episodes import MOST, EpisodeLog
@@ -211,7 +211,8 @@ def test_the_learner_s_count_is_the_count_of_draws(spec: EnvSpec) -> None:
 
 def save_learner(run_dir: Path, number: int, state: dict[str, Any]) -> None:
     """A checkpoint of a learner whose records are empty."""
-    save_checkpoint(run_dir, 5, number, state, lambda _: None, records={})
+    with saving_checkpoint(run_dir, 5, number, state, records={}):
+        pass
 
 
 def finished(run_dir: Path) -> list[int]:
@@ -238,11 +239,8 @@ def test_learner_checkpoints(tmp_path: Path) -> None:
     assert moved == f"what is younger is in {aside}"
     assert (aside / "checkpoints" / "400" / "learner.pt").read_bytes() == b"half", "and nothing is deleted"
 
-    def fails(folder: str) -> None:
+    with pytest.raises(RunError), saving_checkpoint(tmp_path, 5, 500, {}, records={}) as folder:
         raise RunError(f"no room for {folder}")
-
-    with pytest.raises(RunError):
-        save_checkpoint(tmp_path, 5, 500, {}, fails, records={})
     assert finished(tmp_path) == [200]
     assert not (tmp_path / "checkpoints" / "500").exists()
     assert newest_checkpoint(tmp_path) is not None

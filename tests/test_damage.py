@@ -331,10 +331,11 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
         (tmp_path / name).write_text("a line\n")
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(Path, "replace", renamed)
-    from coop.records.learner_checkpoints import save_checkpoint  # noqa: PLC0415 (with what is patched)
+    from coop.records.learner_checkpoints import saving_checkpoint  # noqa: PLC0415 (with what is patched)
 
     records = {name: measure(tmp_path / name) for name in checkpoints.RECORDS}
-    save_checkpoint(tmp_path, 5, 100, {"a": 1}, lambda _: calls.append("replay"), records=records)
+    with saving_checkpoint(tmp_path, 5, 100, {"a": 1}, records=records):
+        calls.append("replay")
     order = [calls.index(each) for each in ("name checkpoints/100/learner.pt", "replay", "sync episodes.csv")]
     done = calls.index("name checkpoints/100/DONE")
     for place, name in ((place, call.removeprefix("name ")) for place, call in enumerate(calls) if call[:4] == "name"):
@@ -347,8 +348,9 @@ def test_a_checkpoint_is_whole_on_the_disk_before_its_name(tmp_path: Path, monke
     assert max(order) < calls.index("sync metrics.jsonl") < last <= done
     assert calls[done + 1] == "sync checkpoints/100"
     (tmp_path / "metrics.jsonl").write_text("")
-    with pytest.raises(OSError, match=r"metrics\.jsonl: lines wait for space"):
-        save_checkpoint(tmp_path, 5, 200, {}, lambda _: None, records=records)
+    ahead = saving_checkpoint(tmp_path, 5, 200, {}, records=records)
+    with pytest.raises(OSError, match=r"metrics\.jsonl: lines wait for space"), ahead:
+        pass
 
 
 def test_a_run_over_processes_goes_on_from_the_checkpoint_that_both_hold(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from coop.common.types import EpisodeRecord
 from coop.learner.trainer import Effects, Trainer
 from coop.lockstep.memory import make_experience
 from coop.records.checkpoints import REPLAY
-from coop.records.learner_checkpoints import fitting, save_checkpoint
+from coop.records.learner_checkpoints import fitting, saving_checkpoint
 from coop.records.resumption import Whole
 from coop.records.run_directory import RunDirectory
 from coop.replay.persistence.storage import Mark
@@ -103,22 +103,17 @@ class Lockstep:
             },
         }
         run_id, number = directory.run_id(), self.agent.updates
-        mark = Mark(run_id, number, 0)
-
-        def snapshot(folder: str) -> None:
-            self.memory.save(directory.path / folder / REPLAY, mark)
-
         try:
-            save_checkpoint(
+            with saving_checkpoint(
                 directory.path,
                 run_id,
                 number,
                 state,
-                snapshot,
                 records=directory.records(),
                 fallbacks=directory.fallbacks,
                 settings=directory.settings,
-            )
+            ) as path:
+                self.memory.save(path / REPLAY, Mark(run_id, number, 0))
         except OSError as error:
             text = f"checkpoint {self.agent.updates} in {directory.path}: {error.strerror or error}"
             raise RunError(text) from error

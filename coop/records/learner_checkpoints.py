@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,29 +17,6 @@ from coop.common.process.output import warn
 from coop.common.process.untrusted import check_torch_file
 from coop.records.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
 from coop.records.resumption import Whole, survey
-
-
-def save_checkpoint(
-    run_dir: Path,
-    run_id: int,
-    number: int,
-    learner_state: dict[str, Any],
-    snapshot: Callable[[str], None],
-    *,
-    records: Mapping[str, FileDigest],
-    fallbacks: Sequence[str] = (),
-    settings: str = "",
-) -> Path:
-    """Save one checkpoint, and delete those that are too old.
-
-    snapshot: makes the replay service save its state under the given folder, relative to the run directory.
-    The other arguments are those of `saving_checkpoint`, and it raises the same.
-    """
-    with saving_checkpoint(
-        run_dir, run_id, number, learner_state, records=records, fallbacks=fallbacks, settings=settings
-    ) as path:
-        snapshot(str(path.relative_to(run_dir)))
-    return path
 
 
 @contextmanager
