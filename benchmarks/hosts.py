@@ -5,8 +5,11 @@ Every host has an IPv4 and an IPv6 address, and a file of host names, which `ip 
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,6 +17,7 @@ from coop.common.errors import RunError
 
 WIRE = "wire"  # a host's interface; the other end, in the switch, has the host's name
 BRIDGE = "bridge0"
+INSIDE = "COOP_NETNS"  # set in a script that runs inside the first host's namespace: the network's number
 NAMES = Path("/etc/netns")  # NAMESPACE/hosts: the host names that processes in the namespace know
 
 
@@ -97,6 +101,21 @@ def network_of(number: int, names: Sequence[str]) -> Iterator[dict[str, Host]]:
                 (NAMES / host.namespace).rmdir()
         if ours and NAMES.exists():
             NAMES.rmdir()
+
+
+def inside_the_first(names: Sequence[str], script: Callable[[dict[str, Host]], None]) -> None:
+    """Make a network of hosts, and call `script` with them in another process of this program, on the first host.
+
+    Without root or iproute2 it says so, and skips. Ends with that process's status.
+    """
+    if os.geteuid() or shutil.which("ip") is None:
+        print("SKIP: making network namespaces needs root and iproute2")
+    elif INSIDE in os.environ:
+        script(hosts_of(int(os.environ[INSIDE]), names))
+    else:
+        with network_of(os.getpid(), names) as hosts:
+            again = [*hosts[names[0]].inside, sys.executable, *sys.argv]
+            sys.exit(subprocess.run(again, env={**os.environ, INSIDE: str(os.getpid())}, check=False).returncode)
 
 
 def _switch(network: int) -> str:

@@ -9,8 +9,6 @@ status is 1.
 from __future__ import annotations
 
 import argparse
-import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from audit import audit
-from hosts import Host, hosts_of, network_of, write_names
+from hosts import Host, inside_the_first, write_names
 from roles import Roles, RunWatch, running, wait_until
 
 from coop.common.errors import CoopError, RunError
@@ -32,7 +30,6 @@ LEARNER_PORT, REPLAY_PORT = 7447, 7448
 LOAD = 3.0  # seconds of work before and after
 STEPS = 16_000  # of a run, so that it is still on when a cut ends
 RATIO, CLOSING_RATIO = "2", "0.1"  # updates per step: few steps pass during a scenario, and the rest soon after it
-INSIDE = "COOP_NETNS"  # set in the process that runs inside the head's namespace: the network's number
 
 
 class Trial:
@@ -174,6 +171,19 @@ def meet(trial: Trial, name: str, seconds: float) -> None:
         raise RunError("the run did not complete with every transition once")
 
 
+def meet_all(hosts: dict[str, Host], only: str, seconds: float) -> None:
+    """Let a run meet each incident with `only` in its name; raises a CoopError."""
+    for name, family, named in SCENARIOS:
+        if only in name:
+            with tempfile.TemporaryDirectory() as folder:
+                trial = Trial(Path(folder) / "run", hosts, family, named)
+                try:
+                    meet(trial, name, seconds)
+                except CoopError as error:
+                    said = (f"{role}: {process.last_line()}" for role, process in trial.roles.processes.items())
+                    raise RunError("\n  ".join((f"{trial}: {name}: {error}", *said))) from error
+
+
 def main() -> None:
     """Make the hosts, and run this script inside the first one."""
     parser = argparse.ArgumentParser(description="Cut hosts of a run from the network, and reboot one, under load.")
@@ -182,25 +192,10 @@ def main() -> None:
     options = parser.parse_args()
     if not options.seconds > 5:
         parser.error(f"--seconds {options.seconds:g}: must be more than 5")
-    if os.geteuid() or shutil.which("ip") is None:
-        print("SKIP: making network namespaces needs root and iproute2")
-        return
-    names = dict.fromkeys(PLACES.values())
     try:
-        if INSIDE not in os.environ:
-            with network_of(os.getpid(), list(names)) as hosts:
-                again = [*hosts["head"].inside, sys.executable, *sys.argv]
-                sys.exit(subprocess.run(again, env={**os.environ, INSIDE: str(os.getpid())}, check=False).returncode)
-        hosts = hosts_of(int(os.environ[INSIDE]), list(names))
-        for name, family, named in SCENARIOS:
-            if options.only in name:
-                with tempfile.TemporaryDirectory() as folder:
-                    trial = Trial(Path(folder) / "run", hosts, family, named)
-                    try:
-                        meet(trial, name, options.seconds)
-                    except CoopError as error:
-                        said = (f"{role}: {process.last_line()}" for role, process in trial.roles.processes.items())
-                        raise RunError("\n  ".join((f"{trial}: {name}: {error}", *said))) from error
+        inside_the_first(
+            list(dict.fromkeys(PLACES.values())), lambda hosts: meet_all(hosts, options.only, options.seconds)
+        )
     except CoopError as error:
         sys.exit(f"netns: error: {error}")
 

@@ -14,9 +14,7 @@ import argparse
 import math
 import os
 import random
-import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -25,7 +23,7 @@ from pathlib import Path
 from statistics import median
 
 from audit import audit
-from hosts import Host, hosts_of, network_of
+from hosts import Host, inside_the_first
 from roles import Roles, RunWatch, running, wait_until
 from soak import measure
 
@@ -36,7 +34,6 @@ from coop.records.checkpoints import checkpoint_numbers
 RUN = "storm"
 PLACES = {"learner": "head", "replay": "rep", "actor 1": "act1", "actor 2": "act2"}
 FLAPPING = "flap"  # the host of the actor that comes and goes
-INSIDE = "COOP_NETNS"  # set in the process that runs inside the head's namespace: the network's number
 STEPS = 2_000_000  # of a run, more than it will come to: the table holds all of them
 BETWEEN = 10.0  # seconds between two faults, in the mean
 SHORTEST, LONGEST = 1.0, 30.0  # seconds of a freeze or a cut
@@ -50,12 +47,12 @@ TICK = 0.1
 class Storm:
     """A run on the hosts, and what happens to it.
 
-    faults: number of each kind. joins: of the flapping actor. calm, between: (seconds, updates) of the time without
-    faults, and of the time between them in which everybody works.
+    chance: draws the faults and their moments. faults: number of each kind. joins: of the flapping actor. between:
+    seconds and updates of the time between faults in which everybody works.
     """
 
     def __init__(self, folder: Path, hosts: dict[str, Host], seed: int) -> None:
-        self._hosts, self._chance, self._folder = hosts, random.Random(seed), folder
+        self._hosts, self.chance, self._folder = hosts, random.Random(seed), folder
         learner_at, replay_at = (f"tcp/{hosts[host].address(4)}:7447" for host in ("head", "rep"))
         joining = (f"--run={RUN}", "--connect", learner_at, "--join-timeout=300", "--patience=300")
         settings = (f"--total-steps={STEPS}", f"--replay.capacity={STEPS}", "--replay.ratio=2", "--replay.journal")
@@ -87,12 +84,12 @@ class Storm:
         free = [name for name in PLACES if name not in self._heals]
         if not free:
             return
-        name, kind, now = self._chance.choice(free), self._chance.choice(KINDS), time.monotonic()
-        until = now + SHORTEST * (LONGEST / SHORTEST) ** self._chance.random()
+        name, kind, now = self.chance.choice(free), self.chance.choice(KINDS), time.monotonic()
+        until = now + SHORTEST * (LONGEST / SHORTEST) ** self.chance.random()
         process = self.roles.processes[name]
         if kind == "kill":
             os.kill(process.pid, signal.SIGKILL)
-            until = now + self._chance.random()
+            until = now + self.chance.random()
         elif kind == "freeze":
             os.kill(process.pid, signal.SIGSTOP)
         else:
@@ -149,9 +146,9 @@ class Storm:
         elif self._flap_until is None:
             if "joined" in process.last_line():
                 self.joins += 1
-                self._flap_until = now + self._chance.uniform(0, 3)
+                self._flap_until = now + self.chance.uniform(0, 3)
         elif now > self._flap_until:
-            os.kill(process.pid, self._chance.choice((signal.SIGKILL, signal.SIGTERM)))
+            os.kill(process.pid, self.chance.choice((signal.SIGKILL, signal.SIGTERM)))
             self._flap_until = math.inf
 
     def _look(self, watch: RunWatch, now: float) -> None:
@@ -186,7 +183,7 @@ class Storm:
 
 def ride(storm: Storm, kills: int, joins: int, give_up: float) -> None:
     """Let a run meet its faults, and print what was seen; raises a CoopError."""
-    began, roles, chance = time.monotonic(), storm.roles, storm._chance
+    began, roles, chance = time.monotonic(), storm.roles, storm.chance
     with running(roles), RunWatch(RUN, "tcp/198.18.0.1:7447") as watch:
 
         def calm() -> float:
@@ -280,19 +277,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the faults, and of their moments")
     parser.add_argument("--give-up", type=float, default=4 * 3600.0, help="seconds")
     options = parser.parse_args()
-    if os.geteuid() or shutil.which("ip") is None:
-        print("SKIP: making network namespaces needs root and iproute2")
-        return
-    names = [*PLACES.values(), FLAPPING]
-    try:
-        if INSIDE not in os.environ:
-            with network_of(os.getpid(), names) as hosts:
-                again = [*hosts["head"].inside, sys.executable, *sys.argv]
-                sys.exit(subprocess.run(again, env={**os.environ, INSIDE: str(os.getpid())}, check=False).returncode)
+
+    def meet(hosts: dict[str, Host]) -> None:
         with tempfile.TemporaryDirectory() as folder:
-            storm = Storm(Path(folder) / "run", hosts_of(int(os.environ[INSIDE]), names), options.seed)
             joins = options.kills if options.joins is None else options.joins
-            ride(storm, options.kills, joins, options.give_up)
+            ride(Storm(Path(folder) / "run", hosts, options.seed), options.kills, joins, options.give_up)
+
+    try:
+        inside_the_first([*PLACES.values(), FLAPPING], meet)
     except CoopError as error:
         sys.exit(f"storm: error: {error}")
 
