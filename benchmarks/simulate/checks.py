@@ -8,26 +8,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.simulate.roles import ACTOR_NUMBERS, SPEC, STEPS
+from benchmarks.simulate.roles import SPEC, STEPS
 from benchmarks.simulate.world import Process, Violation
 from coop.common.messaging import wire
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.messaging.messages.weights import Role
 from coop.common.transitions import Batch, Drawn, DrawRequest, Segment
-from coop.learner.roster import Roster
 from coop.learner.trainer import Effects, Trainer
 from coop.records.checkpoints import DONE, Damaged, checkpoint_numbers
 from coop.records.learner_checkpoints import load_learner
-from coop.replay.core import ReplayCore, Reply, RetryLater
+from coop.records.run_ids import read_run_id
+from coop.replay.core import ReplayCore, Reply
 from coop.replay.persistence.checkpoints import ReplayCheckpoints, part_path
 from coop.replay.persistence.storage import load_snapshot
-from coop.replay.service import ReplayService
 
 if TYPE_CHECKING:
     from benchmarks.simulate.cluster import Cluster
 
 STALE = 6.0  # seconds of good weather after which an actor must know what the learner broadcast last
-CHECKED_EVERY = 12  # inserts between two looks at the whole table
 EXPECTED = (  # how processes end that meet faults, in words
     "killed",
     "its machine has died",
@@ -73,52 +71,6 @@ class Checks:
         self._trainer: Trainer | None = None
         self._core: ReplayCore | None = None
         self._began_at = 0.0
-        checks = self
-
-        class Core(ReplayCore):
-            """The real core, watched."""
-
-            since = 0
-
-            def insert(self, segment: Segment, payload: bytes = b"") -> int | RetryLater:
-                before, ahead = self.table.inserted, self.limiter.ahead(self.table.inserted, checks.counted(self))
-                outcome = super().insert(segment, payload)
-                if self.table.inserted > before:
-                    start, slack = (
-                        checks.cluster.plan.starts,
-                        max(checks.cluster.plan.tolerance, 0.5 / checks.cluster.plan.ratio),
-                    )
-                    checks.hold("ratio", before < start or ahead <= slack + 1e-9, f"inserted {ahead:.1f} steps ahead")
-                    checks.hold("ratio", before < checks.cluster.plan.total, "inserted beyond the run's end")
-                    self.since += 1
-                    if self.since % CHECKED_EVERY == 0:
-                        checks.look_at(self)
-                return outcome
-
-            def draw(self, request: DrawRequest) -> Reply | RetryLater:
-                known = request.sequence < checks.counted(self)
-                checks.asked(request)
-                outcome = super().draw(request)
-                if not isinstance(outcome, RetryLater):
-                    checks.drawn(self, request, outcome, known)
-                return outcome
-
-        class Service(ReplayService):
-            """The real service, whose core is looked at before it serves."""
-
-            def __init__(self, node: Any, core: Any, *rest: Any, **named: Any) -> None:  # noqa: ANN401
-                super().__init__(node, core, *rest, **named)
-                checks.service_begins(node.process, core)
-
-        class Members(Roster):
-            """The real roster, which tells whom it admits."""
-
-            def replay(self, *args: Any) -> int:  # noqa: ANN401
-                index = super().replay(*args)
-                checks.serving = self.serving
-                return index
-
-        self.core_kind, self.service_kind, self.roster_kind = Core, Service, Members
 
     def hold(self, what: str, holds: bool, words: str) -> None:
         """Count a look at an invariant; raise Violation if it does not hold."""
@@ -264,38 +216,37 @@ class Checks:
         """Draws as the present learner counts them; as the core does before its first one."""
         return self._counted if self._learner in core._learners[-1:] else core.drawn
 
-    def trainer_kind(self, process: Process) -> type[Trainer]:
-        """The real trainer of a learner, watched."""
-        checks, incarnation = self, process.state["incarnation"]
+    def inserted(self, before: int, ahead: float) -> None:
+        """A segment has come in; before: transitions until then. ahead: steps by which acting was ahead then."""
+        plan = self.cluster.plan
+        slack = max(plan.tolerance, 0.5 / plan.ratio)
+        self.hold("ratio", before < plan.starts or ahead <= slack + 1e-9, f"inserted {ahead:.1f} steps ahead")
+        self.hold("ratio", before < plan.total, "inserted beyond the run's end")
 
-        class Watched(Trainer):
-            """See `Trainer`."""
+    def trainer_begins(self, trainer: Trainer) -> None:
+        """A learner has made its trainer."""
+        self._trainer = trainer
 
-            def __init__(self, *args: Any) -> None:  # noqa: ANN401
-                super().__init__(*args)
-                checks._trainer = self
+    def trains(self, incarnation: int, agent: Any, batch: Batch, drawn: Drawn) -> None:  # noqa: ANN401
+        """A learner is about to train with a batch."""
+        number = agent.updates
+        self.hold("order", drawn.sequence == number, f"batch {drawn.sequence} in update {number}")
+        expected = self._draws.get((incarnation, number))
+        same = expected is None or expected == tuple(batch.ids.tolist())
+        self.hold("batch", same, f"batch {number} is not the one that was drawn")
+        obs, following = batch.frames[batch.obs_index[:, 0], 0], batch.frames[batch.next_index[:, 0], 0]
+        self.hold("batch", bool((obs == batch.rewards).all()), "frames of others")
+        self.hold("batch", bool((following == batch.rewards + 1).all()), "next frames of others")
 
-            def train(self, batch: Batch, drawn: Drawn, now: float) -> Effects:
-                number, agent = self.agent.updates, self.agent
-                checks.hold("order", drawn.sequence == number, f"batch {drawn.sequence} in update {number}")
-                expected = checks._draws.get((incarnation, number))
-                same = expected is None or expected == tuple(batch.ids.tolist())
-                checks.hold("batch", same, f"batch {number} is not the one that was drawn")
-                obs, following = batch.frames[batch.obs_index[:, 0], 0], batch.frames[batch.next_index[:, 0], 0]
-                checks.hold("batch", bool((obs == batch.rewards).all()), "frames of others")
-                checks.hold("batch", bool((following == batch.rewards + 1).all()), "next frames of others")
-                effects = super().train(batch, drawn, now)
-                checks._note(agent)
-                if effects.broadcast:
-                    checks._broadcast(agent)
-                return effects
+    def trained(self, agent: Any, effects: Effects) -> None:  # noqa: ANN401
+        """It has."""
+        self._note(agent)
+        if effects.broadcast:
+            self._broadcast(agent)
 
-            def load_state(self, state: dict[str, Any], now: float) -> None:
-                super().load_state(state, now)
-                digest = _digest(self.agent)
-                checks.hold("checkpoint", digest in checks._saved[self.agent.updates], "a state that never was")
-
-        return Watched
+    def restored(self, agent: Any) -> None:  # noqa: ANN401
+        """A learner goes on from a checkpoint."""
+        self.hold("checkpoint", _digest(agent) in self._saved[agent.updates], "a state that never was")
 
     def _note(self, agent: Any) -> None:  # noqa: ANN401
         self._saved[agent.updates].add(_digest(agent))
@@ -321,7 +272,7 @@ class Checks:
         self._evaluations.clear()
         self._roles.clear()
         self._began_at = self.cluster.world.now
-        self._learner_look = self.look_at_checkpoints()
+        self.look_at_checkpoints()
 
     def look(self, process: Process, weights: Any, policy: Any) -> None:  # noqa: ANN401
         """An actor has looked for weights: those that it acts with must be whole, and after a while the newest."""
@@ -386,8 +337,6 @@ class Checks:
 
     def _restore(self, folder: Any, number: int) -> None:  # noqa: ANN401
         core = ReplayCore(self.cluster.config, SPEC)
-        from coop.records.run_ids import read_run_id  # noqa: PLC0415
-
         try:
             load_snapshot(core, part_path(folder, number), read_run_id(folder), number)
         except Damaged as damaged:
@@ -446,6 +395,3 @@ class Checks:
 
 def _digest(agent: Any) -> bytes:  # noqa: ANN401
     return b"".join(network.flat.tobytes() for network in agent.networks) + bytes([agent.acting])
-
-
-__all__ = ["ACTOR_NUMBERS", "Checks"]

@@ -19,6 +19,7 @@ from benchmarks.simulate.checks import Checks
 from benchmarks.simulate.disk import Disk
 from benchmarks.simulate.network import Network, Weather
 from benchmarks.simulate.plan import Fault, Plan
+from benchmarks.simulate.watched import watched, watched_trainer
 from benchmarks.simulate.world import Machine, Process, Violation, World
 from coop.common.errors import RunError
 from coop.common.messaging import joining
@@ -127,7 +128,7 @@ class Cluster:
         if role == "learner":
             path = self.root / "learner" / "run"
             conversation: Any = roles.learner(
-                network, process, self.config, path, self.checks.trainer_kind(process), incarnation
+                network, process, self.config, path, watched_trainer(self.checks, incarnation), incarnation
             )
             self.checks.learner_begins(process)
         elif role == "replay":
@@ -247,14 +248,15 @@ class Cluster:
     def _product(self) -> Iterator[None]:
         """Hand the product what it takes from the system: random ids, locks, and what has no part in the protocol."""
         checks, ids = self.checks, self._numbers
+        kinds = watched(checks)
         with contextlib.ExitStack() as stack:
 
             def replace(place: str, what: object) -> None:
                 stack.enter_context(patch(place, what))
 
-            replace("coop.replay.cli.ReplayCore", checks.core_kind)
-            replace("coop.replay.cli.ReplayService", checks.service_kind)
-            replace("coop.learner.process.Roster", checks.roster_kind)
+            replace("coop.replay.cli.ReplayCore", kinds.core)
+            replace("coop.replay.cli.ReplayService", kinds.service)
+            replace("coop.learner.process.Roster", kinds.roster)
             replace("coop.learner.process.RunDirectory", partial(roles.Directory, checks.evaluated))
             replace("coop.learner.process.claim_run_directory", partial(roles.claim_directory, ids))
             replace("coop.learner.process.load_initial_networks", lambda agent: None)
