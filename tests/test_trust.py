@@ -19,7 +19,7 @@ from coop.common.messaging.members import ROUTE
 from coop.common.messaging.messages.control import EndOfRun, Join, Leave, Limit, Snapshot
 from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow
 from coop.common.messaging.messages.sample import encode_request
-from coop.common.messaging.messages.status import ReplayStats, StatsQuestion
+from coop.common.messaging.messages.status import ActorStatus, ReplayStats, StatsQuestion
 from coop.common.messaging.messages.weights import Current
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import NoAnswer, Node, Refused, new_incarnation
@@ -293,13 +293,14 @@ def test_malformed_messages_of_an_actor_are_refused_counted_and_named(run: tuple
                 actor.ask(replay_key(actor, "insert"), bytearray(payload))
         assert stats(inside).bad_messages == before + 4
         token = actor.session.liveliness().declare_token(actor.key("alive", "actor", "no-number"))
-        for _ in range(30):
-            actor.announce(actor.key("metrics", "actor", "\u202enobody"), bytearray(b"junk"))
+        for payload in (bytearray(b"junk"), ActorStatus(1, 1).encode(RUN)) * 30:
+            actor.announce(actor.key("metrics", "actor", "\u202enobody"), payload)
         until(lambda: "alive/actor: key: 'no-number' is no incarnation" in (folder / "learner.log").read_text())
         token.undeclare()
         wait_for_more(inside)
     assert f"refused a message at coop/{RUN}/replay/0/insert: " in (folder / "replay.log").read_text()
     log = (folder / "learner.log").read_text()
     assert "error of this program" not in log
-    assert log.count(f"refused a message at coop/{RUN}/metrics/actor/*: payload: ") == 1, "one line for many"
+    for field in ("payload", "key"):
+        assert log.count(f"refused a message at coop/{RUN}/metrics/actor/*: {field}: ") == 1, "one line for many"
     assert "\u202e" not in log
