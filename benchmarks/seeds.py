@@ -17,8 +17,8 @@ from dataclasses import replace
 
 from coop.common.process.limits import use_threads
 from coop.common.settings.tables import load_tables, resolve
+from coop.lockstep.compiled.seeds import Seeds
 from coop.lockstep.lockstep import Lockstep
-from coop.studies.stacked.seeds import Seeds
 
 
 def alone(run: Lockstep, steps: int) -> None:

@@ -17,14 +17,14 @@ from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import merged
 from coop.common.settings.tables import load_tables, resolve
 from coop.learner.trainer import EpisodeRow
+from coop.lockstep.compiled.conditions import why_not
+from coop.lockstep.compiled.seeds import Seeds
+from coop.lockstep.compiled.together import play_together
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.memory import TableMemory
 from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start
 from coop.records.summaries import read_summary
-from coop.studies.stacked.seeds import Seeds
-from coop.studies.stacked.together import play_together
-from coop.studies.sweep.stacking import why_not
 
 pytest.importorskip("numba")
 

@@ -26,6 +26,8 @@ from coop.records.run_directory import RunDirectory
 from coop.replay.persistence.storage import Mark
 
 Replaying = Callable[[int, int], None]  # actions played again, all of them
+PROGRESS_EVERY = 5.0  # seconds between lines of progress
+LOOK_EVERY = 0.2  # seconds between looks for a request of a checkpoint
 
 
 class Lockstep:
@@ -87,6 +89,13 @@ class Lockstep:
         masks = [] if steps.next_mask is None else [steps.next_mask]
         for shown in (newest, steps.raw_rewards, steps.terminated, *restarted, *masks):
             self._seen = zlib.crc32(shown.tobytes(), self._seen)
+
+    def progress(self) -> str:
+        """Where it is, in a line."""
+        telemetry = self.trainer.telemetry
+        returns = f"return {telemetry.return_mean:.1f}" if telemetry.episodes else "no episode has ended yet"
+        warning = telemetry.warning(self.agent)
+        return f"step {self.step:,}/{self.config.total_steps:,}  {returns}" + (f"  [{warning}]" if warning else "")
 
     def save(self, directory: RunDirectory) -> None:
         """Save a checkpoint that `restore` continues exactly to the bit.

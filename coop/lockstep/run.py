@@ -16,7 +16,8 @@ from coop.common.settings.resuming import settings_digest
 from coop.evaluation.episodes import Evaluator
 from coop.learner.initial_networks import load_initial_networks
 from coop.learner.summary import summarise
-from coop.lockstep.lockstep import Lockstep, Replaying
+from coop.lockstep.compiled.conditions import why_not
+from coop.lockstep.lockstep import LOOK_EVERY, PROGRESS_EVERY, Lockstep, Replaying
 from coop.records.checkpoints import take_request
 from coop.records.following import Callbacks
 from coop.records.learner_checkpoints import load_learner
@@ -26,8 +27,7 @@ from coop.records.run_directory import RunDirectory
 from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import Summary
 
-PROGRESS_EVERY = 5.0  # seconds
-LOOK_EVERY = 0.2  # seconds
+WORTH_COMPILING = 5000  # steps: loading compiled loops takes as long as they save in 2,000
 
 
 class LockstepRun:
@@ -90,7 +90,8 @@ class LockstepRun:
     ) -> Summary:
         """Play until the run is over or stopped; progress: called with a line every few seconds.
 
-        callbacks: called after each step with what it has recorded; one that fails stops the run.
+        callbacks: called after each step with what it has recorded; one that fails stops the run. Without any, a long
+        run of what `why_not` allows is played by compiled loops, which leave the same files.
 
         Raises:
             RunError: there is no space for the closing checkpoint or the summary.
@@ -99,11 +100,20 @@ class LockstepRun:
         with self.files() as directory:
             if directory.aside:
                 progress(directory.aside)
+            if not callbacks and self._compiles():
+                from coop.lockstep.compiled.group import play_runs  # noqa: PLC0415 (numba takes a second)
+
+                return play_runs({self.run: directory}, stop, progress)[0]
             callbacks = callbacks or Callbacks()
             callbacks.follow(self.path, stop)
             summary = play_lockstep(self.run, directory, stop, progress, callbacks.look)
             callbacks.finish()
             return summary
+
+    def _compiles(self) -> bool:
+        """Whether compiled loops can play the run, and pay."""
+        config = self.run.config
+        return config.total_steps - self.run.step >= WORTH_COMPILING and not why_not(config)
 
     def files(self) -> RunDirectory:
         """Open the run's files, to go on from where it is; raises as `RunDirectory`."""
@@ -156,7 +166,7 @@ def play_lockstep(
                     say(f"{error}; the run goes on without it")
             if time.monotonic() >= due:
                 due = time.monotonic() + PROGRESS_EVERY
-                progress(_progress(run))
+                progress(run.progress())
         outcome = trainer.diverged or outcome
         if trainer.saveable():
             run.save(directory)
@@ -186,10 +196,3 @@ def _evaluate(run: Lockstep, directory: RunDirectory, evaluator: Evaluator) -> N
         gif = evaluator.film(network, step)
         if gif is not None:
             directory.film(gif, step)
-
-
-def _progress(run: Lockstep) -> str:
-    telemetry = run.trainer.telemetry
-    returns = f"return {telemetry.return_mean:.1f}" if telemetry.episodes else "no episode has ended yet"
-    warning = telemetry.warning(run.agent)
-    return f"step {run.step:,}/{run.config.total_steps:,}  {returns}" + (f"  [{warning}]" if warning else "")

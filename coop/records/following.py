@@ -117,6 +117,9 @@ class Callbacks:
         self._followed: dict[str, Following | MetricsFollowing] = {}
         self._failure: RunError | None = None
 
+    def __bool__(self) -> bool:
+        return bool(self._given)
+
     def follow(self, run_dir: Path, stop: Stop) -> None:
         """Follow a run, and stop it as they want; rows that are there already are passed over. Raises RunError."""
         self._stop = stop

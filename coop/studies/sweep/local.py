@@ -18,7 +18,7 @@ from coop.studies.sweep.folder import CellFolder, Ending
 from coop.studies.sweep.grid import GridFile
 from coop.studies.sweep.stacking import Stacks
 
-TOGETHER = "coop.studies.stacked.together"  # the module that plays several cells
+TOGETHER = "coop.lockstep.compiled.together"  # the module that plays several cells
 # By default, the libraries that a run uses start a thread per core, and concurrent runs would starve each other.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 

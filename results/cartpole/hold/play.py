@@ -35,11 +35,11 @@ from coop.common.process.lifecycle import Stop, run_main
 from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import merged
 from coop.common.settings.tables import load_tables, resolve
+from coop.lockstep.compiled.together import play_together
 from coop.lockstep.run import LockstepRun
 from coop.records.reading import read_csv, read_jsonl
 from coop.records.resumption import Start
 from coop.records.summaries import read_summary
-from coop.studies.stacked.together import play_together
 from results.cartpole.edl.packed import registered, summary
 
 HERE = Path("results/cartpole/hold")

@@ -10,16 +10,19 @@ from numpy.typing import NDArray
 
 from coop.common.envs.gymnasium_env import GymnasiumEnv
 from coop.common.envs.protocol import VectorEnv
-from coop.studies.stacked.cartpole import FORCE, GRAVITY, HALF_LENGTH, MAX_ANGLE, MAX_X, POLE_MASS, TAU, TOTAL_MASS
+from coop.lockstep.compiled import loops
 
-Doubles = NDArray[np.float64]
+_PHYSICS = (
+    "gravity", "masspole", "total_mass", "length", "polemass_length", "force_mag", "tau", "x_threshold",
+    "theta_threshold_radians",
+)  # fmt: skip
 
 
 def cart_of(env: VectorEnv) -> tuple[CartPoleEnv, int]:
     """The CartPole behind a run's environment, and the steps of an episode at most.
 
     Raises:
-        TypeError: it is another environment; `eligible.why_not` tells.
+        TypeError: it is another environment; `why_not` tells.
     """
     found = env._envs[0]._env.unwrapped if isinstance(env, GymnasiumEnv) else env
     if not isinstance(env, GymnasiumEnv) or type(found) is not CartPoleEnv:
@@ -40,27 +43,19 @@ class Carts:
         self.state = np.array([cart.state for cart in carts], np.float64)
         self.obs = self.state.astype(np.float32)
         self.lengths = np.array(lengths, np.int64)
+        cart = self._carts[0]
+        self._physics = np.array([float(getattr(cart, name)) for name in _PHYSICS])
 
     def move(self, actions: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Play actions [K]; return which poles fell, and which episodes are over: bool [K] each."""
-        x, x_dot, theta, theta_dot = self.state.T
-        force = np.where(actions == 1, FORCE, -FORCE)
-        cos, sin = np.cos(theta), np.sin(theta)
-        length = POLE_MASS * HALF_LENGTH
-        temp = (force + length * np.square(theta_dot) * sin) / TOTAL_MASS
-        theta_acc = (GRAVITY * sin - cos * temp) / (
-            HALF_LENGTH * (4.0 / 3.0 - POLE_MASS * np.square(cos) / TOTAL_MASS)
+        before, theta = self.state, self.state[:, 2]
+        self.state, self.obs = np.empty_like(before), np.empty_like(self.obs)
+        fell, over = np.empty((2, len(before)), np.bool_)
+        loops.pushed(
+            before, np.cos(theta), np.sin(theta), actions, self._physics, self._limit,
+            self.lengths, self.state, self.obs, fell, over,
         )  # fmt: skip
-        x_acc = temp - length * theta_acc * cos / TOTAL_MASS
-        state = np.empty_like(self.state)
-        np.add(x, TAU * x_dot, out=state[:, 0])
-        np.add(x_dot, TAU * x_acc, out=state[:, 1])
-        np.add(theta, TAU * theta_dot, out=state[:, 2])
-        np.add(theta_dot, TAU * theta_acc, out=state[:, 3])
-        self.state, self.obs = state, state.astype(np.float32)
-        self.lengths += 1
-        fell = (np.abs(state[:, 0]) > MAX_X) | (np.abs(state[:, 2]) > MAX_ANGLE)
-        return fell, fell | (self.lengths == self._limit)
+        return fell, over
 
     def restart(self, k: int) -> None:
         """Begin run k's next episode."""

@@ -23,6 +23,43 @@ def _jit(loop: Loop) -> Loop:
 
 
 @_jit
+def pushed(
+    before: Array,
+    cos: Array,
+    sin: Array,
+    actions: Array,
+    physics: Array,
+    limit: int,
+    lengths: Array,
+    state: Array,
+    obs: Array,
+    fell: Array,
+    over: Array,
+) -> None:
+    """Push each cart once: gymnasium's CartPole, operation by operation, in float64.
+
+    before: [K, 4]; cos, sin: of its angles, [K]. physics: as `Carts` has them. limit: steps of an episode, 0: none.
+    lengths: [K], counted up. state, float32 obs: [K, 4], written. fell, over: bool [K], written.
+    """
+    gravity, pole, total, length, both, push, tau, widest, steepest = physics
+    for k in range(before.shape[0]):
+        force = push if actions[k] == 1 else -push
+        theta_dot = before[k, 3]
+        temp = (force + both * (theta_dot * theta_dot) * sin[k]) / total
+        theta_acc = (gravity * sin[k] - cos[k] * temp) / (length * (4.0 / 3.0 - pole * (cos[k] * cos[k]) / total))
+        x_acc = temp - both * theta_acc * cos[k] / total
+        state[k, 0] = before[k, 0] + tau * before[k, 1]
+        state[k, 1] = before[k, 1] + tau * x_acc
+        state[k, 2] = before[k, 2] + tau * theta_dot
+        state[k, 3] = theta_dot + tau * theta_acc
+        for j in range(4):
+            obs[k, j] = np.float32(state[k, j])
+        lengths[k] += 1
+        fell[k] = np.abs(state[k, 0]) > widest or np.abs(state[k, 2]) > steepest
+        over[k] = fell[k] or lengths[k] == limit
+
+
+@_jit
 def gather(
     obs: Array,
     next_obs: Array,

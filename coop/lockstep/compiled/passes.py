@@ -17,7 +17,7 @@ from coop.learner.edl.arrays import convert_like
 from coop.learner.edl.polar import LIMITS, polar_by_svd
 from coop.learner.edl.transforms import SUM_AND_DIFFERENCE
 from coop.learner.optimizers import TINY, Adam, make_optimizer
-from coop.studies.stacked import compiled
+from coop.lockstep.compiled import loops
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -109,9 +109,7 @@ class Networks:
         layers = self._layers(role, runs)
         for number, (weight, bias) in enumerate(layers, 1):
             column = np.matmul(weight, column)
-            column += bias[:, :, None]
-            if number < len(layers):
-                np.maximum(column, 0, out=column)
+            (loops.rectify if number < len(layers) else loops.shift)(column, bias)
         return column[:, :, 0]
 
     def update(
@@ -135,7 +133,7 @@ class Networks:
         h = self._forward(layers, x if double else x[:, :size])
         values, error, gradient = self._columns[-1][:n], self._error[:n], self._gradient[:n]
         preferred = values[:, :, size:] if double else next_values
-        compiled.temporal(
+        loops.temporal(
             values, next_values, preferred, taken, discounts, self._bound, self._loss, errors, error
         )  # fmt: skip
         parts = [(weight[:n], bias[:n]) for weight, bias in self._parts]
@@ -153,9 +151,9 @@ class Networks:
             column = np.matmul(weight, column, out=self._columns[number][:n])
             if number < len(self._h):
                 h.append(self._h[number][:n])
-                compiled.rectify_both(column, bias, h[-1])
+                loops.rectify_both(column, bias, h[-1])
             else:
-                compiled.shift(column, bias)
+                loops.shift(column, bias)
         return h
 
     def _target(self, layers: Views, x: Floats) -> Floats:
@@ -163,7 +161,7 @@ class Networks:
         n, column = len(x), x.swapaxes(1, 2)
         for number, (weight, bias) in enumerate(layers):
             column = np.matmul(weight, column, out=self._next[number][:n])
-            (compiled.rectify if number < len(self._h) else compiled.shift)(column, bias)
+            (loops.rectify if number < len(self._h) else loops.shift)(column, bias)
         return column
 
     def _backward(self, layers: Views, h: list[Floats], error: Floats, parts: Views) -> None:
@@ -173,7 +171,7 @@ class Networks:
         for number in reversed(range(len(self._h))):
             delta = np.matmul(rows, layers[number + 1][0], out=self._deltas[number][: len(error)])
             weight, bias = parts[number]
-            compiled.masked(delta, h[number + 1], bias)
+            loops.masked(delta, h[number + 1], bias)
             np.matmul(delta.swapaxes(1, 2), h[number], out=weight)
             rows = delta
 
@@ -186,15 +184,15 @@ class Networks:
         for place, number in enumerate(range(last, -1, -1)):
             t = ts[number]
             if number == last:
-                compiled.spread(shared, h[number + 1], t)
+                loops.spread(shared, h[number + 1], t)
             else:
                 np.matmul(ts[number + 1], layers[number + 1][0][:, None], out=t)
-                compiled.muted(t, h[number + 1])
+                loops.muted(t, h[number + 1])
             for row, (one, other) in enumerate(((0, 0), (1, 1), (0, 1))):
                 np.vecdot(t[:, one], t[:, other], out=grams[row, place])
         e = np.matmul(error.swapaxes(1, 2), self._basis.T, out=self._e[:n])
         rates = s.astype(np.float32)
-        doubt = compiled.whiten(grams, e, rates, *self._limits, weights, doubtful)
+        doubt = loops.whiten(grams, e, rates, *self._limits, weights, doubtful)
         _last(error * (1 + s).astype(np.float32)[:, None, None], h[-1], parts)
         for place, number in enumerate(range(last, -1, -1)):
             t, delta, (weight, bias) = ts[number].swapaxes(1, 2), self._deltas[number][:n], parts[number]
@@ -204,7 +202,7 @@ class Networks:
                     where = doubtful[place, k]
                     polar = polar_by_svd(torch.as_tensor(t[k][where])).numpy()
                     delta[k, where] += rates[k] * (e[k, where][:, None] @ polar)[:, 0]
-            compiled.summed(delta, bias)
+            loops.summed(delta, bias)
             np.matmul(delta.swapaxes(1, 2), h[number], out=weight)
 
     def _descend(self, role: int, runs: slice, gradient: Floats, rate: float) -> None:
@@ -220,7 +218,7 @@ class Networks:
         correction, f = (1 - learner.beta2**steps) ** 0.5, np.float32
         torch.set_flush_denormal(True)  # as the optimizers do
         try:
-            compiled.adam(
+            loops.adam(
                 theta, gradient, self.buffers["mean"][role, runs], self.buffers["square"][role, runs], *self._decays,
                 f(TINY), f(learner.eps * correction), f(rate * correction / (1 - learner.beta1**steps)),
                 self.finite[runs],

@@ -12,9 +12,9 @@ from coop.common.numbers import generator_state, set_generator_state
 from coop.common.settings.config import RunConfig
 from coop.common.transitions import IN_BATCH, KEPT, Batch, filled
 from coop.common.types import Array, EnvSpec
+from coop.lockstep.compiled import loops
 from coop.lockstep.memory import TableMemory
 from coop.replay.table.table import REUSE_BUCKETS
-from coop.studies.stacked import compiled
 
 Ints = NDArray[np.int64]
 
@@ -95,7 +95,7 @@ class Tables:
     def insert(self, rows: Ints, obs: Array, next_obs: Array, actions: Ints, terminal: Array, version: int) -> None:
         """Put the next transition of every run into its row, int64 [K]; obs, next_obs: float32 [K, 4]."""
         held = self.columns
-        compiled.insert(
+        loops.insert(
             rows, obs, next_obs, actions, terminal, version, self.inserted, self.capacity, self.obs, self.next_obs,
             held["actions"], held["terminated"], held["param_version"], held["ids"], held["reuse"],
             self.reuse_evicted, self.terminal,
@@ -103,9 +103,9 @@ class Tables:
         self.inserted += 1
 
     def read(self, runs: slice, rows: Ints, updates: int, x: Array, taken: Ints, discounts: Array, seen: Ints) -> None:
-        """Read a batch of these runs, whose rows are [n, batch], as `compiled.gather` has it; `batches` stays."""
+        """Read a batch of these runs, whose rows are [n, batch], as `loops.gather` has it; `batches` stays."""
         held = self.columns
-        compiled.gather(
+        loops.gather(
             self.obs[runs], self.next_obs[runs], held["actions"][runs], held["terminated"][runs],
             held["param_version"][runs], held["ids"][runs], held["reuse"][runs], rows, self._powers,
             x, taken, discounts, seen, np.array((self.inserted, updates)),

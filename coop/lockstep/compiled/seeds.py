@@ -27,9 +27,11 @@ from coop.common.numbers import METRICS_EVERY
 from coop.common.types import EpisodeEnd, EpisodeRecord, EpisodeRow
 from coop.learner.agent import Agent
 from coop.learner.diagnostics import ARCHIVED
+from coop.lockstep.compiled.carts import Carts, cart_of
+from coop.lockstep.compiled.passes import BLOCK, Networks
+from coop.lockstep.compiled.tables import Tables
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.memory import TableMemory
-from coop.studies.stacked.carts import Carts, cart_of
 
 Ints = NDArray[np.int64]
 
@@ -76,9 +78,6 @@ class Seeds:
     """
 
     def __init__(self, runs: Sequence[Lockstep], player: int | None = None) -> None:
-        from coop.studies.stacked.passes import Networks  # noqa: PLC0415 (numba takes a second, and may not be there)
-        from coop.studies.stacked.tables import Tables  # noqa: PLC0415
-
         self.runs, self._player, self.config = list(runs), player, runs[0].config
         self._agents = [run.agent for run in runs if isinstance(run.agent, Agent)]
         agent = self._agents[0]
@@ -232,12 +231,10 @@ class Seeds:
 
     def _update(self, block: _Block, place: int, number: int) -> None:
         """Do update `number` of the block, that of step `place`, in every run; change roles if it is time."""
-        from coop.studies.stacked import passes  # noqa: PLC0415
-
         nets, learner, role = self._nets, self.config.learner, self._role
         rate = self._agents[0]._learning_rate()
-        for start in range(0, len(self.runs), passes.BLOCK):
-            runs = slice(start, min(start + passes.BLOCK, len(self.runs)))
+        for start in range(0, len(self.runs), BLOCK):
+            runs = slice(start, min(start + BLOCK, len(self.runs)))
             n = runs.stop - start
             taken, discounts = (
                 np.empty((n, learner.batch_size), np.int64),

@@ -1,0 +1,136 @@
+"""Lockstep runs that are equally far, in compiled loops, each with its own files as `coop-lockstep` leaves them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from itertools import groupby
+
+from coop.common.errors import CoopError, RunError, first_line
+from coop.common.process.console import say
+from coop.common.process.lifecycle import Stop
+from coop.learner.summary import summarise
+from coop.lockstep.compiled.seeds import MOST, Seeds
+from coop.lockstep.lockstep import LOOK_EVERY, PROGRESS_EVERY, Lockstep
+from coop.lockstep.memory import TableMemory
+from coop.records.checkpoints import take_request
+from coop.records.run_directory import RunDirectory
+from coop.records.summaries import Summary
+
+
+def play_runs(
+    files: Mapping[Lockstep, RunDirectory],
+    stop: Stop,
+    progress: Callable[[str], None] = lambda line: None,
+    player: int | None = None,
+) -> list[Summary]:
+    """Play runs that differ in their seeds until each is over, or until the stop, and complete their files.
+
+    Runs that are not equally far go on in groups, one after the other. player: see `Seeds`. progress: called with a
+    line every few seconds.
+
+    Raises:
+        RunError: the files of some runs can't be completed; the others are.
+    """
+    for run, directory in files.items():
+        _align(run, directory)
+    summaries, failed = [], []
+    for _, group in groupby(sorted(files, key=lambda run: run.step), key=lambda run: run.step):
+        played = _Group(list(group), files, player)
+        played.play(stop, progress)
+        summaries += played.summaries
+        failed += played.failed
+    if failed:
+        raise RunError("; ".join(failed))
+    return summaries
+
+
+def _align(run: Lockstep, directory: RunDirectory) -> None:
+    """Play to the end of a segment, where a stop may have come before it."""
+    while isinstance(run.memory, TableMemory) and run.memory.waiting and not run.trainer.outcome():
+        for effects in run.play():
+            directory.record(effects.episodes, effects.metrics)
+
+
+class _Group:
+    """Runs that are equally far.
+
+    summaries: of the runs that are over. failed: what could not be completed.
+    """
+
+    def __init__(self, runs: list[Lockstep], files: Mapping[Lockstep, RunDirectory], player: int | None) -> None:
+        self._files = files
+        self._seeds = Seeds(runs, player)
+        self._looked = 0.0
+        self.summaries: list[Summary] = []
+        self.failed: list[str] = []
+
+    def play(self, stop: Stop, progress: Callable[[str], None]) -> None:
+        """Play to the end."""
+        seeds, due = self._seeds, time.monotonic() + PROGRESS_EVERY
+        total = seeds.config.total_steps
+        try:
+            while seeds.runs and seeds.step < total and not stop.is_set():
+                self._block()
+                if seeds.runs and time.monotonic() >= due:
+                    due = time.monotonic() + PROGRESS_EVERY
+                    progress(self._progress())
+        except BaseException as error:  # what a block has not told yet is in no file: the newest checkpoint stays
+            outcome = "interrupted"
+            if isinstance(error, Exception | SystemExit):
+                outcome = f"failed: {error if isinstance(error, CoopError) else first_line(error)}"
+            for run in seeds.runs:
+                self._conclude(run, outcome)
+            raise
+        for k, run in enumerate(seeds.runs):
+            seeds.save_into(k)
+            self._end(run, stop.reason if seeds.step < total else run.trainer.outcome())
+
+    def _progress(self) -> str:
+        seeds = self._seeds
+        if len(seeds.runs) == 1:
+            seeds.save_counters(0)
+            return seeds.runs[0].progress()
+        return f"step {seeds.step:,}/{seeds.config.total_steps:,} of {len(seeds.runs)} runs"
+
+    def _block(self) -> None:
+        """Play a block of steps, write what it tells, and save what is due."""
+        seeds = self._seeds
+        for block in seeds.play(MOST):
+            directory = self._files[block.run]
+            directory.record(block.episodes, None)
+            for row in block.metrics:
+                directory.record((), row)
+            if block.run.trainer.diverged:
+                self._end(block.run, block.run.trainer.diverged)
+        look = time.monotonic() >= self._looked
+        if look:
+            self._looked = time.monotonic() + LOOK_EVERY
+        for k, run in enumerate(seeds.runs):
+            if look and take_request(self._files[run].path):
+                run.trainer.ask_checkpoint()
+            if run.trainer.checkpoint_due() and seeds.step < run.config.total_steps:
+                run.trainer.checkpoint_begun()
+                seeds.save_into(k)
+                try:
+                    run.save(self._files[run])
+                except RunError as error:
+                    say(f"{error}; the run goes on without it")
+
+    def _end(self, run: Lockstep, outcome: str) -> None:
+        """Save a run for good, and complete its files."""
+        if run.trainer.saveable():
+            try:
+                run.save(self._files[run])
+            except RunError as error:
+                outcome = f"failed: {error}"
+                self.failed.append(str(error))
+        self._conclude(run, run.trainer.diverged or outcome)
+
+    def _conclude(self, run: Lockstep, outcome: str) -> None:
+        summary = summarise(run.trainer, outcome, time.monotonic(), run.step)
+        self.summaries.append(summary)
+        try:
+            self._files[run].conclude(summary, f"{summary.title}, lockstep")
+        except RunError as error:
+            self.failed.append(str(error))
