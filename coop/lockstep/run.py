@@ -100,9 +100,7 @@ class LockstepRun:
         with self.files() as directory:
             if directory.aside:
                 progress(directory.aside)
-            if not callbacks and self._compiles():
-                from coop.lockstep.compiled.group import play_runs  # noqa: PLC0415 (numba takes a second)
-
+            if not callbacks and (play_runs := self._compiled()):
                 return play_runs({self.run: directory}, stop, progress)[0]
             callbacks = callbacks or Callbacks()
             callbacks.follow(self.path, stop)
@@ -110,10 +108,17 @@ class LockstepRun:
             callbacks.finish()
             return summary
 
-    def _compiles(self) -> bool:
-        """Whether compiled loops can play the run, and pay."""
+    def _compiled(self) -> Callable[..., list[Summary]] | None:
+        """`play_runs`, if compiled loops can play the run, and pay."""
         config = self.run.config
-        return config.total_steps - self.run.step >= WORTH_COMPILING and not why_not(config)
+        if config.total_steps - self.run.step < WORTH_COMPILING or why_not(config):
+            return None
+        try:
+            from coop.lockstep.compiled.group import play_runs  # noqa: PLC0415 (numba takes a second)
+        except ImportError as error:  # a numba that does not fit the other packages
+            say(f"plays without compiled loops: {first_line(error)}")
+            return None
+        return play_runs
 
     def files(self) -> RunDirectory:
         """Open the run's files, to go on from where it is; raises as `RunDirectory`."""

@@ -1,1 +1,1 @@
-"""Lockstep on CartPole with loops that numba compiles (extra `fast`), one run or several side by side, to the bit as without."""
+"""Lockstep on CartPole in loops that numba compiles (extra `fast`): one run or several, to the bit as without."""

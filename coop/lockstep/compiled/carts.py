@@ -37,34 +37,46 @@ class Carts:
         state: float64 [K, 4]. obs: float32 [K, 4]. lengths: int64 [K], steps of the present episodes.
     """
 
-    def __init__(self, carts: Sequence[CartPoleEnv], lengths: Sequence[int], limit: int) -> None:
-        """Go on from where the carts are; limit: steps of an episode at most, 0 for no limit."""
-        self._carts, self._limit = list(carts), limit
+    def __init__(
+        self, carts: Sequence[CartPoleEnv], lengths: Sequence[int], limit: int, limit_terminal: bool = False
+    ) -> None:
+        """Go on from where the carts are.
+
+        limit: steps of an episode at most, 0 for no limit; limit_terminal: whether the state there counts as terminal.
+        """
+        self._carts, self._limit, self._limit_terminal = list(carts), limit, limit_terminal
         self.state = np.array([cart.state for cart in carts], np.float64)
         self.obs = self.state.astype(np.float32)
         self.lengths = np.array(lengths, np.int64)
-        cart = self._carts[0]
-        self._physics = np.array([float(getattr(cart, name)) for name in _PHYSICS])
+        self._physics = np.array([float(getattr(carts[0], name)) for name in _PHYSICS])
 
-    def move(self, actions: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Play actions [K]; return which poles fell, and which episodes are over: bool [K] each."""
-        before, theta = self.state, self.state[:, 2]
-        self.state, self.obs = np.empty_like(before), np.empty_like(self.obs)
-        fell, over = np.empty((2, len(before)), np.bool_)
-        loops.pushed(
-            before, np.cos(theta), np.sin(theta), actions, self._physics, self._limit,
-            self.lengths, self.state, self.obs, fell, over,
+    def push(
+        self,
+        values: NDArray[np.float32],
+        chosen: NDArray[np.int64],
+        actions: NDArray[np.int64],
+        obs: NDArray[np.float32],
+        terminal: NDArray[np.bool_],
+        over: NDArray[np.bool_],
+    ) -> bool:
+        """Play a step of each run; the arguments are those of `loops.push`. Returns whether an episode is over."""
+        theta = self.state[:, 2]
+        self.obs = obs
+        return loops.push(
+            self.state, np.cos(theta), np.sin(theta), values, chosen, self._physics, self._limit, self._limit_terminal,
+            self.lengths, actions, obs, terminal, over,
         )  # fmt: skip
-        return fell, over
 
     def restart(self, k: int) -> None:
         """Begin run k's next episode."""
+        self.obs = self.obs.copy()  # the last observation of the episode stays what it was
         self.obs[k], _ = self._carts[k].reset()
         self.state[k] = self._carts[k].state
         self.lengths[k] = 0
 
     def kept(self, runs: NDArray[np.intp]) -> Carts:
         """The carts of these runs alone."""
-        found = Carts([self._carts[k] for k in runs], self.lengths[runs].tolist(), self._limit)
+        carts = [self._carts[k] for k in runs]
+        found = Carts(carts, self.lengths[runs].tolist(), self._limit, self._limit_terminal)
         found.state, found.obs = self.state[runs], self.obs[runs]
         return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 
 from coop.common.errors import CoopError, RunError, first_line
@@ -36,7 +36,7 @@ def play_runs(
         _align(run, directory)
     summaries, failed = [], []
     for _, group in groupby(sorted(files, key=lambda run: run.step), key=lambda run: run.step):
-        played = _Group(list(group), files, player)
+        played = Group(list(group), files, player)
         played.play(stop, progress)
         summaries += played.summaries
         failed += played.failed
@@ -52,26 +52,28 @@ def _align(run: Lockstep, directory: RunDirectory) -> None:
             directory.record(effects.episodes, effects.metrics)
 
 
-class _Group:
-    """Runs that are equally far.
+class Group:
+    """Runs that are equally far, at the end of a segment.
 
-    summaries: of the runs that are over. failed: what could not be completed.
+    seeds: plays them. summaries: of the runs that are over. failed: what could not be completed.
     """
 
-    def __init__(self, runs: list[Lockstep], files: Mapping[Lockstep, RunDirectory], player: int | None) -> None:
+    def __init__(
+        self, runs: Sequence[Lockstep], files: Mapping[Lockstep, RunDirectory], player: int | None = None
+    ) -> None:
         self._files = files
-        self._seeds = Seeds(runs, player)
+        self.seeds = Seeds(runs, player)
         self._looked = 0.0
         self.summaries: list[Summary] = []
         self.failed: list[str] = []
 
     def play(self, stop: Stop, progress: Callable[[str], None]) -> None:
         """Play to the end."""
-        seeds, due = self._seeds, time.monotonic() + PROGRESS_EVERY
+        seeds, due = self.seeds, time.monotonic() + PROGRESS_EVERY
         total = seeds.config.total_steps
         try:
             while seeds.runs and seeds.step < total and not stop.is_set():
-                self._block()
+                self.block()
                 if seeds.runs and time.monotonic() >= due:
                     due = time.monotonic() + PROGRESS_EVERY
                     progress(self._progress())
@@ -87,15 +89,15 @@ class _Group:
             self._end(run, stop.reason if seeds.step < total else run.trainer.outcome())
 
     def _progress(self) -> str:
-        seeds = self._seeds
+        seeds = self.seeds
         if len(seeds.runs) == 1:
             seeds.save_counters(0)
             return seeds.runs[0].progress()
         return f"step {seeds.step:,}/{seeds.config.total_steps:,} of {len(seeds.runs)} runs"
 
-    def _block(self) -> None:
+    def block(self) -> None:
         """Play a block of steps, write what it tells, and save what is due."""
-        seeds = self._seeds
+        seeds = self.seeds
         for block in seeds.play(MOST):
             directory = self._files[block.run]
             directory.record(block.episodes, None)

@@ -14,49 +14,65 @@ import numpy as np
 
 from coop.common.types import Array
 
+LARGEST = np.finfo(np.float32).max
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 
 def _jit(loop: Loop) -> Loop:
-    """Compile a function at its first call; the result is kept on the disk."""
-    return cast(Loop, numba.njit(cache=True, error_model="numpy")(loop))
+    """Compile a function at its first call; the result is kept on the disk, if there is a place for it."""
+    try:
+        return cast(Loop, numba.njit(cache=True, error_model="numpy")(loop))
+    except RuntimeError:  # neither the package's folder nor the user's cache can be written
+        return cast(Loop, numba.njit(error_model="numpy")(loop))
 
 
 @_jit
-def pushed(
-    before: Array,
+def push(
+    state: Array,
     cos: Array,
     sin: Array,
-    actions: Array,
+    values: Array,
+    chosen: Array,
     physics: Array,
     limit: int,
+    limit_terminal: bool,
     lengths: Array,
-    state: Array,
+    actions: Array,
     obs: Array,
-    fell: Array,
+    terminal: Array,
     over: Array,
-) -> None:
-    """Push each cart once: gymnasium's CartPole, operation by operation, in float64.
+) -> bool:
+    """Choose an action of each run, and push its cart: gymnasium's CartPole, operation by operation, in float64.
 
-    before: [K, 4]; cos, sin: of its angles, [K]. physics: as `Carts` has them. limit: steps of an episode, 0: none.
-    lengths: [K], counted up. state, float32 obs: [K, 4], written. fell, over: bool [K], written.
+    state: [K, 4], written; cos, sin: of its angles, [K]. values: float32 [K, 2]. chosen: int64 [K], -1: the greedy
+    action. physics: as `Carts` has them. limit: steps of an episode, 0: none; limit_terminal: whether it counts as a
+    terminal state. lengths: [K], counted up. actions: int64 [K], float32 obs: [K, 4], terminal, over: bool [K], all
+    written. Returns whether an episode is over.
     """
     gravity, pole, total, length, both, push, tau, widest, steepest = physics
-    for k in range(before.shape[0]):
+    some = False
+    for k in range(state.shape[0]):
+        actions[k] = chosen[k]
+        if chosen[k] < 0:
+            first, second = values[k, 0], values[k, 1]
+            actions[k] = 1 if second > first or (np.isnan(second) and not np.isnan(first)) else 0  # as argmax
         force = push if actions[k] == 1 else -push
-        theta_dot = before[k, 3]
+        x_dot, theta_dot = state[k, 1], state[k, 3]
         temp = (force + both * (theta_dot * theta_dot) * sin[k]) / total
         theta_acc = (gravity * sin[k] - cos[k] * temp) / (length * (4.0 / 3.0 - pole * (cos[k] * cos[k]) / total))
         x_acc = temp - both * theta_acc * cos[k] / total
-        state[k, 0] = before[k, 0] + tau * before[k, 1]
-        state[k, 1] = before[k, 1] + tau * x_acc
-        state[k, 2] = before[k, 2] + tau * theta_dot
+        state[k, 0] += tau * x_dot
+        state[k, 1] = x_dot + tau * x_acc
+        state[k, 2] += tau * theta_dot
         state[k, 3] = theta_dot + tau * theta_acc
         for j in range(4):
             obs[k, j] = np.float32(state[k, j])
         lengths[k] += 1
-        fell[k] = np.abs(state[k, 0]) > widest or np.abs(state[k, 2]) > steepest
-        over[k] = fell[k] or lengths[k] == limit
+        fell = np.abs(state[k, 0]) > widest or np.abs(state[k, 2]) > steepest
+        over[k] = fell or lengths[k] == limit
+        terminal[k] = over[k] if limit_terminal else fell
+        some |= over[k]
+    return some
 
 
 @_jit
@@ -208,13 +224,13 @@ def temporal(
     loss: int,
     errors: Array,
     out: Array,
-) -> None:
-    """The TD errors [n, batch], and the output error [n, 2, batch], both written.
+) -> bool:
+    """The TD errors [n, batch], and the output error [n, 2, batch], both written; returns whether all are finite.
 
     values, next_values, preferred: [n, 2, batch]. bound: of the values, 0: none. loss: 0 squared, 1 mse, 2 huber.
     """
     one, zero = np.float32(1), np.float32(0)
-    size = taken.shape[1]
+    size, finite = taken.shape[1], True
     count = np.float32(size)
     for k in range(taken.shape[0]):
         for b in range(size):
@@ -225,6 +241,7 @@ def temporal(
                 value = -bound if value < -bound else bound if value > bound else value
             error = values[k, taken[k, b], b] - (one + discounts[k, b] * value)
             errors[k, b] = error
+            finite &= np.abs(error) <= LARGEST
             slope = error
             if loss == 1:
                 slope = np.float32(2) * error
@@ -233,6 +250,7 @@ def temporal(
             out[k, 0, b] = zero
             out[k, 1, b] = zero
             out[k, taken[k, b], b] = slope / count
+    return finite
 
 
 @_jit
@@ -362,5 +380,5 @@ def adam(
             t[i] -= (m[i] / (np.sqrt(v[i] + tiny) + eps)) * rate
         good = True
         for i in range(t.shape[0]):
-            good &= np.abs(t[i]) <= np.float32(3.4028235e38)
+            good &= np.abs(t[i]) <= LARGEST
         finite[k] = good

@@ -52,7 +52,8 @@ class Networks:
     Attributes:
         theta: float32 [2, K, P]. buffers: the optimizers' running means by name, float32 [trained, K, P].
         steps: that each optimizer has taken. finite: bool [K], whether the network last trained is finite.
-        x: float32 [BLOCK, 2 batch, 4], the observations of a block's batch and then the next ones, for `update`.
+        x, taken, discounts: a block's batch for `update`: float32 [BLOCK, 2 batch, 4], the observations and then the
+            next ones; actions, int64 [BLOCK, batch]; float32 [BLOCK, batch], 0 for a terminal next state.
     """
 
     def __init__(self, config: RunConfig, count: int) -> None:
@@ -83,7 +84,7 @@ class Networks:
         def room(*shape: int) -> Floats:
             return np.zeros((BLOCK, *shape), np.float32)
 
-        self.x = room(2 * batch, INPUTS)
+        self.x, self.taken, self.discounts = room(2 * batch, INPUTS), np.zeros((BLOCK, batch), np.int64), room(batch)
         self._columns = [room(units, 2 * batch if learner.double else batch) for units in (*hidden, ACTIONS)]
         self._next = [room(units, batch) for units in (*hidden, ACTIONS)]
         self._h = [room(batch, units) for units in hidden]
@@ -116,16 +117,13 @@ class Networks:
         self,
         role: int,
         runs: slice,
-        taken: NDArray[np.int64],
-        discounts: Floats,
         s: Doubles,
         rate: float,
         errors: Floats,
-    ) -> None:
-        """Train network `role` of a block of runs with the observations in `x`, towards the other one's targets.
+    ) -> bool:
+        """Train network `role` of a block of runs with the batches given, towards the other one's targets.
 
-        taken: actions [n, batch]. discounts: [n, batch], 0 for a terminal next state. s: [n]. errors: the TD errors
-        before the update, [n, batch], written.
+        `x`, `taken` and `discounts` hold the batches. s: [n]. errors: the TD errors before the update, [n, batch], written. Returns whether all are finite.
         """
         n, size = errors.shape
         layers, x, double = self._layers(role, runs), self.x[:n], self.config.learner.double
@@ -133,8 +131,8 @@ class Networks:
         h = self._forward(layers, x if double else x[:, :size])
         values, error, gradient = self._columns[-1][:n], self._error[:n], self._gradient[:n]
         preferred = values[:, :, size:] if double else next_values
-        loops.temporal(
-            values, next_values, preferred, taken, discounts, self._bound, self._loss, errors, error
+        finite = loops.temporal(
+            values, next_values, preferred, self.taken[:n], self.discounts[:n], self._bound, self._loss, errors, error
         )  # fmt: skip
         parts = [(weight[:n], bias[:n]) for weight, bias in self._parts]
         if self.config.feedback == "transform" and s.any():
@@ -142,6 +140,7 @@ class Networks:
         else:
             self._backward(layers, h, error, parts)
         self._descend(role, runs, gradient, rate)
+        return bool(finite)
 
     def _forward(self, layers: Views, x: Floats) -> list[Floats]:
         """Fill the columns; return the input and the output of each hidden layer for the batch, [n, batch, units]."""

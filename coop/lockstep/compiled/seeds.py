@@ -83,7 +83,8 @@ class Seeds:
         agent = self._agents[0]
         self.step, self.updates, self._role, self._versions = runs[0].step, agent.updates, agent.acting, agent.versions
         carts, limits = zip(*(cart_of(run.env) for run in runs), strict=True)
-        self._carts = Carts(carts, [int(run._player._lengths[0]) for run in runs], limits[0])
+        lengths = [int(run._player._lengths[0]) for run in runs]
+        self._carts = Carts(carts, lengths, limits[0], self.config.env.time_limit_terminal)
         memories = [run.memory for run in runs]
         tables = [memory for memory in memories if isinstance(memory, TableMemory)]
         self._tables, self._due = Tables.of(tables, self.config), tables[0].due
@@ -180,30 +181,25 @@ class Seeds:
         return found
 
     def _play(self, block: _Block, episodes: list[list[EpisodeRow]], metrics: list[list[dict[str, Any]]]) -> None:
-        config, carts, nets, everyone = self.config, self._carts, self._nets, slice(0, len(self.runs))
-        count, size = len(block.due), config.learner.batch_size
-        shown = np.zeros((count, len(self.runs)), _SHOWN)
-        shown["reward"] = 1
+        carts, nets, everyone = self._carts, self._nets, slice(0, len(self.runs))
+        count, size = len(block.due), self.config.learner.batch_size
+        reached = np.empty((count, len(self.runs), 4), np.float32)
+        terminated = np.empty((count, len(self.runs)), np.bool_)
+        over = np.empty(len(self.runs), np.bool_)
         restarts: list[list[tuple[int, bytes]]] = [[] for _ in self.runs]
-        actions = np.zeros((count, len(self.runs)), np.int64)
+        actions = np.empty((count, len(self.runs)), np.int64)
         self._errors = np.zeros((sum(block.due), len(self.runs), size), np.float32)
         self._seen = np.zeros((sum(block.due), len(self.runs), 5, size), np.int64)
         done = 0
         for place in range(count):
             player = self._role if self._player is None else self._player
-            obs = carts.obs
-            greedy = nets.values(player, everyone, obs).argmax(1)
-            actions[place] = action = np.where(block.action[place] < 0, greedy, block.action[place])
-            fell, over = carts.move(action)
-            next_obs = carts.obs
-            terminal = over if config.env.time_limit_terminal else fell
-            shown["obs"][place], shown["terminated"][place] = next_obs, terminal
+            obs, next_obs, action, terminal = carts.obs, reached[place], actions[place], terminated[place]
+            values = nets.values(player, everyone, obs)
+            some_over = carts.push(values, block.action[place], action, next_obs, terminal, over)
             self.step += 1
-            ended = self._ended(over, next_obs, block.epsilon[place]) if over.any() else []
+            ended = self._ended(over, next_obs, block.epsilon[place]) if some_over else []
             self._waiting.append((block.rows[place], obs, next_obs, action, terminal, self.updates))
             for k, _ in ended:
-                if carts.obs is next_obs:
-                    carts.obs = next_obs.copy()
                 carts.restart(k)
                 restarts[k].append((place, carts.obs[k].tobytes()))
             if block.cut[place]:
@@ -216,6 +212,8 @@ class Seeds:
             self._record(ended, episodes)
             if block.due[place] and self.updates % METRICS_EVERY == 0:
                 self._rows(done, metrics)
+        shown = np.empty(terminated.shape, _SHOWN)
+        shown["obs"], shown["reward"], shown["terminated"] = reached, 1, terminated
         self._follow(actions, shown, restarts)
         self._push(done)
 
@@ -232,17 +230,13 @@ class Seeds:
     def _update(self, block: _Block, place: int, number: int) -> None:
         """Do update `number` of the block, that of step `place`, in every run; change roles if it is time."""
         nets, learner, role = self._nets, self.config.learner, self._role
-        rate = self._agents[0]._learning_rate()
+        rate, finite = self._agents[0]._learning_rate(), True
         for start in range(0, len(self.runs), BLOCK):
             runs = slice(start, min(start + BLOCK, len(self.runs)))
             n = runs.stop - start
-            taken, discounts = (
-                np.empty((n, learner.batch_size), np.int64),
-                np.empty((n, learner.batch_size), np.float32),
-            )
             seen, rows = self._seen[number, runs], block.batch[place, runs]
-            self._tables.read(runs, rows, self.updates + 1, nets.x[:n], taken, discounts, seen)
-            nets.update(role, runs, taken, discounts, block.s[place, runs], rate, self._errors[number, runs])
+            self._tables.read(runs, rows, self.updates + 1, nets.x[:n], nets.taken[:n], nets.discounts[:n], seen)
+            finite &= nets.update(role, runs, block.s[place, runs], rate, self._errors[number, runs])
         nets.count(role)
         self._tables.batches += 1
         self.updates += 1
@@ -257,9 +251,8 @@ class Seeds:
         for run, agent in zip(self.runs, self._agents, strict=True):
             if not run.trainer.diverged:
                 agent.updates = self.updates
-        finite = np.isfinite(self._errors[number]).all(1)
-        if not finite.all():
-            self._diverge(finite, "TD errors")
+        if not finite:
+            self._diverge(np.isfinite(self._errors[number]).all(1), "TD errors")
         if (swapped or self.updates % learner.publish_every == 0) and not nets.finite.all():
             self._diverge(nets.finite, "parameters")
 
