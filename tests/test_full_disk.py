@@ -80,12 +80,18 @@ def test_episodes_metrics_and_scalars_wait_for_space(small_disk: Path, capsys: p
     assert len(board.Scalars("losses/td_error")) == rows
 
 
-def test_a_lockstep_run_goes_on_without_its_checkpoints(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_lockstep_run_goes_on_without_its_checkpoints(
+    compiled: bool, small_disk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if compiled:
+        pytest.importorskip("numba")
+        from coop.lockstep.compiled.group import play_runs  # noqa: PLC0415
     run, path = _lockstep(), small_disk / "run"
     with RunDirectory(path, run.config) as directory:
         _fill(small_disk)
         with pytest.raises(RunError, match=r"how the run ended: failed: checkpoint 550 in .*: No space left on device"):
-            play_lockstep(run, directory, Stop())
+            play_runs({run: directory}, Stop()) if compiled else play_lockstep(run, directory, Stop())
     run.env.close()
     assert run.step == run.config.total_steps
     assert checkpoint_numbers(path) == []

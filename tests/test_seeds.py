@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack
+import sys
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
+from coop.common.errors import RunError
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import merged
@@ -23,8 +26,11 @@ from coop.lockstep.compiled.together import play_together
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.memory import TableMemory
 from coop.lockstep.run import LockstepRun
+from coop.records.checkpoints import ask, checkpoint_numbers
+from coop.records.following import Callbacks
 from coop.records.resumption import Start
-from coop.records.summaries import read_summary
+from coop.records.run_directory import RunDirectory
+from coop.records.summaries import Summary, read_summary
 
 pytest.importorskip("numba")
 
@@ -219,6 +225,106 @@ def test_runs_go_on_where_they_stopped_whoever_had_begun_them(first: str, tmp_pa
     files_of(config, [1, 2], tmp_path / "parts", Stop(), together=not one)
     for seed in (1, 2):
         assert_same_files(tmp_path / "whole" / str(seed), tmp_path / "parts" / str(seed), resumed=True)
+
+
+LONG = {"total_steps": 600, "checkpoint_every": 130}
+
+
+@pytest.fixture
+def compiled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Single runs of any length may be played by compiled loops; a list of where those began, by step."""
+    from coop.lockstep.compiled import group  # noqa: PLC0415 (after importorskip)
+
+    began, play_runs = [], group.play_runs
+
+    def watched(files: dict[Lockstep, RunDirectory], *rest: Any) -> list[Summary]:
+        began.extend(run.step for run in files)
+        return play_runs(files, *rest)
+
+    monkeypatch.setattr("coop.lockstep.run.WORTH_COMPILING", 1)
+    monkeypatch.setattr(group, "play_runs", watched)
+    return began
+
+
+def play_one(path: Path, config: RunConfig, stop: Stop | None = None, callbacks: Callbacks | None = None) -> Summary:
+    """Play a run, which may have begun, as `coop-lockstep --resume` does."""
+    with closing(LockstepRun(config, path, "test", Start(resume=True))) as run:
+        return run.play(stop or Stop(), callbacks=callbacks)
+
+
+def test_a_single_run_in_compiled_loops_leaves_the_same_files(compiled: list[int], tmp_path: Path) -> None:
+    config = config_of("coop", LONG)
+    stopped = play_one(tmp_path / "compiled", config, StopAt(2))
+    assert (stopped.exit, 0 < stopped.env_steps < 600) == ("stopped", True)
+    assert play_one(tmp_path / "compiled", config).exit == "complete"
+    assert compiled[0] == 0
+    assert 0 < compiled[1] < 600
+    files_of(config, [config.seed], tmp_path, Stop(), together=True)
+    assert_same_files(tmp_path / "compiled", tmp_path / str(config.seed), resumed=True)
+    del compiled[:]
+    play_one(tmp_path / "short", replace(config, eval_every=300))
+    assert not compiled, "evaluations are not theirs"
+
+
+def test_callbacks_see_each_step(compiled: list[int], tmp_path: Path) -> None:
+    seen: list[Any] = []
+    callbacks = Callbacks({"on_episode": lambda row: bool(seen.append(row)) or len(seen) == 3})
+    summary = play_one(tmp_path, config_of("coop", LONG), callbacks=callbacks)
+    assert (summary.exit, summary.episodes, len(seen)) == ("stopped by on_episode", 3, 3)
+    assert not compiled
+
+
+def test_compiled_loops_save_a_checkpoint_on_request(
+    compiled: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coop.lockstep.compiled.group.LOOK_EVERY", 0.0)
+    config = config_of("coop", LONG, {"checkpoint_every": 0})
+    saved: list[int] = []
+    monkeypatch.setattr(Lockstep, "save", lambda run, directory: saved.append(run.step))
+    tmp_path.joinpath("run").mkdir()
+    ask(tmp_path / "run")
+    play_one(tmp_path / "run", config)
+    assert len(saved) == 2
+    assert saved[0] < saved[1] == 600
+    assert compiled
+
+
+def test_a_run_that_fails_in_compiled_loops_keeps_its_newest_checkpoint(
+    compiled: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a block has not told yet is in no file, so no checkpoint may hold it."""
+    config, record = config_of("coop", LONG), RunDirectory.record
+
+    def full(directory: RunDirectory, episodes: Any, metrics: Any) -> None:
+        if metrics is not None and metrics["update"] >= 400:
+            raise RunError("no space")
+        record(directory, episodes, metrics)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(RunDirectory, "record", full)
+        with pytest.raises(RunError, match="no space"):
+            play_one(tmp_path / "run", config)
+    assert read_summary(tmp_path / "run")["exit"] == "failed: no space"
+    assert checkpoint_numbers(tmp_path / "run")[-1] < 400
+    play_one(tmp_path / "run", config)
+    files_of(config, [config.seed], tmp_path, Stop(), together=False)
+    assert_same_files(tmp_path / "run", tmp_path / str(config.seed), resumed=True)
+
+
+def test_a_numba_that_can_not_be_imported_costs_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("coop.lockstep.run.WORTH_COMPILING", 1)
+    monkeypatch.setitem(sys.modules, "coop.lockstep.compiled.group", None)
+    assert play_one(tmp_path, config_of("dqn", {"total_steps": 100})).exit == "complete"
+    assert capsys.readouterr().out.count("plays without compiled loops: ") == 1
+
+
+def test_a_cartpole_of_ones_own_is_played_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = replace(gymnasium.spec("CartPole-v1"), kwargs={"sutton_barto_reward": True})
+    monkeypatch.setitem(gymnasium.registry, "CartPole-v1", spec)
+    config = config_of("dqn", {"env": {"id": "CartPole-v1"}})
+    assert why_not(config) == "env: CartPole-v1 is registered as something else"
 
 
 REFUSED = {

@@ -123,7 +123,8 @@ class Networks:
     ) -> bool:
         """Train network `role` of a block of runs with the batches given, towards the other one's targets.
 
-        `x`, `taken` and `discounts` hold the batches. s: [n]. errors: the TD errors before the update, [n, batch], written. Returns whether all are finite.
+        `x`, `taken` and `discounts` hold the batches. s: [n]. errors: the TD errors before the update, [n, batch],
+        written. Returns whether all are finite.
         """
         n, size = errors.shape
         layers, x, double = self._layers(role, runs), self.x[:n], self.config.learner.double
