@@ -94,7 +94,13 @@ CASES = {
     "g-coop, fifo, single": ("g-coop", {"learner": {"double": False, "loss": "huber"}, "replay": {"eviction": "fifo"}}),
     "half of the updates": ("dqn", {"replay": {"ratio": 0.5}, "learner": {"swap_every": 50}}),
     "dead units": ("coop", {"network": {"hidden": [8, 4]}, "learner": {"learning_rate": 0.05}}),
-    "rmsprop, mse": ("coop", {"learner": {"optimizer": "rmsprop", "loss": "mse", "reward_bound": None}}),
+    "rmsprop, mse, ends at a limit": (
+        "coop",
+        {
+            "learner": {"optimizer": "rmsprop", "loss": "mse", "reward_bound": None},
+            "env": {"max_episode_steps": 15, "time_limit_terminal": True},
+        },
+    ),
     "sgd, time limit": ("dqn", {"learner": {"optimizer": "sgd"}, "env": {"max_episode_steps": 15}}),
 }  # fmt: skip
 
