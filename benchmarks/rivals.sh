@@ -1,6 +1,6 @@
 #!/bin/sh
 # Makes the virtual environments of the rivals of `make bench` in .bench/, each once: benchmarks/rivals.sh [NAME ...]
-# Reverb has its own, since it needs an older numpy than ours.
+# JAX has its own, and Reverb, which needs an older numpy than ours.
 set -eu
 cd "$(dirname "$0")/.."
 PYTHON=${PYTHON:-python3}
@@ -18,11 +18,11 @@ venv() { # name, what to install
     fi
 }
 
-[ $# -gt 0 ] || set -- bench reverb
+[ $# -gt 0 ] || set -- bench jax reverb
 for name in "$@"; do
     case $name in
     bench) venv bench --constraint constraints.txt --editable '.[bench]' ;;
-    reverb) venv reverb --requirement benchmarks/reverb/requirements.txt ;;
+    jax | reverb) venv "$name" --requirement "benchmarks/$name/requirements.txt" ;;
     *) echo "$0: no environment $name" >&2; exit 2 ;;
     esac
 done

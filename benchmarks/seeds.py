@@ -1,8 +1,8 @@
-"""Runs a core-hour: seeds side by side against runs by themselves, in turns, one thread.
+"""Runs a core-hour: seeds side by side, a run by itself in compiled loops, and one without these, in turns, one thread.
 
     OMP_NUM_THREADS=1 python benchmarks/seeds.py
 
-Preset cartpole, an update a step. Both go on from turn to turn. The seconds are those of the processor, which other
+Preset cartpole, an update a step. All go on from turn to turn. The seconds are those of the processor, which other
 processes of the machine disturb less; --wall takes the clock's.
 """
 
@@ -42,7 +42,7 @@ def rate(work: Callable[[], int], clock: Callable[[], float]) -> float:
 
 
 def main() -> None:
-    """Print a line of JSON for each method: steps/s of both, and their ratio, by turn."""
+    """Print a line of JSON for each method: steps/s by turn, and ratios: median, least, most."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
     parser.add_argument("--methods", nargs="+", default=["dqn", "coop"])
     parser.add_argument("--seeds", type=int, default=30)
@@ -54,27 +54,30 @@ def main() -> None:
     clock = time.perf_counter if args.wall else time.process_time
     for method in args.methods:
         config = resolve(load_tables("cartpole", None), method)
-        own = Lockstep(config)
-        seeds = Seeds([Lockstep(replace(config, seed=seed)) for seed in range(args.seeds)])
-        alone(own, config.replay.learning_starts + 50)
-        together(seeds, config.replay.learning_starts + 50)
+        plain, first = Lockstep(config), config.replay.learning_starts + 50
+        one, many = (Seeds([Lockstep(replace(config, seed=k)) for k in range(n)]) for n in (1, args.seeds))
+        alone(plain, first)
+        together(one, first)
+        together(many, first)
         each = max(20, 2 * args.steps // args.seeds)
 
-        def played(number: int = each) -> int:
-            before = seeds.step  # noqa: B023 (called in this turn)
-            together(seeds, number)  # noqa: B023
-            return (seeds.step - before) * args.seeds  # noqa: B023
+        def played(seeds: Seeds, number: int) -> int:
+            before = seeds.step
+            together(seeds, number)
+            return (seeds.step - before) * len(seeds.runs)
 
-        turns = []
-        for _ in range(args.turns):
-            one = rate(lambda: alone(own, args.steps) or args.steps, clock)  # noqa: B023
-            turns.append((one, rate(played, clock)))
-        ratios = [many / one for one, many in turns]
-        found = {
-            "method": method, "seeds": args.seeds, "clock": "wall" if args.wall else "processor",
-            "alone": [round(one) for one, _ in turns], "together": [round(many) for _, many in turns],
-            "ratio": round(statistics.median(ratios), 2), "range": [round(f(ratios), 2) for f in (min, max)],
-        }  # fmt: skip
+        works = {
+            "plain": lambda: alone(plain, args.steps) or args.steps,  # noqa: B023 (called in this turn)
+            "alone": lambda: played(one, 2 * args.steps),  # noqa: B023
+            "together": lambda: played(many, each),  # noqa: B023
+        }
+        turns = [{name: rate(work, clock) for name, work in works.items()} for _ in range(args.turns)]
+        measured = "wall" if args.wall else "processor"
+        found: dict[str, object] = {"method": method, "seeds": args.seeds, "clock": measured}
+        found |= {name: [round(turn[name]) for turn in turns] for name in works}
+        for name in ("alone", "together"):
+            ratios = [turn[name] / turn["plain"] for turn in turns]
+            found[f"{name} / plain"] = [round(f(ratios), 2) for f in (statistics.median, min, max)]
         print(json.dumps(found), flush=True)
 
 

@@ -33,6 +33,7 @@ class Target:
 def _updates() -> Iterator[Comparison]:
     for kind, batch in (("mlp", 32), ("minatar", 32), ("nips2013", 32), ("nature", 32), ("nature", 512)):
         subjects = _update_subjects(kind, batch, "cpu") | {"TorchRL": Subject("update_torchrl", (kind, str(batch)))}
+        subjects |= {"JAX": Subject("update_jax", (kind, str(batch)), venv="jax")}
         subjects |= {f"peak {dtype}": Subject("peak", (dtype,)) for dtype in ("float32", "bfloat16")}
         title = f"update of {kind}, batch {batch}"
         yield Comparison("update", title, subjects, "Stable-Baselines3", 9 if batch == 32 else 5, 0.5)
@@ -107,7 +108,12 @@ def _steps() -> Iterator[Comparison]:
 
 def _step_subjects(preset: str, period: str, *methods: str) -> dict[str, Subject]:
     ours = {method: Subject("steps_coop", (preset, method, period)) for method in methods}
-    return {"Stable-Baselines3": Subject("steps_sb3", (preset, period))} | ours
+    return {
+        "Stable-Baselines3": Subject("steps_sb3", (preset, period)),
+        "rejax": Subject("steps_rejax", (preset, period), venv="jax"),
+        "JAX": Subject("steps_jax", (preset, period), venv="jax"),
+        **ours,
+    }
 
 
 def _end_to_end() -> Iterator[Comparison]:
@@ -115,6 +121,8 @@ def _end_to_end() -> Iterator[Comparison]:
         subjects = {
             "Stable-Baselines3": Subject("learn", ("sb3", task)),
             "TorchRL": Subject("learn", ("torchrl", task)),
+            "rejax": Subject("learn", ("rejax", task)),
+            "JAX": Subject("learn", ("jax", task)),
             "dqn lockstep": Subject("learn", ("lockstep", task, "dqn")),
             "coop lockstep": Subject("learn", ("lockstep", task)),
             "coop distributed": Subject("learn", ("distributed", task), cores=0),
@@ -187,6 +195,8 @@ TARGETS = (
     Target("replay service", BESIDE, "coop tcp", ("bare tcp",), 0.75),
     Target("replay service", BESIDE, "coop shm", ("bare shm",), 0.75),
     Target("update of nature, batch 32", "updates/s", "coop bfloat16", ("dqn",), 1 / 1.4),
+    Target("lockstep steps of cartpole-paper", "steps/s", "dqn", ("rejax",), 0.8),
+    Target("lockstep steps of cartpole-paper", "steps/s", "coop", ("rejax",), 0.6),
     Target("table of items of 28KB", "sampled/s", "coop", ("bare copies",), 1 / 1.2),
     Target("table of items of 28KB", "inserted/s", "coop", OTHERS, 15.0),
     Target("table of items of 28KB", "sampled/s", "coop prioritized", ("coop",), 0.5),

@@ -23,6 +23,7 @@ FIGURES = Path(__file__).parents[1] / "results.json"
 PAGE = Path(__file__).parents[1] / "RESULTS.md"
 PACKAGES = {
     "bench": ("coop-rl", "torch", "numpy", "eclipse-zenoh", "stable-baselines3", "torchrl", "cpprb", "gymnasium"),
+    "jax": ("jax", "jaxlib", "flax", "optax", "rejax", "gymnax", "numpy"),
     "reverb": ("dm-reverb", "tensorflow", "numpy"),
 }
 _PRINT_VERSIONS = """

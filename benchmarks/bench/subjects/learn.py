@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from bench.comparison import python_of
 from turns import attend_rounds
 
 # By task: the mean return, and the steps at most. Our preset has its name.
@@ -24,6 +25,7 @@ STEPS = {"cartpole": 2, "minatar-breakout": 4}
 PERIODS = {"minatar-breakout": 250}  # updates between two targets
 RATES = {"minatar-breakout": 1e-3}
 N_STEPS = {"minatar-breakout": 3}  # of a return
+IN_JAX = ("jax", "rejax")
 OURS = {"lockstep": ("coop-lockstep",), "distributed": ("coop-local", "--actors", "1")}
 
 
@@ -50,7 +52,8 @@ def ours(who: str, task: str, method: str, seed: int, folder: Path) -> tuple[int
 
 def rival(who: str, task: str, seed: int) -> tuple[int, bool]:
     """The same of a script beside this one."""
-    command = [sys.executable, str(Path(__file__).with_name(f"learn_{who}.py")), task, str(seed)]
+    python = python_of("jax") if who in IN_JAX else sys.executable
+    command = [str(python), str(Path(__file__).with_name(f"learn_{who}.py")), task, str(seed)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     steps, solved = json.loads(done.stdout.splitlines()[-1])
     return steps, solved
