@@ -12,12 +12,12 @@ from rejax.networks import EpsilonGreedyPolicy
 warnings.simplefilter("ignore")
 
 
-def make(settings: Settings, total: int, log: Any = lambda env: env) -> Any:
-    """The algorithm. total: steps of the run. log: wraps its environment."""
+def make(settings: Settings, total: int) -> Any:
+    """The algorithm. total: steps of the run."""
     env, params = make_env(settings)
     together = max(1, settings.period // settings.updates)
     algorithm = DQN.create(
-        env=log(env),
+        env=env,
         env_params=params,
         num_envs=together,
         num_epochs=1,

@@ -8,28 +8,32 @@ import sys
 from collections import deque
 
 import jax
-from gymnax.wrappers.purerl import LogWrapper
+import jax.numpy as jnp
 from jax_dqn import apart, learning_settings
 from jax_rejax import make
 
 LOOKED = 1000  # steps between looks at the returns
 settings, mean, most = learning_settings(sys.argv[1])
-algorithm = make(settings, most, LogWrapper)
+algorithm = make(settings, most)
 iterations = LOOKED // algorithm.num_envs
 
 
-def iteration(state, _):
+def iteration(carry, _):
+    state, totals = carry
     state = algorithm.train_iteration(state)
-    logged = state.env_state
-    return state, (logged.episode_lengths == 0, logged.returned_episode_returns)
+    buffer = state.replay_buffer
+    newest = (buffer.index - algorithm.num_envs + jnp.arange(algorithm.num_envs)) % buffer.size
+    totals, ended = totals + buffer.data.reward[newest], buffer.data.done[newest]
+    return (state, jnp.where(ended, 0.0, totals)), (ended, totals)
 
 
-run = jax.jit(lambda state: jax.lax.scan(iteration, state, None, iterations), donate_argnums=0)
+run = jax.jit(lambda carry: jax.lax.scan(iteration, carry, None, iterations), donate_argnums=0)
 state = apart(algorithm.init_state(jax.random.PRNGKey(int(sys.argv[2]))))
+carry = state, jnp.zeros(algorithm.num_envs)
 returns: deque[float] = deque(maxlen=100)
 steps, solved = 0, False
 while steps < most and not solved:
-    state, (ended, totals) = run(state)
+    carry, (ended, totals) = run(carry)
     for total in totals[ended].tolist():
         returns.append(total)
         solved = solved or (len(returns) == 100 and sum(returns) / 100 >= mean)
