@@ -69,6 +69,7 @@ class Networks:
         self._gradient = np.zeros((BLOCK, size), np.float32)
         self._parts = views_of(self._gradient, hidden)
         self._views: dict[tuple[int, int, int], Views] = {}
+        self._flats: dict[tuple[int, int, int], tuple[Floats, dict[str, Floats]]] = {}
         self._make_buffers()
         learner, f = config.learner, np.float32
         self._bound, self._loss = f(learner.value_bound or 0), LOSSES[learner.loss]
@@ -103,6 +104,14 @@ class Networks:
         if key not in self._views:
             self._views[key] = views_of(self.theta[role, runs], self.config.network.hidden)
         return self._views[key]
+
+    def _flat(self, role: int, runs: slice) -> tuple[Floats, dict[str, Floats]]:
+        """The parameters of a block of runs as one array, and their optimizers' running means."""
+        key = (role, runs.start, runs.stop)
+        if key not in self._flats:
+            means = {name: buffer[role, runs] for name, buffer in self.buffers.items()}
+            self._flats[key] = self.theta[role, runs], means
+        return self._flats[key]
 
     def values(self, role: int, runs: slice, obs: Floats) -> Floats:
         """Q of one observation of each run, float32 [n, 4] -> [n, 2]."""
@@ -207,7 +216,8 @@ class Networks:
 
     def _descend(self, role: int, runs: slice, gradient: Floats, rate: float) -> None:
         """Take step number `steps` + 1 of the optimizers; `count` counts it."""
-        learner, steps, theta = self.config.learner, self.steps[role] + 1, self.theta[role, runs]
+        learner, steps = self.config.learner, self.steps[role] + 1
+        theta, means = self._flat(role, runs)
         if not self._adam:
             for k, (parameters, its) in enumerate(zip(theta, gradient, strict=True), runs.start):
                 one = make_optimizer(learner, parameters, its)
@@ -219,7 +229,7 @@ class Networks:
         torch.set_flush_denormal(True)  # as the optimizers do
         try:
             loops.adam(
-                theta, gradient, self.buffers["mean"][role, runs], self.buffers["square"][role, runs], *self._decays,
+                theta, gradient, means["mean"], means["square"], *self._decays,
                 f(TINY), f(learner.eps * correction), f(rate * correction / (1 - learner.beta1**steps)),
                 self.finite[runs],
             )  # fmt: skip

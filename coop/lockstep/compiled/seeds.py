@@ -150,12 +150,16 @@ class Seeds:
         rows, action = np.full((count, runs), -1), np.full((count, runs), -1)
         batch, s = np.zeros((count, runs, size), np.int64), np.zeros((count, runs))
         scales = self._scales(due)
+        # From a full table that draws for nothing else, as many numbers are the same at once.
+        together = config.replay.eviction == "fifo" and self.step >= config.replay.capacity
         for k, run in enumerate(self.runs):
             uniform, choose, noise = (
                 run._policy_rng.random,
                 run._policy_rng.integers,
                 self._agents[k]._noise.standard_normal,
             )
+            if together:
+                batch[due, k] = self._tables.drawn(k, self.step, sum(due))
             for place, step in enumerate(steps):
                 if uniform() < epsilon[place]:
                     action[place, k] = choose(2, size=1, dtype=np.int32)[0]
@@ -163,7 +167,8 @@ class Seeds:
                     first = place + 1 - lengths[place]
                     rows[first : place + 1, k] = self._tables.rows(k, step - lengths[place], lengths[place])
                 if due[place]:
-                    batch[place, k] = self._tables.drawn(k, step)
+                    if not together:
+                        batch[place, k] = self._tables.drawn(k, step)[0]
                     scale = scales[place]
                     normal = config.edl.noise == "normal" and scale
                     s[place, k] = scale * float(noise()) if normal else scale

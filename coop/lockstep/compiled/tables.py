@@ -88,9 +88,9 @@ class Tables:
         rows = [n if n < self.capacity else int(draw(n + 1)) for n in range(first, first + count)]
         return [row if row < self.capacity else -1 for row in rows]
 
-    def drawn(self, k: int, inserted: int) -> Ints:
-        """The rows of a batch of table k once it has been given so many transitions: int64 [batch]."""
-        return self.rngs[k].integers(0, min(inserted, self.capacity), self.config.learner.batch_size)
+    def drawn(self, k: int, inserted: int, count: int = 1) -> Ints:
+        """The rows of so many batches of table k once it has been given so many transitions: int64 [count, batch]."""
+        return self.rngs[k].integers(0, min(inserted, self.capacity), (count, self.config.learner.batch_size))
 
     def insert(self, rows: Ints, obs: Array, next_obs: Array, actions: Ints, terminal: Array, version: int) -> None:
         """Put the next transition of every run into its row, int64 [K]; obs, next_obs: float32 [K, 4]."""
