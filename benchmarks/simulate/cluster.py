@@ -14,6 +14,8 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+import msgspec
+
 from benchmarks.simulate import roles
 from benchmarks.simulate.checks import Checks
 from benchmarks.simulate.disk import Disk
@@ -22,16 +24,12 @@ from benchmarks.simulate.plan import Fault, Plan
 from benchmarks.simulate.watched import watched, watched_trainer
 from benchmarks.simulate.world import Machine, Process, Violation, World
 from coop.common.errors import RunError
-from coop.common.messaging import joining
-from coop.common.messaging.messages.control import JoinReply
 from coop.common.settings.config import ActorSettings, LearnerSettings, ReplaySettings, RunConfig
+from coop.common.settings.tables import to_tables
 
 ENDS_WITHIN = 240.0  # seconds after the last fault: a lost acknowledgement alone takes a minute to be missed
 LEAVES_WITHIN = 90.0  # seconds that other roles may take once the run is complete: their patience is 60
 DRIFT = 5e-5  # clocks of two machines differ by a ten-thousandth at most
-_decoded: dict[bytes, JoinReply] = {}
-_decode, _compare = JoinReply.decode, joining.difference
-_compared: dict[tuple[int, int, int, int], str | None] = {}
 
 
 class Cluster:
@@ -48,6 +46,7 @@ class Cluster:
         self.network = Network(self.world)
         self.disk = Disk(self.world, root)
         self.config = make_config(plan)
+        self._tables = msgspec.msgpack.decode(msgspec.msgpack.encode(to_tables(self.config)))
         self.complete = False
         self.met: Counter[str] = Counter()
         self.slow: dict[str, float] = {}
@@ -272,10 +271,18 @@ class Cluster:
             where = SimpleNamespace(gethostname=lambda: self._present_process().machine.name)
             replace("coop.common.messaging.members.socket", where)
             replace("coop.common.process.files.time", SimpleNamespace(strftime=lambda form: "moved"))
-            replace("coop.common.messaging.messages.control.JoinReply.decode", _remembered)
-            replace("coop.common.messaging.joining.difference", _difference)
+            # All have the same settings, which take long to send, read and compare.
+            replace("coop.learner.join_service.to_tables", lambda config: self._tables)
+            replace("coop.common.messaging.messages.control.validated", self._read)
+            replace("coop.common.messaging.joining.identity", lambda config: {})
             replace("benchmarks.simulate.node.SimNode.on_reply", staticmethod(checks.on_reply))
             yield
+
+    def _read(self, tables: dict[str, Any]) -> RunConfig:
+        """The settings that a message holds."""
+        if tables != self._tables:
+            raise Violation("a message holds other settings")
+        return self.config
 
     def _present_process(self) -> Process:
         assert self.world.running is not None
@@ -320,25 +327,6 @@ class _Lock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
-
-
-def _remembered(message: Any) -> JoinReply:  # noqa: ANN401
-    """What a reply says, which takes long to read: the same bytes say the same."""
-    raw = bytes(message.payload)
-    if raw not in _decoded:
-        if len(_decoded) > 4096:
-            _decoded.clear()
-            _compared.clear()
-        _decoded[raw] = _decode(message)
-    return _decoded[raw]
-
-
-def _difference(mine: JoinReply, theirs: JoinReply) -> str | None:
-    """What keeps a member from following a learner; two settings that are the same object differ in nothing."""
-    key = id(mine.config), mine.run_id, id(theirs.config), theirs.run_id
-    if key not in _compared:
-        _compared[key] = _compare(mine, theirs)
-    return _compared[key]
 
 
 def make_config(plan: Plan) -> RunConfig:
