@@ -15,8 +15,10 @@ from typing import Any
 from unittest.mock import patch
 
 import msgspec
+import numpy as np
 
 from benchmarks.simulate import roles
+from benchmarks.simulate.agent import NoDiagnostics, Plain
 from benchmarks.simulate.checks import Checks
 from benchmarks.simulate.disk import Disk
 from benchmarks.simulate.network import Network, Weather
@@ -29,6 +31,7 @@ from coop.common.settings.tables import to_tables
 
 ENDS_WITHIN = 240.0  # seconds after the last fault: a lost acknowledgement alone takes a minute to be missed
 LEAVES_WITHIN = 90.0  # seconds that other roles may take once the run is complete: their patience is 60
+DESCRIPTORS = Path("/proc/self/fd")
 DRIFT = 5e-5  # clocks of two machines differ by a ten-thousandth at most
 
 
@@ -44,7 +47,7 @@ class Cluster:
         self.root = root
         self.world = World(seed)
         self.network = Network(self.world)
-        self.disk = Disk(self.world, root)
+        self.disk = Disk(self.world, root, {fault.target for fault in plan.faults if fault.kind == "crash"})
         self.config = make_config(plan)
         self._tables = msgspec.msgpack.decode(msgspec.msgpack.encode(to_tables(self.config)))
         self.complete = False
@@ -78,7 +81,7 @@ class Cluster:
         for name in ("learner", "replay", "elsewhere"):
             (self.root / name).mkdir(parents=True)
             self.disk.adopt(name)
-        before = set(map(str, Path("/proc/self/fd").iterdir()))
+        before = set(DESCRIPTORS.iterdir())
         try:
             with self._product(), self.disk.installed():
                 names = ["learner", "replay", "actor 0", "actor 1"][: 2 + self.plan.actors]
@@ -262,6 +265,10 @@ class Cluster:
             replace("coop.learner.trainer.METRICS_EVERY", 1 << 40)
             replace("coop.replay.core.check_memory", lambda config, spec: None)
             replace("coop.replay.service.new_incarnation", self.incarnation)
+            replace("coop.replay.persistence.storage.load_array", lambda path, small: np.load(path))  # not mapped
+            replace("coop.records.learner_checkpoints.torch", Plain)
+            replace("coop.records.learner_checkpoints.check_torch_file", lambda path: None)
+            replace("coop.learner.telemetry.Diagnostics", NoDiagnostics)
             replace("coop.replay.persistence.folder.RunLock", partial(_Lock, self))
             replace(
                 "coop.common.process.files.secrets",
@@ -274,6 +281,7 @@ class Cluster:
             # All have the same settings, which take long to send, read and compare.
             replace("coop.learner.join_service.to_tables", lambda config: self._tables)
             replace("coop.common.messaging.messages.control.validated", self._read)
+            replace("coop.common.messaging.messages.control._modules", lambda tables: ())
             replace("coop.common.messaging.joining.identity", lambda config: {})
             replace("benchmarks.simulate.node.SimNode.on_reply", staticmethod(checks.on_reply))
             yield
@@ -288,7 +296,7 @@ class Cluster:
         assert self.world.running is not None
         return self.world.running
 
-    def _clear(self, before: set[str]) -> None:
+    def _clear(self, before: set[Path]) -> None:
         """End what is left of dead processes, whose files and conversations nothing else closes."""
         with self.disk.installed(), patch("sys.unraisablehook", lambda *_: None):
             for process in self.world.processes:
@@ -296,10 +304,10 @@ class Cluster:
                 self.world.running = process
                 for activity in process.activities:
                     activity.abandon()
-        for descriptor in set(map(str, Path("/proc/self/fd").iterdir())) - before:
+        for descriptor in set(DESCRIPTORS.iterdir()) - before:
             with contextlib.suppress(OSError):
-                if Path(descriptor).readlink().is_relative_to(self.root):
-                    os.close(int(Path(descriptor).name))
+                if descriptor.readlink().is_relative_to(self.root):
+                    os.close(int(descriptor.name))
         shutil.rmtree(self.root, ignore_errors=True)
 
 

@@ -12,7 +12,7 @@ import os
 import random
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,12 @@ class Disk:
 
     Attributes:
         full: top folders that have no space. deadly: how many calls a process has left, by name. calls: so far.
+        mortal: top folders of machines that will die; of others nobody asks what was flushed.
     """
 
-    def __init__(self, world: World, root: Path) -> None:
+    def __init__(self, world: World, root: Path, mortal: Set[str]) -> None:
         self.root = root
+        self.mortal = mortal
         self.full: set[str] = set()
         self.deadly: dict[str, int] = {}
         self.calls = 0
@@ -134,12 +136,16 @@ class Disk:
 
     def _fsync(self, descriptor: int) -> None:
         self._call()
-        found = os.fstat(descriptor)
-        if stat.S_ISDIR(found.st_mode):
+        found, process = os.fstat(descriptor), self._world.running
+        is_folder = stat.S_ISDIR(found.st_mode)
+        if not is_folder:
+            self._space()
+        if process is not None and process.machine.name not in self.mortal:
+            return
+        if is_folder:
             with os.scandir(descriptor) as entries:
                 self._folders[found.st_ino] = {entry.name: entry.inode() for entry in entries}
         else:
-            self._space()
             opened = os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY)
             try:
                 self._files[found.st_ino] = os.pread(opened, found.st_size, 0)
