@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -284,7 +285,7 @@ class Checks:
         if not weights.ready:
             return
         heard = process.state.pop("roles", ())
-        told = [process.state.get("role"), *(Role.decode(wire.decode(raw)).acting - 1 for raw in heard)]
+        told = [process.state.get("role"), *map(_acting, heard)]
         process.state["role"] = told[-1]
         self.hold("role", policy.acting in told, f"{process.name} acts with network {policy.acting + 1}")
         for number, each in enumerate(policy.networks):
@@ -392,6 +393,12 @@ class Checks:
                 f"holds {core.table.inserted}, has drawn {core.drawn}: {core.inserts_wait_for}; {core.samples_wait_for}"
             )
         return "lives"
+
+
+@lru_cache(64)
+def _acting(role: bytes) -> int:
+    """The network that acts, from 0 on."""
+    return Role.decode(wire.decode(role)).acting - 1
 
 
 def _digest(agent: Any) -> bytes:  # noqa: ANN401
