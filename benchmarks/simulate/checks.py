@@ -34,6 +34,7 @@ EXPECTED = (  # how processes end that meet faults, in words
     "JoinError: ",
     "uses it",
     "No space left",
+    "Input/output error",
     "serves this run",
     "has taken over from this one",
     "has been gone for",
@@ -154,7 +155,7 @@ class Checks:
                     continue
                 text = f"segment {who[1]} of actor {who[0]:x}, acknowledged at {when} s, is not in the restored table"
                 self.broken(f"acknowledged: {text}")
-        if self._forgive:
+        if self._forgive or self.cluster.met["bad flush"]:
             self._draws.clear()
         self._forgive = False
         self.look_at(core)

@@ -211,6 +211,9 @@ class Cluster:
         self.disk.full.add(fault.target)
         self.world.after(fault.length, lambda: self.disk.full.discard(fault.target))
 
+    def _bad_flush(self, fault: Fault) -> None:
+        self.disk.failing.add(fault.target)
+
     def _slow(self, fault: Fault) -> None:
         self.slow[fault.target] = fault.number
         self.world.after(fault.length, lambda: self.slow.pop(fault.target, None))
