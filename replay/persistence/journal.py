@@ -141,7 +141,7 @@ class Journal:
                 self.sync(self._number)
             except OSError:
                 os.close(self._file)
-                self._file, self._number, self._records, self._end = before
+                self._append_to(*before)
                 raise
             self._flushed = self._end
         os.close(before[0])
@@ -213,7 +213,10 @@ class Journal:
             os.close(file)
             path.unlink()
             raise
-        self._file, self._number, self._records, self._end = file, number, 1, end
+        self._append_to(file, number, 1, end)
+
+    def _append_to(self, file: int, number: int, records: int, end: int) -> None:
+        self._file, self._number, self._records, self._end = file, number, records, end
 
     def _append(self, kind: int, payload: bytes, transitions: int = 0) -> None:
         if self._end > ROLL_AT:
