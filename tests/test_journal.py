@@ -188,6 +188,34 @@ def test_a_disk_that_fails_once_ends_the_service_and_acknowledges_nothing(
         assert stop.reason == "the journal can't be flushed to the disk: Input/output error"
 
 
+@pytest.mark.parametrize("call", ["fdatasync", "fsync"])
+def test_what_a_flush_has_failed_to_write_is_gone_from_the_journal(
+    spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    def fail(file: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    lock = threading.Condition()
+    journal = Journal(tmp_path, 5, 1, keep=False, sync=True)
+    core = ReplayCore(CONFIG, spec, journal)
+    _use(core, spec, range(2))
+    journal.flush(lock)
+    _use(core, spec, range(2, 4))
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises(OSError, match="Input/output error"):
+        journal.flush(lock) if call == "fdatasync" else journal.roll()
+    monkeypatch.undo()
+    with pytest.raises(OSError, match="Input/output error"):
+        journal.flush(lock)
+    assert isinstance(_insert(core, spec, 4), RetryLater)
+    with pytest.raises(OSError, match="Input/output error"):
+        journal.close()
+    twin = ReplayCore(CONFIG, spec)
+    _, notices = recover(twin, tmp_path, 1, 5, sync=True)
+    assert twin.table.inserted == 8, "what was flushed, and may have been acknowledged"
+    assert len(notices) == 1, "and nothing is said to be lost"
+
+
 @contextmanager
 def served(endpoint: str, spec: EnvSpec, folder: Path) -> Iterator[tuple[Node, ReplayService]]:
     """A service with a journal that is flushed, and a client of it."""

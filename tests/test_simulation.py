@@ -73,6 +73,15 @@ def test_a_machine_that_dies_loses_only_what_no_promise_covers() -> None:
             assert not outcome.forgiven or journal == "async"
 
 
+@pytest.mark.parametrize("seed", [174, 463])
+def test_a_disk_that_fails_a_flush_and_dies_loses_nothing_acknowledged(seed: int) -> None:
+    outcome = simulate(seed)
+    _assert_holds(outcome)
+    assert outcome.plan.journal == "sync"
+    assert outcome.met["bad flush"] == outcome.met["crash"] == 1
+    assert not outcome.forgiven
+
+
 def test_a_flush_that_outlives_the_confirmation_acknowledges_nothing() -> None:
     faults = (
         Fault(0.5, "slow", "replay", length=5.0, number=3.0),

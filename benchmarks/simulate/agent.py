@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -95,3 +98,31 @@ class FewNumbers:
         for network, flat in zip(self.networks, state["networks"], strict=True):
             network.load(np.array(flat, np.float32))
         self.versions, self.acting, self.updates = list(state["versions"]), state["acting"], state["updates"]
+
+
+class NoDiagnostics:
+    """In place of `Diagnostics`, which measures networks."""
+
+    def add(self, batch: Batch) -> None:
+        """See `Diagnostics`."""
+
+    def state(self) -> dict[str, Any]:
+        """See `Diagnostics`."""
+        return {}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """See `Diagnostics`."""
+
+
+class Plain:
+    """In place of PyTorch, which takes long to write and read a learner's state without tensors."""
+
+    @staticmethod
+    def save(state: dict[str, Any], file: BytesIO) -> None:
+        """As `torch.save`."""
+        file.write(msgpack.packb(state))
+
+    @staticmethod
+    def load(path: Path, *, weights_only: bool) -> Any:  # noqa: ANN401
+        """As `torch.load`."""
+        return msgpack.unpackb(path.read_bytes())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +17,11 @@ from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.messaging.messages.weights import Role
 from coop.common.transitions import Batch, Drawn, DrawRequest, Segment
 from coop.learner.trainer import Effects, Trainer
-from coop.records.checkpoints import DONE, Damaged, checkpoint_numbers
+from coop.records.checkpoints import DONE, Damaged, check_part, checkpoint_numbers, read_manifest
 from coop.records.learner_checkpoints import load_learner
 from coop.records.run_ids import read_run_id
 from coop.replay.core import ReplayCore, Reply
-from coop.replay.persistence.checkpoints import ReplayCheckpoints, part_path
+from coop.replay.persistence.checkpoints import part_path
 from coop.replay.persistence.storage import load_snapshot
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ EXPECTED = (  # how processes end that meet faults, in words
     "JoinError: ",
     "uses it",
     "No space left",
+    "Input/output error",
     "serves this run",
     "has taken over from this one",
     "has been gone for",
@@ -152,7 +155,7 @@ class Checks:
                     continue
                 text = f"segment {who[1]} of actor {who[0]:x}, acknowledged at {when} s, is not in the restored table"
                 self.broken(f"acknowledged: {text}")
-        if self._forgive:
+        if self._forgive or self.cluster.met["bad flush"]:
             self._draws.clear()
         self._forgive = False
         self.look_at(core)
@@ -282,10 +285,10 @@ class Checks:
         self.hold("acknowledged", acked <= given, f"{process.name} counts {acked} acknowledged, but {given} were")
         if not weights.ready:
             return
-        told, process.state["roles"] = process.state.get("roles", []), []
-        acting = {Role.decode(wire.decode(raw)).acting - 1 for raw in (process.state.get("last role"), *told) if raw}
-        process.state["last role"] = told[-1] if told else process.state.get("last role")
-        self.hold("role", policy.acting in acting, f"{process.name} acts with network {policy.acting + 1}")
+        heard = process.state.pop("roles", ())
+        told = [process.state.get("role"), *map(_acting, heard)]
+        process.state["role"] = told[-1]
+        self.hold("role", policy.acting in told, f"{process.name} acts with network {policy.acting + 1}")
         for number, each in enumerate(policy.networks):
             held = weights._held[number]
             expected = self._flats.get((number, held))
@@ -308,9 +311,9 @@ class Checks:
         recent = [old[-1], *(each for each in self._roles if each[0] > now - STALE)]
         acting = {role for _, role, _ in recent}
         self.hold("role", policy.acting in acting, f"{process.name} acts with network {policy.acting + 1}")
-        told = old[-1][2][policy.acting]
+        newest = old[-1][2][policy.acting]
         held = weights._held[policy.acting]
-        self.hold("role", held >= told, f"{process.name} acts with version {held}, {told} was broadcast")
+        self.hold("role", held >= newest, f"{process.name} acts with version {held}, {newest} was broadcast")
 
     # ------------------------------------------------------------------------------------------------------------------
     # Checkpoints
@@ -328,19 +331,19 @@ class Checks:
             state = load_learner(path / "checkpoints" / str(newest))
             self.hold("checkpoint", state["agent"]["updates"] == newest, f"{newest} holds another number of updates")
         for folder in self._folders():
-            if newest in ReplayCheckpoints(folder, -1).intact():
+            with suppress(Damaged):
                 if sealed != self._sealed:
                     self._restore(folder, newest)
+                else:
+                    check_part(part_path(folder, newest), newest, None)
                 self._sealed = sealed
                 return
         self.broken(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
 
-    def _restore(self, folder: Any, number: int) -> None:  # noqa: ANN401
-        core = ReplayCore(self.cluster.config, SPEC)
-        try:
-            load_snapshot(core, part_path(folder, number), read_run_id(folder), number)
-        except Damaged as damaged:
-            self.broken(f"checkpoint: part of {number}: {damaged}")
+    def _restore(self, folder: Path, number: int) -> None:
+        core, path = ReplayCore(self.cluster.config, SPEC), part_path(folder, number)
+        mark = load_snapshot(core, path, read_manifest(path).run, number)
+        self.hold("checkpoint", mark.run_id == read_run_id(folder), f"part of {number} is another run's")
         acked, self.acked = self.acked, {}
         self.look_at(core)
         self.acked = acked
@@ -391,6 +394,12 @@ class Checks:
                 f"holds {core.table.inserted}, has drawn {core.drawn}: {core.inserts_wait_for}; {core.samples_wait_for}"
             )
         return "lives"
+
+
+@lru_cache(64)
+def _acting(role: bytes) -> int:
+    """The network that acts, from 0 on."""
+    return Role.decode(wire.decode(role)).acting - 1
 
 
 def _digest(agent: Any) -> bytes:  # noqa: ANN401

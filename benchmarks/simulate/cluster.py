@@ -14,7 +14,11 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+import msgspec
+import numpy as np
+
 from benchmarks.simulate import roles
+from benchmarks.simulate.agent import NoDiagnostics, Plain
 from benchmarks.simulate.checks import Checks
 from benchmarks.simulate.disk import Disk
 from benchmarks.simulate.network import Network, Weather
@@ -22,16 +26,13 @@ from benchmarks.simulate.plan import Fault, Plan
 from benchmarks.simulate.watched import watched, watched_trainer
 from benchmarks.simulate.world import Machine, Process, Violation, World
 from coop.common.errors import RunError
-from coop.common.messaging import joining
-from coop.common.messaging.messages.control import JoinReply
 from coop.common.settings.config import ActorSettings, LearnerSettings, ReplaySettings, RunConfig
+from coop.common.settings.tables import to_tables
 
 ENDS_WITHIN = 240.0  # seconds after the last fault: a lost acknowledgement alone takes a minute to be missed
 LEAVES_WITHIN = 90.0  # seconds that other roles may take once the run is complete: their patience is 60
+DESCRIPTORS = Path("/proc/self/fd")
 DRIFT = 5e-5  # clocks of two machines differ by a ten-thousandth at most
-_decoded: dict[bytes, JoinReply] = {}
-_decode, _compare = JoinReply.decode, joining.difference
-_compared: dict[tuple[int, int, int, int], str | None] = {}
 
 
 class Cluster:
@@ -46,8 +47,9 @@ class Cluster:
         self.root = root
         self.world = World(seed)
         self.network = Network(self.world)
-        self.disk = Disk(self.world, root)
+        self.disk = Disk(self.world, root, {fault.target for fault in plan.faults if fault.kind == "crash"})
         self.config = make_config(plan)
+        self._tables = msgspec.msgpack.decode(msgspec.msgpack.encode(to_tables(self.config)))
         self.complete = False
         self.met: Counter[str] = Counter()
         self.slow: dict[str, float] = {}
@@ -79,7 +81,7 @@ class Cluster:
         for name in ("learner", "replay", "elsewhere"):
             (self.root / name).mkdir(parents=True)
             self.disk.adopt(name)
-        before = set(map(str, Path("/proc/self/fd").iterdir()))
+        before = set(DESCRIPTORS.iterdir())
         try:
             with self._product(), self.disk.installed():
                 names = ["learner", "replay", "actor 0", "actor 1"][: 2 + self.plan.actors]
@@ -209,6 +211,9 @@ class Cluster:
         self.disk.full.add(fault.target)
         self.world.after(fault.length, lambda: self.disk.full.discard(fault.target))
 
+    def _bad_flush(self, fault: Fault) -> None:
+        self.disk.failing.add(fault.target)
+
     def _slow(self, fault: Fault) -> None:
         self.slow[fault.target] = fault.number
         self.world.after(fault.length, lambda: self.slow.pop(fault.target, None))
@@ -263,6 +268,10 @@ class Cluster:
             replace("coop.learner.trainer.METRICS_EVERY", 1 << 40)
             replace("coop.replay.core.check_memory", lambda config, spec: None)
             replace("coop.replay.service.new_incarnation", self.incarnation)
+            replace("coop.replay.persistence.storage.load_array", lambda path, small: np.load(path))  # not mapped
+            replace("coop.records.learner_checkpoints.torch", Plain)
+            replace("coop.records.learner_checkpoints.check_torch_file", lambda path: None)
+            replace("coop.learner.telemetry.Diagnostics", NoDiagnostics)
             replace("coop.replay.persistence.folder.RunLock", partial(_Lock, self))
             replace(
                 "coop.common.process.files.secrets",
@@ -272,16 +281,25 @@ class Cluster:
             where = SimpleNamespace(gethostname=lambda: self._present_process().machine.name)
             replace("coop.common.messaging.members.socket", where)
             replace("coop.common.process.files.time", SimpleNamespace(strftime=lambda form: "moved"))
-            replace("coop.common.messaging.messages.control.JoinReply.decode", _remembered)
-            replace("coop.common.messaging.joining.difference", _difference)
+            # All have the same settings, which take long to send, read and compare.
+            replace("coop.learner.join_service.to_tables", lambda config: self._tables)
+            replace("coop.common.messaging.messages.control.validated", self._read)
+            replace("coop.common.messaging.messages.control._modules", lambda tables: ())
+            replace("coop.common.messaging.joining.identity", lambda config: {})
             replace("benchmarks.simulate.node.SimNode.on_reply", staticmethod(checks.on_reply))
             yield
+
+    def _read(self, tables: dict[str, Any]) -> RunConfig:
+        """The settings that a message holds."""
+        if tables != self._tables:
+            raise Violation("a message holds other settings")
+        return self.config
 
     def _present_process(self) -> Process:
         assert self.world.running is not None
         return self.world.running
 
-    def _clear(self, before: set[str]) -> None:
+    def _clear(self, before: set[Path]) -> None:
         """End what is left of dead processes, whose files and conversations nothing else closes."""
         with self.disk.installed(), patch("sys.unraisablehook", lambda *_: None):
             for process in self.world.processes:
@@ -289,10 +307,10 @@ class Cluster:
                 self.world.running = process
                 for activity in process.activities:
                     activity.abandon()
-        for descriptor in set(map(str, Path("/proc/self/fd").iterdir())) - before:
+        for descriptor in set(DESCRIPTORS.iterdir()) - before:
             with contextlib.suppress(OSError):
-                if Path(descriptor).readlink().is_relative_to(self.root):
-                    os.close(int(Path(descriptor).name))
+                if descriptor.readlink().is_relative_to(self.root):
+                    os.close(int(descriptor.name))
         shutil.rmtree(self.root, ignore_errors=True)
 
 
@@ -320,25 +338,6 @@ class _Lock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
-
-
-def _remembered(message: Any) -> JoinReply:  # noqa: ANN401
-    """What a reply says, which takes long to read: the same bytes say the same."""
-    raw = bytes(message.payload)
-    if raw not in _decoded:
-        if len(_decoded) > 4096:
-            _decoded.clear()
-            _compared.clear()
-        _decoded[raw] = _decode(message)
-    return _decoded[raw]
-
-
-def _difference(mine: JoinReply, theirs: JoinReply) -> str | None:
-    """What keeps a member from following a learner; two settings that are the same object differ in nothing."""
-    key = id(mine.config), mine.run_id, id(theirs.config), theirs.run_id
-    if key not in _compared:
-        _compared[key] = _compare(mine, theirs)
-    return _compared[key]
 
 
 def make_config(plan: Plan) -> RunConfig:

@@ -12,7 +12,7 @@ import os
 import random
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,16 +28,21 @@ class Disk:
 
     Attributes:
         full: top folders that have no space. deadly: how many calls a process has left, by name. calls: so far.
+        failing: top folders whose next flush of a file fails.
+        mortal: top folders of machines that will die; of others nobody asks what was flushed.
     """
 
-    def __init__(self, world: World, root: Path) -> None:
+    def __init__(self, world: World, root: Path, mortal: Set[str]) -> None:
         self.root = root
+        self.mortal = mortal
         self.full: set[str] = set()
+        self.failing: set[str] = set()
         self.deadly: dict[str, int] = {}
         self.calls = 0
         self._world = world
         self._files: dict[int, bytes] = {}  # what was flushed, by inode
         self._folders: dict[int, dict[str, int]] = {}
+        self._holes: dict[int, tuple[int, int]] = {}  # bytes that a failed flush has lost: later ones pass them over
 
     @contextmanager
     def installed(self) -> Iterator[None]:
@@ -98,7 +103,7 @@ class Disk:
     def _content(self, inode: int, now: Path | None, draw: random.Random) -> bytes:
         """A file after the crash: what was flushed, what is there, or something between."""
         flushed = self._files.get(inode, b"")
-        present = now.read_bytes() if now is not None else flushed
+        present = self._without_hole(inode, now.read_bytes()) if now is not None else flushed
         if present == flushed or draw.random() < 0.4:
             return flushed
         if draw.random() < 0.3:
@@ -134,17 +139,44 @@ class Disk:
 
     def _fsync(self, descriptor: int) -> None:
         self._call()
-        found = os.fstat(descriptor)
-        if stat.S_ISDIR(found.st_mode):
+        found, process = os.fstat(descriptor), self._world.running
+        is_folder = stat.S_ISDIR(found.st_mode)
+        if not is_folder:
+            self._space()
+        name = "" if process is None else process.machine.name
+        fails = not is_folder and name in self.failing
+        if fails:
+            self.failing.discard(name)
+        if process is not None and name not in self.mortal and not fails:
+            return
+        if is_folder:
             with os.scandir(descriptor) as entries:
                 self._folders[found.st_ino] = {entry.name: entry.inode() for entry in entries}
-        else:
-            self._space()
-            opened = os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY)
-            try:
-                self._files[found.st_ino] = os.pread(opened, found.st_size, 0)
-            finally:
-                os.close(opened)
+            return
+        opened = os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY)
+        try:
+            content = self._without_hole(found.st_ino, os.pread(opened, found.st_size, 0))
+        finally:
+            os.close(opened)
+        if fails:
+            before = self._files.get(found.st_ino, b"")
+            pairs = enumerate(zip(before, content, strict=False))
+            first = next((at for at, (one, other) in pairs if one != other), min(len(before), len(content)))
+            self._holes[found.st_ino] = first, len(content)
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        self._files[found.st_ino] = content
+
+    def _without_hole(self, inode: int, content: bytes) -> bytes:
+        """A file's content as the disk has it, if nothing else is lost."""
+        start, end = self._holes.get(inode, (0, 0))
+        return content[:start] + bytes(max(0, min(end, len(content)) - start)) + content[max(start, end) :]
+
+    def _written_anew(self, descriptor: int, start: int) -> None:
+        """What is written again from a byte on is not lost."""
+        if self._holes:
+            inode = os.fstat(descriptor).st_ino
+            first, end = self._holes.get(inode, (0, 0))
+            self._holes[inode] = first, min(end, max(first, start))
 
     def _fdatasync(self, descriptor: int) -> None:
         self._fsync(descriptor)
@@ -158,11 +190,13 @@ class Disk:
         left = None if process is None else self.deadly.get(process.name)
         if left == 0:  # its next call kills it: this one is torn
             data = data[: self._world.random.randrange(len(data) + 1)]
+        self._written_anew(descriptor, at)
         written: int = _real["pwrite"](descriptor, data, at)
         return written
 
     def _ftruncate(self, descriptor: int, size: int) -> None:
         self._call()
+        self._written_anew(descriptor, size)
         _real["ftruncate"](descriptor, size)
 
     def _replace(self, source: Any, target: Any, **named: Any) -> None:  # noqa: ANN401

@@ -21,8 +21,9 @@ KINDS = (
     "leap",
     "second",
     "second actor",
+    "bad flush",
 )
-_WEIGHTS = (6, 5, 4, 6, 8, 4, 3, 6, 2, 3, 1, 4, 1)
+_WEIGHTS = (6, 5, 4, 6, 8, 4, 3, 6, 2, 3, 1, 4, 1, 0)  # the last one comes by itself
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ class Fault:
             "leap": f"the clock of {self.target} leaps by {self.number:.2f} s",
             "second": f"a second replay service starts, {self.other}",
             "second actor": "another actor joins",
+            "bad flush": f"the disk of {self.target} fails the next flush, and loses what it was to write",
         }
         return f"{self.at:7.3f} s  {words[self.kind]}"
 
@@ -111,7 +113,7 @@ def make_plan(seed: int) -> Plan:
         every=every,
         actors=actors,
         evaluator=draw.random() < 0.3,
-        faults=tuple(sorted(_faults(draw, lasts), key=lambda fault: fault.at)),
+        faults=tuple(sorted([*_faults(draw, lasts), *_bad_flush(draw, lasts)], key=lambda fault: fault.at)),
     )
 
 
@@ -147,3 +149,12 @@ def _faults(draw: random.Random, lasts: float) -> list[Fault]:
                 other = draw.choice(("elsewhere", "elsewhere", "on the same folder"))
             found.append(Fault(at, kind, target, other, length, number))
     return found
+
+
+def _bad_flush(draw: random.Random, lasts: float) -> list[Fault]:
+    """A flush that fails, and often the death of the machine: until then what was lost can still be read."""
+    if draw.random() > 0.15:
+        return []
+    at, target = draw.uniform(0.2, 1.2 * lasts), draw.choice(("learner", "replay", "replay"))
+    then = [Fault(at + draw.uniform(0.1, 4.0), "crash", target)] if draw.random() < 0.7 else []
+    return [Fault(at, "bad flush", target), *then]

@@ -11,6 +11,7 @@ Only names that the product wrote are read or removed; others in these folders a
 from __future__ import annotations
 
 import json
+import os
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -81,11 +82,12 @@ def checkpoint_numbers(run_dir: Path, part: str = "") -> list[int]:
     part: only those with this file or folder.
     """
     try:
-        there = [path for path in (run_dir / FOLDER).iterdir() if _NUMBER.fullmatch(path.name)]
-        own = [path for path in there if path.is_dir() and not path.is_symlink()]
+        with os.scandir(run_dir / FOLDER) as entries:
+            there = [entry for entry in entries if _NUMBER.fullmatch(entry.name)]
+            own = [entry for entry in there if entry.is_dir(follow_symlinks=False)]
     except OSError:
         return []
-    return sorted(int(path.name) for path in own if not part or (path / part).exists())
+    return sorted(int(entry.name) for entry in own if not part or Path(entry.path, part).exists())
 
 
 def ask(run_dir: Path) -> None:

@@ -103,9 +103,11 @@ class Journal:
         self._sync = sync
         self._accepted = accepted
         self._late: list[tuple[int, bytes]] = []  # records of draws for which there was no space
+        self._failed: OSError | None = None  # the first flush that has failed, if records must survive the machine
         make_folder(folder)
         self._open(number)
         self.sync(number)
+        self._flushed = self._end
 
     def insert(self, payload: bytes, transitions: int) -> None:
         """Record an insert request; raises OSError, and then has recorded nothing."""
@@ -127,16 +129,22 @@ class Journal:
         """Begin the next file and return its number; raises OSError, and then continues the present file."""
         self._append_late()
         self._write(END, b"")  # remains of an older file may follow
-        before = self._file
+        before = self._file, self._number, self._records, self._end
         try:
             self._open(self._number + 1)
         except OSError:
             self._end -= HEADER_BYTES
             self._records -= 1
             raise
-        os.close(before)
         if self._sync:
-            self.sync(self._number)
+            try:
+                self.sync(self._number)
+            except OSError:
+                os.close(self._file)
+                self._append_to(*before)
+                raise
+            self._flushed = self._end
+        os.close(before[0])
         return self._number
 
     def flush(self, lock: threading.Condition) -> None:
@@ -145,11 +153,29 @@ class Journal:
         lock: guards this journal; it is not held meanwhile.
         """
         with lock:
-            file = os.dup(self._file)  # which may be rolled meanwhile
+            self._check()
+            file, number, end = os.dup(self._file), self._number, self._end  # which may be rolled meanwhile
         try:
             os.fdatasync(file)
+        except OSError as error:
+            self._failed = error
         finally:
             os.close(file)
+        with lock:
+            self._check()
+            if number == self._number:
+                self._flushed = max(self._flushed, end)
+
+    def _check(self) -> None:
+        """Raise OSError if a flush has failed.
+
+        What it was to write may be lost, and can be read all the same, until the machine ends. So it is cut off, and
+        nothing follows: a process that goes on from this journal must find no more than the disk holds.
+        """
+        if self._failed is not None:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, self._flushed)
+            raise OSError(self._failed.errno, self._failed.strerror)
 
     def close(self) -> None:
         """End the journal as one that was not killed; raises OSError."""
@@ -160,10 +186,14 @@ class Journal:
 
     def sync(self, number: int) -> None:
         """Flush what the journal held when file `number` was begun to the disk; raises OSError."""
-        for each in (number - 1, number):
-            with contextlib.suppress(FileNotFoundError):
-                sync_file(_path(self._folder, each))
-        sync_folder(self._folder)
+        try:
+            for each in (number - 1, number):
+                with contextlib.suppress(FileNotFoundError):
+                    sync_file(_path(self._folder, each))
+            sync_folder(self._folder)
+        except OSError as error:
+            self._failed = error if self._sync else None
+            raise
 
     def drop(self, before: int) -> None:
         """Release the files with lower numbers, unless all are to be kept."""
@@ -183,7 +213,10 @@ class Journal:
             os.close(file)
             path.unlink()
             raise
-        self._file, self._number, self._records, self._end = file, number, 1, end
+        self._append_to(file, number, 1, end)
+
+    def _append_to(self, file: int, number: int, records: int, end: int) -> None:
+        self._file, self._number, self._records, self._end = file, number, records, end
 
     def _append(self, kind: int, payload: bytes, transitions: int = 0) -> None:
         if self._end > ROLL_AT:
@@ -198,6 +231,7 @@ class Journal:
 
     def _write(self, kind: int, payload: bytes, transitions: int = 0) -> None:
         check_guards()
+        self._check()
         accepted = self._accepted + transitions
         header = Header(_checksum(payload), kind, self._number, self._records, accepted, len(payload))
         try:
