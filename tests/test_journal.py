@@ -216,6 +216,28 @@ def test_what_a_flush_has_failed_to_write_is_gone_from_the_journal(
     assert len(notices) == 1, "and nothing is said to be lost"
 
 
+@pytest.mark.parametrize("sync", [False, True])
+def test_a_file_that_a_dead_machine_has_shortened_is_said_by_the_next_one(
+    spec: EnvSpec, tmp_path: Path, sync: bool
+) -> None:
+    """Its end looks as a kill leaves it, and so the draws of the next file were taken for deviations."""
+    journal = Journal(tmp_path, 5, 1, keep=False)
+    core = ReplayCore(CONFIG, spec, journal)
+    _use(core, spec, range(2))
+    whole = journal._end
+    _use(core, spec, range(2, 4))
+    journal.roll()
+    _use(core, spec, range(4, 6))
+    journal.close()
+    os.truncate(tmp_path / "00000001.log", whole)
+    twin = ReplayCore(CONFIG, spec)
+    _, notices = recover(twin, tmp_path, 1, 5, sync=sync)
+    assert twin.table.inserted == 16
+    assert twin.damaged == (0 if sync else 8), "what was not flushed was not acknowledged"
+    assert notices[1].startswith(f"{tmp_path}: 8 transitions before file 2 are missing")
+    assert len(notices) == (2 if sync else 3)
+
+
 @contextmanager
 def served(endpoint: str, spec: EnvSpec, folder: Path) -> Iterator[tuple[Node, ReplayService]]:
     """A service with a journal that is flushed, and a client of it."""

@@ -151,7 +151,11 @@ class Disk:
             return
         if is_folder:
             with os.scandir(descriptor) as entries:
-                self._folders[found.st_ino] = {entry.name: entry.inode() for entry in entries}
+                there = list(entries)
+            self._folders[found.st_ino] = {entry.name: entry.inode() for entry in there}
+            for entry in there:  # if it is removed, and the removal is not flushed, a folder is there again
+                if entry.is_dir():
+                    self._folders.setdefault(entry.inode(), {})
             return
         opened = os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY)
         try:

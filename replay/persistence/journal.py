@@ -141,6 +141,8 @@ class Journal:
                 self.sync(self._number)
             except OSError:
                 os.close(self._file)
+                with contextlib.suppress(OSError):
+                    _path(self._folder, self._number).unlink()
                 self._append_to(*before)
                 raise
             self._flushed = self._end

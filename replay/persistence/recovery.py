@@ -88,17 +88,17 @@ class Replaying:
             if isinstance(entry, Lost):
                 self.lost.append(entry.text)
                 if entry.accepted is not None:
-                    behind += self._count(entry.accepted)
+                    behind += self._count(entry.accepted, number)
                 continue
             kind, payload, accepted = entry
             if kind == SEGMENT:
                 segment = read(wire.decode(payload))
-                self._count(accepted - segment.steps)
+                self._count(accepted - segment.steps, number)
                 behind = 0
                 core.apply_insert(segment)
                 self._accepted = accepted
                 continue
-            self._count(accepted)
+            self._count(accepted, number)
             behind = 0
             if kind == DRAW:
                 request, ids = read_draw(payload)
@@ -115,9 +115,12 @@ class Replaying:
             self.ended = kind == END
         self.behind += behind
 
-    def _count(self, accepted: int) -> int:
-        """Count what is lost before a record at which the run had accepted so many transitions."""
-        lost = max(0, accepted - self._accepted) if self.lost else 0
+    def _count(self, accepted: int, number: int) -> int:
+        """Count what is lost before a record of file `number` at which the run had accepted so many transitions."""
+        lost = max(0, accepted - self._accepted)
+        if lost and not self.lost:  # the file before it ends whole, but earlier than it did
+            self.lost.append(f"{self._folder}: {lost:,} transitions before file {number} are missing")
+            self.behind += lost
         self.transitions_lost += lost
         self._accepted = accepted
         return lost
