@@ -38,7 +38,8 @@ from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start, holds_run
 from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
-from coop.records.sinks import Kept, Sink, chosen_sinks
+from coop.records.sinks import Kept, RecordedRun, Sink, chosen_sinks
+from coop.records.sinks.mlflow import MlflowSink
 from website.assemble import assembled
 
 GRID = {
@@ -190,6 +191,18 @@ def test_mlflow_is_told_how_a_run_has_ended(tmp_path: Path, ended: str | None, s
     (its_run,) = store.search_runs([store.get_experiment_by_name("coop").experiment_id])
     assert its_run.info.status == status
     assert its_run.data.metrics == ({} if ended is None else {"final/return_mean_100": 7})
+
+
+def test_mlflow_s_requests_are_within_its_bounds(tmp_path: Path) -> None:
+    pytest.importorskip("mlflow", reason="needs the extra mlflow")
+    sink = MlflowSink(RecordedRun(tmp_path, 7, ""))
+    sink.begin({f"setting.{number}": number for number in range(201)}, None)
+    sink.scalars({f"metric/{number}": number for number in range(2001)}, 5)
+    sink.close()
+    store = mlflow_store(tmp_path / "logs" / "mlruns")
+    (its_run,) = store.search_runs([store.get_experiment_by_name("coop").experiment_id])
+    assert its_run.data.params == {f"setting.{number}": str(number) for number in range(201)}
+    assert its_run.data.metrics == {f"metric/{number}": number for number in range(2001)}
 
 
 def test_a_run_that_a_service_refuses_has_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
