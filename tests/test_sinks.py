@@ -7,7 +7,7 @@ import socket
 import struct
 import threading
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -142,6 +142,8 @@ def test_weights_and_biases_gets_tensorboards_scalars(tmp_path: Path, monkeypatc
     assert logged == pytest.approx(expected)
     assert settings["replay.capacity"] == run.config.replay.capacity
     assert ends == [1], "a run that nothing has ended"
+    assert [path for path in tmp_path.glob("wandb/*/logs/*") if not path.resolve().is_relative_to(tmp_path)]
+    assert coop.load(tmp_path).config == run.config, "though W&B has a link to its log elsewhere there"
 
 
 def test_mlflow_gets_tensorboards_scalars(tmp_path: Path) -> None:
@@ -195,7 +197,14 @@ def test_mlflow_is_told_how_a_run_has_ended(tmp_path: Path, ended: str | None, s
 
 def test_mlflow_s_requests_are_within_its_bounds(tmp_path: Path) -> None:
     pytest.importorskip("mlflow", reason="needs the extra mlflow")
-    sink = MlflowSink(RecordedRun(tmp_path, 7, ""))
+    sink, sizes = MlflowSink(RecordedRun(tmp_path, 7, "")), []
+    log = sink._client.log_batch
+
+    def noted(run: str, metrics: Sequence[Any] = (), params: Sequence[Any] = ()) -> None:
+        sizes.append((len(metrics), len(params)))
+        log(run, metrics=metrics, params=params)
+
+    sink._client.log_batch = noted
     sink.begin({f"setting.{number}": number for number in range(201)}, None)
     sink.scalars({f"metric/{number}": number for number in range(2001)}, 5)
     sink.close()
@@ -203,6 +212,7 @@ def test_mlflow_s_requests_are_within_its_bounds(tmp_path: Path) -> None:
     (its_run,) = store.search_runs([store.get_experiment_by_name("coop").experiment_id])
     assert its_run.data.params == {f"setting.{number}": str(number) for number in range(201)}
     assert its_run.data.metrics == {f"metric/{number}": number for number in range(2001)}
+    assert sizes == [(0, 100), (0, 100), (0, 1), (1000, 0), (1000, 0), (1, 0)]
 
 
 def test_a_run_that_a_service_refuses_has_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

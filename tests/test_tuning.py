@@ -116,7 +116,7 @@ def test_what_a_grid_s_fields_are_chosen_from(tmp_path: Path) -> None:
     assert cell.config.learner.batch_size == chosen["learner.batch_size"]
     for wrong in (
         {"low": 0, "high": 1, "log": True}, {"low": 0.1, "high": 1, "log": True, "step": 0.1},
-        {"low": 0, "high": True}, {"low": 0, "high": 1, "lgo": True}, {"low": 0}, [],
+        {"low": 0, "high": True}, {"low": 2, "high": 1}, {"low": 0, "high": 1, "lgo": True}, {"low": 0}, [],
     ):  # fmt: skip
         with pytest.raises(coop.UsageError, match=r"^vary\.learner\.learning_rate = .*: must be"):
             Space({"vary": {"learner": {"learning_rate": wrong}}})

@@ -1,6 +1,7 @@
 """`coop-watch DIR`: runs and sweeps by their folders, while they grow and when they have ended."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -17,8 +18,10 @@ from coop.common.process.processes import command
 from coop.lockstep.lockstep import Lockstep
 from coop.monitor.live_page import LivePage
 from coop.records.growing import GrowingTable
+from coop.records.locks import RunLock
 from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
+from coop.records.summaries import summary_text
 from coop.studies.watch.run import RunFolder
 from coop.studies.watch.screen import SweepPage
 from coop.studies.watch.sweep import SweepFolder
@@ -119,6 +122,77 @@ def test_a_run_of_a_process_that_is_killed(tmp_path: Path) -> None:
     done = run_command("coop-watch", tmp_path / "r", cwd=tmp_path)
     assert done.returncode == 0, "a run that nobody goes on with is not followed"
     assert done.stdout.endswith("the run has ended: no process works in its folder\n")
+
+
+def ended(cell: Path, outcome: str) -> None:
+    """Write how the run of a cell has ended."""
+    cell.mkdir(exist_ok=True)
+    (cell / "summary.json").write_text(summary_text({"exit": outcome}))
+
+
+def played(cell: Path, steps: int) -> None:
+    """Write an episode of a cell's run, of return 7."""
+    cell.mkdir(exist_ok=True)
+    (cell / "episodes.csv").write_text(f"episode,env_step,return\n0,{steps},7.0\n1,9")
+
+
+def test_the_states_of_cells(tmp_path: Path) -> None:
+    (tmp_path / "sweep.toml").write_text(GRID.replace("[fixed]", "seeds = [0, 1, 2, 3]\n[fixed]"))
+    sweep, cells = SweepFolder(tmp_path), [tmp_path / f"{m}-seed={n}" for m in ("coop", "dqn") for n in range(4)]
+    ended(cells[0], "complete: target_return reached")
+    ended(cells[1], "diverged: TD errors are not finite at update 3")
+    ended(cells[2], "failed: ValueError: no luck")
+    played(cells[3], 90)
+    (cells[3] / "run.log").write_text("step 90/600\ncoop-lockstep: error: the disk is full\n\n")
+    ended(cells[4], "interrupted")
+    played(cells[4], 200)
+    played(cells[5], 100)
+    row = {"env_step": 150, "env_steps_per_s": 30.0}
+    (cells[5] / "metrics.jsonl").write_text(f'{{"env_step": 4}}\n{json.dumps(row)}\n{{"env_step": 180, "env')
+    cells[6].mkdir()
+    lock = RunLock(cells[5], "coop-lockstep", ("learner",)).sign()
+    try:
+        sweep.refresh()
+        running = sweep.cells[5]
+    finally:
+        lock.release()
+    states = ["finished", "diverged", "failed", "failed", "stopped", "running", "waiting", "waiting"]
+    assert [cell.state for cell in sweep.cells] == states
+    assert list(sweep.counts().items()) == [
+        ("finished", 1), ("running", 1), ("waiting", 2), ("stopped", 1), ("diverged", 1), ("failed", 2),
+    ]  # fmt: skip
+    assert (running.group, running.seed, running.step, running.total) == ("dqn", "1", 150, 600)
+    assert (running.mean_return, running.speed) == (7.0, 30.0)
+    assert sweep.steps() == (4 * 600 + 200 + 150, 8 * 600)
+    assert sweep.seconds_left() == (8 * 600 - 2750) / 30
+    assert [cell.why for cell in sweep.failures()] == [
+        "diverged: TD errors are not finite at update 3", "failed: ValueError: no luck", "the disk is full",
+    ]  # fmt: skip
+    assert not sweep.over
+    sweep.refresh()
+    assert sweep.cells[5].state == "stopped", "its process is gone"
+    assert (sweep.speed(), sweep.seconds_left(), sweep.over) == (0, None, False)
+    for cell in cells[3:]:
+        ended(cell, "complete")
+    played(cells[3], 600)
+    sweep.refresh()
+    assert (sweep.counts(), sweep.over) == ({"finished": 6, "diverged": 1, "failed": 1}, True)
+    ended(cells[0], "interrupted")  # made longer, and stopped
+    os.utime(cells[0] / "summary.json", (1, 1))
+    sweep.refresh()
+    assert (sweep.cells[0].state, sweep.over) == ("stopped", False)
+
+
+def test_a_folder_of_runs_without_a_grid(tmp_path: Path) -> None:
+    for name, outcome in (("a", "complete"), ("b", "interrupted")):
+        with RunDirectory(tmp_path / name, base_config(["--method", "coop", "--total-steps", "700"]), log="none"):
+            ended(tmp_path / name, outcome)
+    sweep = SweepFolder(tmp_path)
+    sweep.refresh()
+    assert [(cell.name, cell.state, cell.group) for cell in sweep.cells] == [
+        ("a", "finished", "CartPole-v0, coop"), ("b", "stopped", "CartPole-v0, coop"),
+    ]  # fmt: skip
+    assert (sweep.steps(), sweep.over) == ((700, 1400), True), "no command goes on with it"
 
 
 @pytest.mark.timeout(600)  # on a busy machine
