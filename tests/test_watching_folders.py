@@ -101,6 +101,19 @@ def test_a_run_by_its_files_while_they_grow(tmp_path: Path) -> None:
     }
 
 
+def test_rows_that_can_t_be_read_are_left_out(tmp_path: Path) -> None:
+    with RunDirectory(tmp_path / "r", base_config(["--method", "coop"]), log="none"):
+        pass
+    rows = ('{"env_step": 3}', "nonsense", '{"env_step": 300, "update": 200, "updates_per_s": 50.0}')
+    (tmp_path / "r" / "metrics.jsonl").write_text("".join(f"{row}\n" for row in rows))
+    watched = RunFolder(tmp_path / "r")
+    watched.refresh()
+    assert watched.learner is not None
+    assert (watched.learner.updates, watched.learner.env_steps, watched.learner.seconds) == (200, 300, 4.0)
+    assert len(watched.points()) == 1
+    assert watched.points() == [], "each once"
+
+
 @pytest.mark.timeout(400)  # on a busy machine
 def test_a_run_of_a_process_that_is_killed(tmp_path: Path) -> None:
     flags = ["--preset", "cartpole", "--total-steps", "1000000", "--run-dir", str(tmp_path / "r")]
@@ -153,11 +166,13 @@ def test_the_states_of_cells(tmp_path: Path) -> None:
     lock = RunLock(cells[5], "coop-lockstep", ("learner",)).sign()
     try:
         sweep.refresh()
-        running = sweep.cells[5]
+        now = {cell.name: cell for cell in sweep.cells}
     finally:
         lock.release()
     states = ["finished", "diverged", "failed", "failed", "stopped", "running", "waiting", "waiting"]
-    assert [cell.state for cell in sweep.cells] == states
+    assert [now[cell.name].state for cell in cells] == states
+    running = now[cells[5].name]
+    assert now[cells[0].name].step == 600, "it has no episode behind its last one"
     assert list(sweep.counts().items()) == [
         ("finished", 1), ("running", 1), ("waiting", 2), ("stopped", 1), ("diverged", 1), ("failed", 2),
     ]  # fmt: skip
@@ -166,11 +181,13 @@ def test_the_states_of_cells(tmp_path: Path) -> None:
     assert sweep.steps() == (4 * 600 + 200 + 150, 8 * 600)
     assert sweep.seconds_left() == (8 * 600 - 2750) / 30
     assert [cell.why for cell in sweep.failures()] == [
-        "diverged: TD errors are not finite at update 3", "failed: ValueError: no luck", "the disk is full",
-    ]  # fmt: skip
+        "diverged: TD errors are not finite at update 3",
+        "failed: ValueError: no luck",
+        "coop-lockstep: error: the disk is full",
+    ]
     assert not sweep.over
     sweep.refresh()
-    assert sweep.cells[5].state == "stopped", "its process is gone"
+    assert sweep.counts()["stopped"] == 2, "its process is gone"
     assert (sweep.speed(), sweep.seconds_left(), sweep.over) == (0, None, False)
     for cell in cells[3:]:
         ended(cell, "complete")
@@ -180,7 +197,7 @@ def test_the_states_of_cells(tmp_path: Path) -> None:
     ended(cells[0], "interrupted")  # made longer, and stopped
     os.utime(cells[0] / "summary.json", (1, 1))
     sweep.refresh()
-    assert (sweep.cells[0].state, sweep.over) == ("stopped", False)
+    assert (sweep.counts(), sweep.over) == ({"finished": 5, "stopped": 1, "diverged": 1, "failed": 1}, False)
 
 
 def test_a_folder_of_runs_without_a_grid(tmp_path: Path) -> None:
@@ -193,6 +210,12 @@ def test_a_folder_of_runs_without_a_grid(tmp_path: Path) -> None:
         ("a", "finished", "CartPole-v0, coop"), ("b", "stopped", "CartPole-v0, coop"),
     ]  # fmt: skip
     assert (sweep.steps(), sweep.over) == ((700, 1400), True), "no command goes on with it"
+    (tmp_path / "sweep.toml").write_text('methods = ["coop", "dqn", "edql"]')
+    (tmp_path / "a").rename(tmp_path / "coop-seed=0")
+    sweep = SweepFolder(tmp_path)
+    sweep.refresh()
+    assert [cell.total for cell in sweep.cells] == [700, None, None], "a grid need not say it"
+    assert sweep.steps() == (700, 3 * 700), "those that have not begun count as the others"
 
 
 @pytest.mark.timeout(600)  # on a busy machine

@@ -159,8 +159,7 @@ def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:
 def _difference(mine: Any, theirs: Any, name: str) -> str | None:  # noqa: ANN401 (nested state)
     """Describe the first place where nested states differ in any bit; None if they are equal."""
     if isinstance(mine, torch.Tensor):
-        same = mine.dtype == theirs.dtype and mine.shape == theirs.shape
-        return None if same and torch.equal(_bytes(mine), _bytes(theirs)) else name
+        return None if mine.shape == theirs.shape and torch.equal(_bytes(mine), _bytes(theirs)) else name
     if isinstance(mine, dict) and mine.keys() == theirs.keys():
         pairs = [(mine[key], theirs[key], f"{name}.{key}") for key in mine]
     elif isinstance(mine, list | tuple) and len(mine) == len(theirs):
