@@ -104,13 +104,14 @@ def test_a_run_by_its_files_while_they_grow(tmp_path: Path) -> None:
 def test_rows_that_can_t_be_read_are_left_out(tmp_path: Path) -> None:
     with RunDirectory(tmp_path / "r", base_config(["--method", "coop"]), log="none"):
         pass
-    rows = ('{"env_step": 3}', "nonsense", '{"env_step": 300, "update": 200, "updates_per_s": 50.0}')
-    (tmp_path / "r" / "metrics.jsonl").write_text("".join(f"{row}\n" for row in rows))
+    rows = [{"env_step": 100 + n, "update": n, "updates_per_s": speed} for n, speed in ((200, 50), (250, 0), (300, 25))]
+    lines = ['{"env_step": 3}', "nonsense", *map(json.dumps, rows)]
+    (tmp_path / "r" / "metrics.jsonl").write_text("".join(f"{line}\n" for line in lines))
     watched = RunFolder(tmp_path / "r")
     watched.refresh()
     assert watched.learner is not None
-    assert (watched.learner.updates, watched.learner.env_steps, watched.learner.seconds) == (200, 300, 4.0)
-    assert len(watched.points()) == 1
+    assert (watched.learner.updates, watched.learner.env_steps, watched.learner.seconds) == (300, 400, 4 + 2)
+    assert len(watched.points()) == 3
     assert watched.points() == [], "each once"
 
 
