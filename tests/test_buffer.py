@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from commands import Command, lines, wait_for
 
 import coop
 from coop.common.errors import RunError, UsageError
@@ -112,6 +114,34 @@ def test_a_running_run_gives_its_buffer_and_goes_on(tmp_path: Path) -> None:
     finally:
         run.stop()
     assert len(run.buffer()) == len(coop.load(tmp_path).buffer(live=True)) >= len(again), "of the closing checkpoint"
+
+
+@pytest.mark.timeout(300)
+def test_running_processes_give_their_buffer_and_go_on(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    flags = ("--method", "dqn", "--actors", "2", "--total-steps", "1000000", "--checkpoint-every", "1000000")
+    table = ("--replay.capacity", "1000000", "--replay.learning-starts", "20")
+    with Command("coop-local", *flags, *table, "--run-dir", path) as local:
+        wait_for("some episodes", lambda: lines(path / "episodes.csv") > 4)
+        first = coop.load(path).buffer(live=True)
+        again = coop.load(path).buffer(live=True)
+        before = lines(path / "episodes.csv")
+        wait_for("the next episode", lambda: lines(path / "episodes.csv") > before)
+        assert local.returncode is None
+        assert not (path / "checkpoints" / "ASKED").exists()
+        local.send_signal(signal.SIGINT)
+        assert local.wait(60) == 130
+    assert again.checkpoint > first.checkpoint > 0
+    assert len(again) > len(first) > SMALL["learning_starts"]
+    assert again.ids.tolist() == list(range(len(again)))
+    assert again.reuse[: len(first)].sum() > first.reuse.sum()
+    for name in ("observations", "actions", "rewards", "next_observations", "terminated", "param_version"):
+        np.testing.assert_array_equal(getattr(again, name)[: len(first)], getattr(first, name), name)
+    seen = {observation.tobytes() for observation in again.observations}
+    goes_on = [each.tobytes() for each in again.next_observations[~again.terminated]]
+    assert sum(each not in seen for each in goes_on) <= 2, "but for the newest step of each of two emulators"
+    assert again.truncated is not None
+    assert again.terminated.sum() > 2
 
 
 def test_a_run_without_a_whole_table_is_refused(tmp_path: Path) -> None:

@@ -175,7 +175,8 @@ def test_what_can_t_be_filmed_is_refused_before_the_run_starts(name: str, tmp_pa
     flags = ("--env.id", "corridor:test/Corridor-v0", "--video-every", "9", "--run-dir", tmp_path / "run")
     done = run_command(name, *flags, cwd=Path(__file__).parent)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"{name}: error: video_every: env.id: 'corridor:test/Corridor-v0' has no pictures to film\n"
+    why = "has no pictures to film: its metadata['render_modes'] has no 'rgb_array'"
+    assert done.stderr == f"{name}: error: video_every: env.id: 'corridor:test/Corridor-v0' {why}\n"
     assert not (tmp_path / "run").exists()
 
 

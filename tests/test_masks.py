@@ -33,6 +33,9 @@ from coop.learner.methods.rule import UpdateRule
 from coop.learner.recorded import _WARM_UPS
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.reexecute import reexecute
+from coop.records.learner_checkpoints import load_learner
+from coop.records.resumption import survey
+from coop.records.run_directory import RunDirectory
 from coop.replay.table.table import Table
 
 INFO, METHOD = "gates:Gates-v0", "gates:GatesByMethod-v0"
@@ -347,6 +350,22 @@ def test_a_run_never_plays_what_is_not_allowed(method: str, tmp_path: Path) -> N
         buffer = run.buffer()
         np.testing.assert_array_equal(buffer.mask, mask_of(buffer.observations))
         assert len(buffer.frame()["next_mask"]) == 50
+
+
+def test_a_run_whose_masks_have_changed_is_not_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Observations, rewards and ends are the same."""
+    config = resolve({**SHORT, "env": {"id": INFO}}, "dqn")
+    run = Lockstep(config)
+    with RunDirectory(tmp_path, config, log="none") as directory:
+        for _ in range(30):
+            list(run.play())
+        run.save(directory)
+    (saved,) = survey(tmp_path, replay=True, load=load_learner).whole
+    Lockstep(config).restore(saved)
+    mask = Gates._mask
+    monkeypatch.setattr(Gates, "_mask", lambda env: mask(env) | (env._state == 4))
+    with pytest.raises(RunError, match="showed something else when the run's 30 actions were played again"):
+        Lockstep(config).restore(saved)
 
 
 def test_what_is_no_policy_of_masks_is_refused_in_a_line() -> None:

@@ -2,10 +2,13 @@
 
 import dataclasses
 import json
+import os
 import socket
 import struct
+import threading
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +32,14 @@ from coop.common.process.lifecycle import Stop
 from coop.common.process.processes import free_endpoint
 from coop.common.registry import Registry
 from coop.common.types import EpisodeRow
+from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.run import LockstepRun
-from coop.records.resumption import Start
+from coop.records.resumption import Start, holds_run
 from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
-from coop.records.sinks import Kept, Sink, chosen_sinks
+from coop.records.sinks import Kept, RecordedRun, Sink, chosen_sinks
+from coop.records.sinks.mlflow import MlflowSink
 from website.assemble import assembled
 
 GRID = {
@@ -127,14 +132,18 @@ def test_weights_and_biases_gets_tensorboards_scalars(tmp_path: Path, monkeypatc
     run.env.close()
     expected = scalars(tmp_path)
     (file,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
-    logged, settings = {}, {}
+    logged, settings, ends = {}, {}, []
     for data in records(file):
         record = Record.FromString(data)
         row = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
         logged |= {(tag, row["env_step"]): value for tag, value in row.items() if "/" in tag}
         settings |= {item.key: json.loads(item.value_json) for item in record.config.update}
+        ends += [record.exit.exit_code] if record.HasField("exit") else []
     assert logged == pytest.approx(expected)
     assert settings["replay.capacity"] == run.config.replay.capacity
+    assert ends == [1], "a run that nothing has ended"
+    assert [path for path in tmp_path.glob("wandb/*/logs/*") if not path.resolve().is_relative_to(tmp_path)]
+    assert coop.load(tmp_path).config == run.config, "though W&B has a link to its log elsewhere there"
 
 
 def test_mlflow_gets_tensorboards_scalars(tmp_path: Path) -> None:
@@ -166,6 +175,71 @@ def test_mlflow_gets_tensorboards_scalars(tmp_path: Path) -> None:
     expected = scalars(path)
     assert max(step for _, step in expected) > 1000, "the resumed run goes on with tb/, which has to be cut back"
     assert logged == pytest.approx(expected), "what was behind the checkpoint was logged twice, with the same values"
+
+
+@pytest.mark.parametrize(
+    ("ended", "status"),
+    [("complete: target_return reached", "FINISHED"), ("stopped by on_episode", "FINISHED"),
+     ("interrupted", "KILLED"), ("diverged: TD errors are not finite at update 3", "FAILED"), (None, "KILLED")],
+)  # fmt: skip
+def test_mlflow_is_told_how_a_run_has_ended(tmp_path: Path, ended: str | None, status: str) -> None:
+    pytest.importorskip("mlflow", reason="needs the extra mlflow")
+    run = Lockstep(base_config(["--method", "coop"]))
+    run.env.close()
+    with RunDirectory(tmp_path / "run", run.config, log="mlflow") as directory:
+        if ended is not None:
+            directory.conclude(dataclasses.replace(summarise(run.trainer, ended, 0.0, 0), return_mean_100=7), "run")
+    store = mlflow_store(tmp_path / "run" / "logs" / "mlruns")
+    (its_run,) = store.search_runs([store.get_experiment_by_name("coop").experiment_id])
+    assert its_run.info.status == status
+    assert its_run.data.metrics == ({} if ended is None else {"final/return_mean_100": 7})
+
+
+def test_mlflow_s_requests_are_within_its_bounds(tmp_path: Path) -> None:
+    pytest.importorskip("mlflow", reason="needs the extra mlflow")
+    sink, sizes = MlflowSink(RecordedRun(tmp_path, 7, "")), []
+    log = sink._client.log_batch
+
+    def noted(run: str, metrics: Sequence[Any] = (), params: Sequence[Any] = ()) -> None:
+        sizes.append((len(metrics), len(params)))
+        log(run, metrics=metrics, params=params)
+
+    sink._client.log_batch = noted
+    sink.begin({f"setting.{number}": number for number in range(201)}, None)
+    sink.scalars({f"metric/{number}": number for number in range(2001)}, 5)
+    sink.close()
+    store = mlflow_store(tmp_path / "logs" / "mlruns")
+    (its_run,) = store.search_runs([store.get_experiment_by_name("coop").experiment_id])
+    assert its_run.data.params == {f"setting.{number}": str(number) for number in range(201)}
+    assert its_run.data.metrics == {f"metric/{number}": number for number in range(2001)}
+    assert sizes == [(0, 100), (0, 100), (0, 1), (1000, 0), (1000, 0), (1, 0)]
+
+
+def test_a_run_that_a_service_refuses_has_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that is away is tried three times, not for minutes; and the same folder takes the run without it."""
+    pytest.importorskip("mlflow", reason="needs the extra mlflow")
+    run, tried = Lockstep(base_config(["--method", "coop"])), []
+    run.env.close()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def hang_up() -> None:
+            with suppress(OSError):  # at the end
+                while True:
+                    server.accept()[0].close()
+                    tried.append(1)
+
+        threading.Thread(target=hang_up, daemon=True).start()
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{server.getsockname()[1]}")
+        with pytest.raises(UsageError, match=r"^--log mlflow: MlflowException: API request to http.* failed"):
+            RunDirectory(tmp_path / "run", run.config, log="mlflow")
+        assert len(tried) == 3
+        assert "MLFLOW_HTTP_REQUEST_MAX_RETRIES" not in os.environ
+        monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+        with pytest.raises(UsageError, match=r"^--log mlflow: "):
+            RunDirectory(tmp_path / "run", run.config, log="mlflow")
+        assert len(tried) == 4, "as its own variable says"
+        server.shutdown(socket.SHUT_RDWR)
+    assert not holds_run(tmp_path / "run")
 
 
 def mlflow_store(folder: Path) -> Any:
@@ -208,6 +282,7 @@ def test_the_runs_of_a_sweep_are_a_group_with_tags(tmp_path: Path, monkeypatch: 
         assert {*run.tags} == {"mine", "method=dqn", "seed=3", f"replay.capacity={row['replay.capacity']}"}
         final = {item.key or item.nested_key[0]: item.value_json for each in found for item in each.history.item}
         assert json.loads(final["final/return_mean_100"]) == pytest.approx(row["return_mean_100"])
+        assert [record.exit.exit_code for record in found if record.HasField("exit")] == [0]
 
 
 @pytest.mark.timeout(400)  # two processes
@@ -280,6 +355,7 @@ def test_a_sink_that_fails_does_not_end_the_run(
     run.env.close()
     with pytest.raises(UsageError, match=r"^--log broken: ValueError: no luck$"):
         RunDirectory(tmp_path / "other", dataclasses.replace(run.config, seed=7), log="broken")
+    assert not holds_run(tmp_path / "other")
 
 
 def test_sinks_are_refused_by_name(tmp_path: Path) -> None:

@@ -17,7 +17,9 @@ import pytest
 import torch
 from commands import Command, lines, run_command, wait_for
 
+from coop.common.errors import RunError
 from coop.common.metrics import COLUMNS
+from coop.learner.agent import Agent
 from coop.lockstep.reexecute import reexecute
 from coop.records.learner_checkpoints import load_learner
 
@@ -97,7 +99,7 @@ def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, 
     return summary
 
 
-def test_coop_local_end_to_end(tmp_path: Path) -> None:
+def test_coop_local_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run"
     flags = ("--preset", "cartpole", "--actors", "2", "--seed", "3", "--total-steps", "1500", "--run-dir", str(path))
     done = run("coop-local", *flags, "--replay.journal", "--checkpoint-every", "500")
@@ -105,6 +107,10 @@ def test_coop_local_end_to_end(tmp_path: Path) -> None:
     check_files(path, 1500)
     again = reexecute(path)
     assert (again.began, again.updates, again.missing_segments) == (1000, 1372, 0)
+    rate = Agent._learning_rate
+    monkeypatch.setattr(Agent, "_learning_rate", lambda agent: rate(agent) * (1.01 if agent.updates == 1200 else 1))
+    with pytest.raises(RunError, match=r"^agent\.networks\[[01]\] differs from .*checkpoints/1372$"):
+        reexecute(path)
     again = run("coop-local", *flags)
     assert again.returncode == 2
     assert again.stderr.count("\n") == 1

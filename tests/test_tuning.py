@@ -14,6 +14,7 @@ import pytest
 
 import coop
 from coop.studies.report.packing import pack
+from coop.studies.tuning import Space
 
 pytestmark = [
     pytest.mark.timeout(500),
@@ -78,6 +79,81 @@ def test_bad_trials_fail_and_bad_grids_are_refused(tmp_path: Path) -> None:
         coop.load_sweep(tmp_path / "b")
 
 
+def test_what_a_grid_s_fields_are_chosen_from(tmp_path: Path) -> None:
+    grid = tmp_path / "grid.toml"
+    grid.write_text(
+        """
+        methods = ["dqn", "coop"]
+        fixed.network.hidden = [8]
+        [vary]
+        network.hidden = [[8], [16, 16]]
+        learner.batch_size = { low = 16, high = 64, step = 16 }
+        learner.swap_every = { low = 1, high = 100, log = true }
+        learner.learning_rate = { low = 1e-4, high = 1e-2, log = true }
+        learner.gamma = { low = 0.5, high = 1 }
+        replay.eviction = ["fifo", "reservoir"]
+        [quick]
+        fixed.total_steps = 7
+        """
+    )
+    space = Space(grid)
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    trial = study.ask()
+    method, chosen = space.suggest(trial)
+    assert trial.distributions == {
+        "method": optuna.distributions.CategoricalDistribution(["dqn", "coop"]),
+        "network.hidden": optuna.distributions.CategoricalDistribution(["[8]", "[16, 16]"]),
+        "learner.batch_size": optuna.distributions.IntDistribution(16, 64, step=16),
+        "learner.swap_every": optuna.distributions.IntDistribution(1, 100, log=True),
+        "learner.learning_rate": optuna.distributions.FloatDistribution(1e-4, 1e-2, log=True),
+        "learner.gamma": optuna.distributions.FloatDistribution(0.5, 1),
+        "replay.eviction": optuna.distributions.CategoricalDistribution(["fifo", "reservoir"]),
+    }
+    assert chosen["network.hidden"] in ([8], [16, 16])
+    (cell,) = space.cells("mine", method, chosen)
+    assert (cell.name, cell.config.method, cell.config.total_steps) == ("mine", method, 50_000)
+    assert list(cell.config.network.hidden) == chosen["network.hidden"]
+    assert cell.config.learner.batch_size == chosen["learner.batch_size"]
+    for wrong in (
+        {"low": 0, "high": 1, "log": True}, {"low": 0.1, "high": 1, "log": True, "step": 0.1},
+        {"low": 0, "high": True}, {"low": 2, "high": 1}, {"low": 0, "high": 1, "lgo": True}, {"low": 0}, [],
+    ):  # fmt: skip
+        with pytest.raises(coop.UsageError, match=r"^vary\.learner\.learning_rate = .*: must be"):
+            Space({"vary": {"learner": {"learning_rate": wrong}}})
+    with pytest.raises(coop.UsageError, match=r"nowhere\.toml: No such file"):
+        coop.tune(tmp_path / "nowhere.toml", tmp_path)
+    for counts in ({"trials": 0}, {"workers": 0}):
+        with pytest.raises(coop.UsageError, match="must be at least 1"):
+            coop.tune(grid, tmp_path / "none", **counts)
+    assert not (tmp_path / "none").exists()
+
+
+def test_workers_run_at_once_and_two_processes_share_a_search(tmp_path: Path) -> None:
+    """The second process waits for the trials of the first one; either may see first that one has ended."""
+    grid = {"fixed": {**FIXED, "total_steps": 1_500}, "vary": RATES}
+    url = f"sqlite:///{tmp_path / 'mine.db'}"
+    call = f"coop.tune({grid!r}, {str(tmp_path / 'a')!r}, trials=3, workers=2, storage={url!r})"
+    with subprocess.Popen([sys.executable, "-c", f"import coop; {call}"]) as other:
+        try:
+            while not (tmp_path / "a" / "trial-0001" / "episodes.csv").exists():
+                assert other.poll() is None
+                time.sleep(0.1)
+            study = coop.tune(grid, tmp_path / "a", trials=3, workers=2, storage=url)
+            assert other.wait(200) == 0
+        finally:
+            other.kill()
+    assert {trial.state for trial in study.trials} == {STATE.COMPLETE}
+    assert len(study.trials) >= 3, "more where both ask at the same moment"
+    first, second = study.trials[:2]
+    assert second.datetime_start < first.datetime_complete  # type: ignore[operator]
+    assert not (tmp_path / "a" / "optuna.db").exists()
+    for trial in study.trials:
+        summary = coop.load(tmp_path / "a" / f"trial-{trial.number:04}").summary
+        assert summary is not None
+        assert trial.value == pytest.approx(summary["return_mean_100"])
+        assert (summary["exit"], summary["env_steps"]) == ("complete", 1_500)
+
+
 class Second(optuna.pruners.BasePruner):
     """Prunes trial 1 at its first report."""
 
@@ -92,7 +168,11 @@ def test_a_pruned_trial_s_run_is_stopped(tmp_path: Path) -> None:
     summary = coop.load(tmp_path / "trial-0001").summary
     assert summary is not None
     assert (summary["exit"], summary["env_steps"] < 1_000) == ("interrupted", True)
-    assert max(study.trials[0].intermediate_values) <= 20
+    told = study.trials[0].intermediate_values
+    assert max(told) <= 20
+    returns, steps = (coop.load(tmp_path / "trial-0000").episodes[name].tolist() for name in ("return", "env_step"))
+    reached = {step * 20 // 1_000: at + 1 for at, step in reversed(list(enumerate(steps))) if step >= 50}
+    assert told == {step: pytest.approx(sum(returns[:at]) / at) for step, at in reached.items()}, "of 100 at most"
 
 
 def test_a_search_that_was_killed_goes_on(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """`coop-watch DIR`: runs and sweeps by their folders, while they grow and when they have ended."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -17,8 +18,10 @@ from coop.common.process.processes import command
 from coop.lockstep.lockstep import Lockstep
 from coop.monitor.live_page import LivePage
 from coop.records.growing import GrowingTable
+from coop.records.locks import RunLock
 from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
+from coop.records.summaries import summary_text
 from coop.studies.watch.run import RunFolder
 from coop.studies.watch.screen import SweepPage
 from coop.studies.watch.sweep import SweepFolder
@@ -98,6 +101,20 @@ def test_a_run_by_its_files_while_they_grow(tmp_path: Path) -> None:
     }
 
 
+def test_rows_that_can_t_be_read_are_left_out(tmp_path: Path) -> None:
+    with RunDirectory(tmp_path / "r", base_config(["--method", "coop"]), log="none"):
+        pass
+    rows = [{"env_step": 100 + n, "update": n, "updates_per_s": speed} for n, speed in ((200, 50), (250, 0), (300, 25))]
+    lines = ['{"env_step": 3}', "nonsense", *map(json.dumps, rows)]
+    (tmp_path / "r" / "metrics.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    watched = RunFolder(tmp_path / "r")
+    watched.refresh()
+    assert watched.learner is not None
+    assert (watched.learner.updates, watched.learner.env_steps, watched.learner.seconds) == (300, 400, 4 + 2)
+    assert len(watched.points()) == 3
+    assert watched.points() == [], "each once"
+
+
 @pytest.mark.timeout(400)  # on a busy machine
 def test_a_run_of_a_process_that_is_killed(tmp_path: Path) -> None:
     flags = ["--preset", "cartpole", "--total-steps", "1000000", "--run-dir", str(tmp_path / "r")]
@@ -119,6 +136,87 @@ def test_a_run_of_a_process_that_is_killed(tmp_path: Path) -> None:
     done = run_command("coop-watch", tmp_path / "r", cwd=tmp_path)
     assert done.returncode == 0, "a run that nobody goes on with is not followed"
     assert done.stdout.endswith("the run has ended: no process works in its folder\n")
+
+
+def ended(cell: Path, outcome: str) -> None:
+    """Write how the run of a cell has ended."""
+    cell.mkdir(exist_ok=True)
+    (cell / "summary.json").write_text(summary_text({"exit": outcome}))
+
+
+def played(cell: Path, steps: int) -> None:
+    """Write an episode of a cell's run, of return 7."""
+    cell.mkdir(exist_ok=True)
+    (cell / "episodes.csv").write_text(f"episode,env_step,return\n0,{steps},7.0\n1,9")
+
+
+def test_the_states_of_cells(tmp_path: Path) -> None:
+    (tmp_path / "sweep.toml").write_text(GRID.replace("[fixed]", "seeds = [0, 1, 2, 3]\n[fixed]"))
+    sweep, cells = SweepFolder(tmp_path), [tmp_path / f"{m}-seed={n}" for m in ("coop", "dqn") for n in range(4)]
+    ended(cells[0], "complete: target_return reached")
+    ended(cells[1], "diverged: TD errors are not finite at update 3")
+    ended(cells[2], "failed: ValueError: no luck")
+    played(cells[3], 90)
+    (cells[3] / "run.log").write_text("step 90/600\ncoop-lockstep: error: the disk is full\n\n")
+    ended(cells[4], "interrupted")
+    played(cells[4], 200)
+    played(cells[5], 100)
+    row = {"env_step": 150, "env_steps_per_s": 30.0}
+    (cells[5] / "metrics.jsonl").write_text(f'{{"env_step": 4}}\n{json.dumps(row)}\n{{"env_step": 180, "env')
+    cells[6].mkdir()
+    lock = RunLock(cells[5], "coop-lockstep", ("learner",)).sign()
+    try:
+        sweep.refresh()
+        now = {cell.name: cell for cell in sweep.cells}
+    finally:
+        lock.release()
+    states = ["finished", "diverged", "failed", "failed", "stopped", "running", "waiting", "waiting"]
+    assert [now[cell.name].state for cell in cells] == states
+    running = now[cells[5].name]
+    assert now[cells[0].name].step == 600, "it has no episode behind its last one"
+    assert list(sweep.counts().items()) == [
+        ("finished", 1), ("running", 1), ("waiting", 2), ("stopped", 1), ("diverged", 1), ("failed", 2),
+    ]  # fmt: skip
+    assert (running.group, running.seed, running.step, running.total) == ("dqn", "1", 150, 600)
+    assert (running.mean_return, running.speed) == (7.0, 30.0)
+    assert sweep.steps() == (4 * 600 + 200 + 150, 8 * 600)
+    assert sweep.seconds_left() == (8 * 600 - 2750) / 30
+    assert [cell.why for cell in sweep.failures()] == [
+        "diverged: TD errors are not finite at update 3",
+        "failed: ValueError: no luck",
+        "coop-lockstep: error: the disk is full",
+    ]
+    assert not sweep.over
+    sweep.refresh()
+    assert sweep.counts()["stopped"] == 2, "its process is gone"
+    assert (sweep.speed(), sweep.seconds_left(), sweep.over) == (0, None, False)
+    for cell in cells[3:]:
+        ended(cell, "complete")
+    played(cells[3], 600)
+    sweep.refresh()
+    assert (sweep.counts(), sweep.over) == ({"finished": 6, "diverged": 1, "failed": 1}, True)
+    ended(cells[0], "interrupted")  # made longer, and stopped
+    os.utime(cells[0] / "summary.json", (1, 1))
+    sweep.refresh()
+    assert (sweep.counts(), sweep.over) == ({"finished": 5, "stopped": 1, "diverged": 1, "failed": 1}, False)
+
+
+def test_a_folder_of_runs_without_a_grid(tmp_path: Path) -> None:
+    for name, outcome in (("a", "complete"), ("b", "interrupted")):
+        with RunDirectory(tmp_path / name, base_config(["--method", "coop", "--total-steps", "700"]), log="none"):
+            ended(tmp_path / name, outcome)
+    sweep = SweepFolder(tmp_path)
+    sweep.refresh()
+    assert [(cell.name, cell.state, cell.group) for cell in sweep.cells] == [
+        ("a", "finished", "CartPole-v0, coop"), ("b", "stopped", "CartPole-v0, coop"),
+    ]  # fmt: skip
+    assert (sweep.steps(), sweep.over) == ((700, 1400), True), "no command goes on with it"
+    (tmp_path / "sweep.toml").write_text('methods = ["coop", "dqn", "edql"]')
+    (tmp_path / "a").rename(tmp_path / "coop-seed=0")
+    sweep = SweepFolder(tmp_path)
+    sweep.refresh()
+    assert [cell.total for cell in sweep.cells] == [700, None, None], "a grid need not say it"
+    assert sweep.steps() == (700, 3 * 700), "those that have not begun count as the others"
 
 
 @pytest.mark.timeout(600)  # on a busy machine

@@ -183,7 +183,9 @@ class FilmedGymnasium(GymnasiumEnv):
         metadata, vectors = env.metadata or {}, len(FrameMaker(settings, observations).shape) == 1
         CheckedEnv(env, settings.id, observations, int(actions.n)).close()
         if vectors and "rgb_array" not in (metadata.get("render_modes") or ()):
-            raise UsageError(f"env.id: {settings.id!r} has no pictures to film")
+            raise UsageError(
+                f"env.id: {settings.id!r} has no pictures to film: its metadata['render_modes'] has no 'rgb_array'"
+            )
         super().__init__(settings, [seed], "rgb_array" if vectors else None, bounded=True)
         self.pictures_per_s = _speed(metadata.get("render_fps"))
         self._renders = vectors

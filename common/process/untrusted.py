@@ -106,6 +106,8 @@ def _own(folder: Path) -> Iterator[Path]:
         yield folder / name
         yield folder / f"{name}.part"
     for name in LEFT:
+        if name == "wandb":
+            continue  # Weights & Biases links its own log there, which is outside; nothing here opens what it holds
         for at, folders, files in os.walk(folder / name):
             if name == "checkpoints" and Path(at) == folder / name:
                 yield from (Path(at, each) for each in folders if each.isdecimal())

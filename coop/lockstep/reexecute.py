@@ -159,11 +159,16 @@ def _last_draws(folder: Path, files: list[int], run_id: int) -> dict[int, int]:
 def _difference(mine: Any, theirs: Any, name: str) -> str | None:  # noqa: ANN401 (nested state)
     """Describe the first place where nested states differ in any bit; None if they are equal."""
     if isinstance(mine, torch.Tensor):
-        return None if torch.equal(mine, theirs) else name
-    if isinstance(mine, dict):
+        return None if mine.shape == theirs.shape and torch.equal(_bytes(mine), _bytes(theirs)) else name
+    if isinstance(mine, dict) and mine.keys() == theirs.keys():
         pairs = [(mine[key], theirs[key], f"{name}.{key}") for key in mine]
-    elif isinstance(mine, list | tuple):
+    elif isinstance(mine, list | tuple) and len(mine) == len(theirs):
         pairs = [(a, b, f"{name}[{i}]") for i, (a, b) in enumerate(zip(mine, theirs, strict=True))]
     else:
         return None if mine == theirs else name
     return next((found for a, b, at in pairs if (found := _difference(a, b, at))), None)
+
+
+def _bytes(tensor: torch.Tensor) -> torch.Tensor:
+    """uint8 [bytes]; as numbers 0 and -0 would be equal, and nothing would equal NaN."""
+    return tensor.reshape(-1).view(torch.uint8)

@@ -25,7 +25,7 @@ from coop.common.types import EpisodeRow
 from coop.records.checkpoints import RECORDS, SWEEP
 from coop.records.curve import draw_learning_curve
 from coop.records.resumption import Survey, go_back
-from coop.records.run_ids import claim, has_run_id, read_run_id
+from coop.records.run_ids import RUN_ID, claim, has_run_id, read_run_id
 from coop.records.sinks import DEFAULT_LOG, ChosenSinks, Kept, RecordedRun, Sink, chosen_sinks
 from coop.records.sinks.files import RecordFiles
 from coop.records.summaries import SUMMARY, Summary, summary_text
@@ -58,7 +58,7 @@ class RunDirectory:
         self.fallbacks: list[str] = []
         self.aside = ""
         sealed: Mapping[str, FileDigest] = {}
-        opened = ExitStack()
+        opened, new = ExitStack(), not has_run_id(path)
         try:
             newest = None if found is None or number is None else found.of(number)
             run_id = claim_run_directory(path, config, None if newest is None else newest.manifest.run)
@@ -81,10 +81,12 @@ class RunDirectory:
                 kept = Kept(_lines(path / RECORDS[0]) - 1, _lines(path / RECORDS[1]), env_step)
             self._files = RecordFiles(run)
             opened.callback(self._files.close)
-            for sink in (self._files, self._sinks):
+            for sink in (self._sinks, self._files):
                 sink.begin({".".join(place): value for place, value in leaves(to_tables(config))}, kept)
         except BaseException as error:
             opened.close()
+            if new:  # no run has begun
+                (path / RUN_ID).unlink(missing_ok=True)
             if not isinstance(error, OSError):
                 raise
             raise RunError(f"run directory {path}: {error.strerror or error}") from error

@@ -7,6 +7,7 @@ import time
 import tomllib
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -178,6 +179,7 @@ class _Search:
         self.executor = LocalProcesses(space.file, workers)
         self._exhausted = False  # the sampler has nothing left to try
         self._states = optuna.trial.TrialState
+        self._told_by_another = optuna.exceptions.UpdateFinishedTrialError  # process, which saw the end first
         self._running: list[_Running] = []
         self._log = DEFAULT_LOG
         # Those of a search that was interrupted go on; those that another process runs are refused by their locks.
@@ -205,15 +207,17 @@ class _Search:
         return bool(self._study.get_trials(False)[trial.number].state == self._states.RUNNING)
 
     def _begin(self, trial: optuna.Trial, told: set[int]) -> None:
-        method, chosen = self._space.suggest(trial)
-        trial.set_user_attr("seeds", list(self._space.file.seeds))
-        trial.set_user_attr("settings", {"method": method, **chosen})
         try:
+            method, chosen = self._space.suggest(trial)
+            trial.set_user_attr("seeds", list(self._space.file.seeds))
+            trial.set_user_attr("settings", {"method": method, **chosen})
             cells = self._space.cells(f"trial-{trial.number:04}", method, chosen)
             folders = [CellFolder(self._path, cell, self._log) for cell in cells]
             running = _Running(trial, folders, Following(folders[0].path, EPISODES), told)
             if self._start(running):
                 self._running.append(running)
+        except self._told_by_another:
+            pass
         except CoopError as error:
             self._fail(trial, str(error))
 
@@ -255,6 +259,8 @@ class _Search:
                     return
             else:
                 self._fail(running.trial, ending.why)
+        except self._told_by_another:
+            pass
         except CoopError as error:
             if ending is None:
                 self.executor.interrupt(folder)
@@ -275,7 +281,8 @@ class _Search:
         return False
 
     def _fail(self, trial: optuna.Trial, why: str) -> None:
-        trial.set_user_attr("why", why)
+        with suppress(self._told_by_another):
+            trial.set_user_attr("why", why)
         self._tell(trial, state=self._states.FAIL)
 
     def _tell(
@@ -283,7 +290,7 @@ class _Search:
     ) -> None:
         """Tell Optuna how a trial has ended; a sampler of a finite grid then says by `Study.stop` that it is over."""
         try:
-            self._study.tell(trial, value, state)
+            self._study.tell(trial, value, state, skip_if_finished=True)
         except RuntimeError as error:
             if "Study.stop" not in str(error):
                 raise

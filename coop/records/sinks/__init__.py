@@ -23,9 +23,8 @@ from coop.common.types import EpisodeRow
 
 # The first tags of an episode and of a row of metrics.
 EPISODE, ROW = "charts/episodic_return", "losses/q_values"
-
-
 FINAL = "final/return_mean_100"  # the tag of what a run has reached at its end
+WELL = ("complete", "stopped by")  # how `exit` of a run begins that has ended as it was to end
 
 
 class RecordedRun(NamedTuple):

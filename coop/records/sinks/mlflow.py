@@ -13,12 +13,13 @@ from typing import Any
 
 from coop.common.process.files import make_folder
 from coop.records.locks import FileLock
-from coop.records.sinks import Kept, RecordedRun, ScalarSink
+from coop.records.sinks import WELL, Kept, RecordedRun, ScalarSink
 
 BATCH = 1000  # metrics in a request, MLflow's own bound
 PARAMS = 100  # settings in a request, likewise
 ID = "coop.run_id"  # the tag by which a resumed run is found
 ITS_STORE, ITS_EXPERIMENT = "MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"
+RETRIES = "MLFLOW_HTTP_REQUEST_MAX_RETRIES"
 
 
 class MlflowSink(ScalarSink):
@@ -41,19 +42,24 @@ class MlflowSink(ScalarSink):
         mlflow = importlib.import_module("mlflow")  # an extra, and it takes seconds
         self._entities = importlib.import_module("mlflow.entities")
         self._client = mlflow.MlflowClient(tracking_uri=store or folder.as_uri())
+        with _at_once(), _locked(folder) if store is None else nullcontext():  # or two cells make an experiment each
+            self._id = self._begun(run)
+        self._status = "KILLED"  # until it is told how the run has ended
+        self._late: list[Any] = []
+        self._thread = ThreadPoolExecutor(1, "mlflow")
+        self._sent: Future[None] | None = None
+
+    def _begun(self, run: RecordedRun) -> str:
+        """The id there of a run, which is begun or goes on."""
         experiment = os.environ.get(ITS_EXPERIMENT) or run.sweep or "coop"
-        with _locked(folder) if store is None else nullcontext():  # or two cells make one each
-            found = self._client.get_experiment_by_name(experiment)
-            number = found.experiment_id if found else self._client.create_experiment(experiment)
+        found = self._client.get_experiment_by_name(experiment)
+        number = found.experiment_id if found else self._client.create_experiment(experiment)
         run_id = f"{run.run_id:x}"
         there = self._client.search_runs([number], filter_string=f"tags.`{ID}` = '{run_id}'")
         tags = {ID: run_id, **{f"coop.{name}": str(value) for name, value in run.cell.items()}}
         begun = there[0] if there else self._client.create_run(number, run_name=run.path.name, tags=tags)
-        self._id = begun.info.run_id
-        self._client.update_run(self._id, status="RUNNING")
-        self._late: list[Any] = []
-        self._thread = ThreadPoolExecutor(1, "mlflow")
-        self._sent: Future[None] | None = None
+        self._client.update_run(begun.info.run_id, status="RUNNING")
+        return str(begun.info.run_id)
 
     def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
         """See `Sink`. A parameter of MLflow can't change: those that a resumed run has changed keep their value."""
@@ -69,12 +75,18 @@ class MlflowSink(ScalarSink):
         if self._sent is None or self._sent.done():
             self._send()
 
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """See `Sink`."""
+        super().conclude(summary)
+        ended = str(summary["exit"])
+        self._status = "FINISHED" if ended.startswith(WELL) else "KILLED" if ended == "interrupted" else "FAILED"
+
     def close(self) -> None:
         """See `Sink`."""
         try:
             while self._late or self._sent is not None:
                 self._send()
-            self._client.set_terminated(self._id)
+            self._client.set_terminated(self._id, self._status)
         finally:
             self._thread.shutdown()
 
@@ -86,6 +98,18 @@ class MlflowSink(ScalarSink):
         batch, self._late = self._late[:BATCH], self._late[BATCH:]
         if batch:
             self._sent = self._thread.submit(self._client.log_batch, self._id, metrics=batch)
+
+
+@contextmanager
+def _at_once() -> Iterator[None]:
+    """Let MLflow try a request three times in some seconds; by itself it tries a server that is away for minutes."""
+    own = RETRIES in os.environ
+    os.environ.setdefault(RETRIES, "2")
+    try:
+        yield
+    finally:
+        if not own:
+            os.environ.pop(RETRIES, None)
 
 
 @contextmanager

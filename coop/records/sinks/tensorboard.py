@@ -21,7 +21,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 from coop.common.process.files import LineFile, write_atomic
 from coop.common.process.untrusted import read_bytes
-from coop.records.sinks import EPISODE, ROW, Kept, RecordedRun, ScalarSink
+from coop.records.sinks import EPISODE, ROW, WELL, Kept, RecordedRun, ScalarSink
 
 FOLDER = "tb"
 SETTINGS = "hyperparameters"  # the first tag of an event that each file begins with
@@ -73,7 +73,7 @@ class TensorBoardSink(ScalarSink):
     def conclude(self, summary: Mapping[str, Any]) -> None:
         """Add what the run has reached, and, for HParams, how it has ended."""
         super().conclude(summary)
-        whole = str(summary["exit"]).startswith("complete")
+        whole = str(summary["exit"]).startswith(WELL)
         status = api_pb2.STATUS_SUCCESS if whole else api_pb2.STATUS_FAILURE
         told = plugin_data_pb2.HParamsPluginData(
             session_end_info=plugin_data_pb2.SessionEndInfo(status=status, end_time_secs=time.time())

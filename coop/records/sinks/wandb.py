@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from coop.common.errors import UsageError
-from coop.records.sinks import Kept, RecordedRun, ScalarSink
+from coop.records.sinks import WELL, Kept, RecordedRun, ScalarSink
 
 STEP = "env_step"
 MAX_TAG = 64  # characters, the service's bound
@@ -40,6 +40,7 @@ class WandbSink(ScalarSink):
             self._run = wandb.init(dir=run.path, resume="allow", settings=settings, **named)
         except wandb.Error as error:
             raise UsageError(f"--log wandb: {str(error).splitlines()[0]}") from error
+        self._status = 1  # until it is told how the run has ended
         # Episodes are told a little later than updates; wandb's own step must not go back.
         self._run.define_metric(STEP, hidden=True)
         self._run.define_metric("*", step_metric=STEP)
@@ -52,6 +53,11 @@ class WandbSink(ScalarSink):
         """See `ScalarSink`."""
         self._run.log({**values, STEP: env_step})
 
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """See `Sink`."""
+        super().conclude(summary)
+        self._status = int(not str(summary["exit"]).startswith(WELL))
+
     def close(self) -> None:
         """See `Sink`."""
-        self._run.finish()
+        self._run.finish(exit_code=self._status)
