@@ -1,31 +1,34 @@
-"""Console commands, each in a process of its own, forked where torch has been imported: a cold start takes seconds."""
+"""Console commands and programs, each in a process of its own, forked where torch has been imported.
+
+A cold start takes seconds.
+"""
 
 import os
 import signal
-import socket
 import subprocess
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Self
 
-from forked import SERVER, become, forked_children, serve
-
-SUPERVISORS = ("coop-local", "coop-sweep")
+from forked import SERVER, become
 
 
 class Command:
-    """A console command that has been started; its output goes to files. As a context it is killed at its end.
+    """A command that has been started; its output goes to files. As a context it is killed at its end.
 
-    environment: all variables; those of this process if None.
+    name: of a console command, or the file of a program. environment: all variables; those of this process if None.
     """
 
     def __init__(
-        self, name: str, *flags: str | Path, cwd: Path | None = None, environment: Mapping[str, str] | None = None
+        self,
+        name: str | Path,
+        *flags: str | Path,
+        cwd: Path | None = None,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
-        self.arguments = [name, *map(str, flags)]
+        self.arguments = list(map(str, (name, *flags)))
         self._folder = tempfile.TemporaryDirectory()
         self._files = [Path(self._folder.name, stream) for stream in ("out", "err")]
         variables = dict(os.environ if environment is None else environment)
@@ -78,7 +81,7 @@ class Command:
 
 
 def run_command(
-    name: str,
+    name: str | Path,
     *flags: str | Path,
     cwd: Path | None = None,
     environment: Mapping[str, str] | None = None,
@@ -87,7 +90,7 @@ def run_command(
 ) -> subprocess.CompletedProcess[str]:
     """What `subprocess.run` does with the command's script, its output captured as text.
 
-    environment: see `Command`. check: raise CalledProcessError at another status than 0.
+    name, environment: see `Command`. check: raise CalledProcessError at another status than 0.
     """
     done = Command(name, *flags, cwd=cwd, environment=environment).end(timeout)
     if check and done.returncode:
@@ -113,12 +116,4 @@ def _run(arguments: Sequence[str], cwd: str, environment: Mapping[str, str], fil
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(descriptor, number)
         os.close(descriptor)
-    with forked_children(_fork) if arguments[0] in SUPERVISORS else nullcontext():
-        become(arguments, cwd, environment)
-
-
-def _fork(asking: socket.socket, requests: socket.socket) -> None:
-    if os.fork() == 0:
-        asking.close()
-        serve(requests)
-        os._exit(0)
+    become(arguments, cwd, environment)

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
@@ -609,8 +608,7 @@ def test_a_survey_stops_at_the_newest_whole_one(run: Path) -> None:
 @pytest.mark.timeout(900)
 def test_damage_on_purpose() -> None:
     """Some of the mutations of which docs/robustness.md tells: none silent, no traceback, no hang."""
-    command = [sys.executable, str(ROOT / "benchmarks" / "corrupt.py"), "--mutations", "200", "--seed", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=880)
+    done = run_command(ROOT / "benchmarks" / "corrupt.py", "--mutations", "200", "--seed", "1", timeout=880)
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^200 mutations in \d+ s: 0 silent", done.stdout, re.MULTILINE)
 
