@@ -19,6 +19,7 @@ class Command:
     """A command that has been started; its output goes to files. As a context it is killed at its end.
 
     name: of a console command, or the file of a program. environment: all variables; those of this process if None.
+    out: a pipe that its standard output goes to, or a terminal that it begins a session on. nohup: ignore SIGHUP.
     """
 
     def __init__(
@@ -27,13 +28,16 @@ class Command:
         *flags: str | Path,
         cwd: Path | None = None,
         environment: Mapping[str, str] | None = None,
+        out: Path | None = None,
+        nohup: bool = False,
     ) -> None:
         self.arguments = list(map(str, (name, *flags)))
         self._folder = tempfile.TemporaryDirectory()
-        self._files = [Path(self._folder.name, stream) for stream in ("out", "err")]
+        files = [Path(self._folder.name, stream) for stream in ("out", "err")]
+        self._files = files if out is None else [out, out if out.is_char_device() else files[1]]
         variables = dict(os.environ if environment is None else environment)
         self._process = SERVER.Process(
-            target=_run, args=(self.arguments, str(cwd or Path.cwd()), variables, list(map(str, self._files)))
+            target=_run, args=(self.arguments, str(cwd or Path.cwd()), variables, self._files, nohup)
         )
         self._process.start()
         assert self._process.pid is not None
@@ -49,7 +53,7 @@ class Command:
 
     def output(self) -> tuple[str, str]:
         """What it has written so far to standard output and to standard error."""
-        out, err = (file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files)
+        out, err = (file.read_text(encoding="utf-8") if file.is_file() else "" for file in self._files)
         return out, err
 
     @property
@@ -98,6 +102,16 @@ def run_command(
     return done
 
 
+def run_for_a_line(name: str, *flags: str | Path, cwd: Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    """What `run_command` returns, of a command whose reader goes once it has read a line."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.mkfifo(pipe := Path(folder, "pipe"))
+        with Command(name, *flags, cwd=cwd, out=pipe) as process:
+            with pipe.open(encoding="utf-8") as reader:
+                line = reader.readline()
+            return subprocess.CompletedProcess(process.arguments, process.wait(timeout), line, process.output()[1])
+
+
 def wait_for(what: str, reached: object, seconds: float = 60.0) -> None:
     """Look until `reached()` is true; fail after `seconds`."""
     deadline = time.monotonic() + seconds
@@ -111,9 +125,16 @@ def lines(path: Path) -> int:
     return len(path.read_text().splitlines()) if path.exists() else 0
 
 
-def _run(arguments: Sequence[str], cwd: str, environment: Mapping[str, str], files: Sequence[str]) -> None:
+def _run(
+    arguments: Sequence[str], cwd: str, environment: Mapping[str, str], files: Sequence[Path], nohup: bool
+) -> None:
+    os.setsid()
     for number, file in enumerate(files, 1):
-        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        os.dup2(descriptor, number)
+        terminal = file.is_char_device()  # opened for reading too, it is the session's
+        descriptor = os.open(file, os.O_RDWR if terminal else os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        for each in (0, number) if terminal else (number,):
+            os.dup2(descriptor, each)
         os.close(descriptor)
+    if nohup:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
     become(arguments, cwd, environment)
