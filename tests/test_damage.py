@@ -274,6 +274,15 @@ def test_overwriting_moves_the_run_aside(run: Path) -> None:
     assert (both.returncode, "give one of them" in both.stderr) == (2, True)
 
 
+def test_overwriting_leaves_a_folder_without_a_run_as_it_is(tmp_path: Path) -> None:
+    for name in ("videos", "logs"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine.txt").write_text("mine")
+    before = contents(tmp_path)
+    assert resumption.overwrite(tmp_path) == ""
+    assert contents(tmp_path) == before
+
+
 def test_a_run_killed_before_its_first_checkpoint_begins_again_with_its_records_aside(run: Path) -> None:
     (run / "summary.json").unlink()
     for folder in (run / "checkpoints").iterdir():

@@ -255,6 +255,17 @@ def test_idle_connections_keep_nobody_out(run: tuple[str, str], keys: Path) -> N
         wait_for_more(inside)
 
 
+def test_strangers_who_begin_to_speak_keep_nobody_out_and_are_sent_away() -> None:
+    at = free_endpoint("tcp/127.0.0.1:0")
+    with Node(open_session((at,)), RUN, "learner", new_incarnation()), idle(at, 300, b"\x00") as strangers:
+        time.sleep(0.5)
+        with joined((at, at), None) as actor:
+            until(lambda: actor.presence.members("learner"), 4.0)
+        strangers[0].settimeout(20.0)
+        with suppress(ConnectionResetError):
+            assert strangers[0].recv(1) == b""
+
+
 @pytest.mark.parametrize("protocol", ["tls", "tcp"])
 def test_a_listener_hears_only_of_those_who_speak(protocol: str, keys: Path) -> None:
     at = free_endpoint(f"{protocol}/127.0.0.1:0")
