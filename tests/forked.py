@@ -31,7 +31,8 @@ SERVER.set_forkserver_preload(
     [
         *("coop.actors.cli", "coop.deploy.local", "coop.evaluation.cli", "coop.lockstep.cli", "coop.learner.process"),
         *("coop.common.envs.gymnasium_env", "coop.evaluation.evaluate", "coop.lockstep.run", "coop.studies.sweep.cli"),
-        *("coop.records.sinks.tensorboard", "matplotlib.backends.backend_agg", "matplotlib.style"),
+        *("coop.records.sinks.tensorboard", "coop.studies.report.writer", "matplotlib.backends.backend_agg"),
+        *("matplotlib.figure", "matplotlib.style"),
     ]
 )
 ADOPT, NAME = 36, 15  # PR_SET_CHILD_SUBREAPER, PR_SET_NAME

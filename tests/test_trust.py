@@ -17,7 +17,7 @@ from samples import until
 
 from coop.common.messaging.keys import evaluations_key, join_key, replay_key
 from coop.common.messaging.members import ROUTE
-from coop.common.messaging.messages.control import EndOfRun, Join, Leave, Limit, Snapshot
+from coop.common.messaging.messages.control import EndOfRun, Join, Leave, Limit, Limits, LimitsQuestion, Snapshot
 from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow
 from coop.common.messaging.messages.sample import encode_request
 from coop.common.messaging.messages.status import ActorStatus, ReplayStats, StatsQuestion
@@ -196,12 +196,28 @@ def test_an_evaluator_s_certificate_reads_weights_and_reports(run: tuple[str, st
                 node.ask(key, payload)
 
 
-def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys: Path) -> None:
-    """Not even as a Zenoh client, whose messages the learner would forward to the other actors."""
+@contextmanager
+def client(at: str, keys: Path) -> Iterator[zenoh.Session]:
+    """A Zenoh client with the certificate of an actor: others forward what it tells, and it asks whoever may answer."""
     config = zenoh.Config.from_file(str(keys / "actor.json5"))
     config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps(run[:1]))
-    with joined(run, keys / "actor.json5") as actor, zenoh.open(config) as forger:
+    config.insert_json5("connect/endpoints", json.dumps([at]))
+    with zenoh.open(config) as session:
+        yield session
+
+
+def test_an_actor_s_certificate_can_t_set_limits(run: tuple[str, str], keys: Path) -> None:
+    with joined(run, keys / "replay.json5", "watch") as inside, client(run[1], keys) as forger:
+        key, question = replay_key(inside, "limits"), LimitsQuestion().encode(RUN)
+        before = Limits.decode(inside.ask(key, question))
+        assert list(forger.get(replay_key(inside, "insert"), payload=b"junk", timeout=5.0)), "it is heard"
+        assert list(forger.get(key, payload=bytes(Limit(0.5, 32.0).encode(RUN)), timeout=1.0)) == []
+        after = Limits.decode(inside.ask(key, question))
+        assert (after.ratio, after.tolerance) == (before.ratio, before.tolerance)
+
+
+def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys: Path) -> None:
+    with joined(run, keys / "actor.json5") as actor, client(run[0], keys) as forger:
         key = actor.key("weights", "1")
         received = actor.session.declare_subscriber(key, zenoh.handlers.FifoChannel(10_000))
         time.sleep(0.5)
