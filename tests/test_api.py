@@ -272,7 +272,7 @@ def test_a_script_from_standard_input_waits_for_its_runs(tmp_path: Path) -> None
     script = "import coop\nfor distributed in (False, True):\n"
     script += "    coop.train(total_steps=300, run_dir=str(distributed), distributed=distributed)\nprint('at once')\n"
     done = subprocess.run(
-        [sys.executable, "-"], input=script, capture_output=True, text=True, timeout=100, check=True, cwd=tmp_path
+        [sys.executable, "-"], input=script, capture_output=True, text=True, timeout=250, check=True, cwd=tmp_path
     )
     *settings, printed = done.stdout.splitlines()
     assert len(settings) == 2
