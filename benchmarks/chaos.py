@@ -6,8 +6,8 @@ import os
 import random
 import re
 import signal
-import subprocess
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,16 +96,13 @@ class ChaosMonkey:
 
 
 def _children(pid: int) -> list[tuple[int, str]]:
-    """(process id, command) of the direct children of a process."""
+    """(process id, command) of the direct children of a process that are roles."""
     found = []
     for entry in Path("/proc").iterdir():
-        try:
-            if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
-                arguments = (entry / "cmdline").read_bytes().split(b"\0")
-                names = [Path(os.fsdecode(argument)).name for argument in arguments]
-                found += [(int(entry.name), name) for name in names if name in ROLES]
-        except (OSError, ValueError, IndexError):
-            continue
+        with suppress(OSError, ValueError):
+            name, _, rest = (entry / "stat").read_text().partition("(")[2].rpartition(")")
+            if int(rest.split()[1]) == pid and name in ROLES:
+                found.append((int(entry.name), name))
     return found
 
 
@@ -160,9 +157,13 @@ def _run() -> None:
     ended = time.monotonic()
     if process.exit_status():
         raise RunError(process.why())
-    proof = subprocess.run(command("coop-reexecute", str(options.run_dir)), capture_output=True, text=True, check=False)
-    if proof.returncode:
-        raise RunError(proof.stderr.strip())
+    proof = options.run_dir / "coop-reexecute.log"
+    process = ChildProcess("coop-reexecute", command("coop-reexecute", str(options.run_dir)), proof)
+    process.start()
+    process.end(options.give_up)
+    if process.exit_status():
+        raise RunError(process.why())
+    printed = proof.read_text(encoding="utf-8").strip()
     summary = read_summary(options.run_dir)
     killed = ", ".join(f"{count} {name.removeprefix('coop-')}" for name, count in monkey.kills.items())
     restarts = log.read_text(encoding="utf-8").count("starting it again")
@@ -170,11 +171,11 @@ def _run() -> None:
         "kills": f"{sum(monkey.kills.values())} ({killed})",
         "transitions accepted": f"{summary['transitions_accepted']:,}",
         "lost": summary["transitions_lost"],
-        "duplicated": _repeated(proof.stdout),
+        "duplicated": _repeated(printed),
         "restarts": restarts,
         "longest stall": f"{monkey.longest_stall:.1f} s",
         "wall time": f"{ended - started:.0f} s",
-        "re-executed": proof.stdout.strip(),
+        "re-executed": printed,
     }.items():
         print(f"{name:22}{value}")
 

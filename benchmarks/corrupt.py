@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any
 
 from coop.common.errors import CoopError
-from coop.common.process.processes import command
+from coop.common.process.processes import ChildProcess, command
 
 LIMIT = 120  # seconds for a command, on a busy machine
 LIMITS = {"coop-local": 600}  # whose processes wait for each other
@@ -137,11 +137,11 @@ def prepare(folder: Path) -> dict[str, tuple[Reader, ...]]:
 
 def call(name: str, *flags: str) -> None:
     """Run a command in a process; exits if it fails."""
-    import subprocess  # noqa: PLC0415 (for the preparation alone)
-
-    done = subprocess.run(command(name, *flags), capture_output=True, text=True, check=False)
-    if done.returncode:
-        sys.exit(f"{name} {' '.join(flags)}: {done.stderr or done.stdout}")
+    process = ChildProcess(name, command(name, *flags), Path("calls.log"))
+    process.start()
+    process.end(LIMITS["coop-local"])
+    if process.exit_status():
+        sys.exit(process.why())
 
 
 def corrupt(

@@ -1,36 +1,43 @@
-"""Console commands, each in a process of its own, forked where torch has been imported: a cold start takes seconds."""
+"""Console commands and programs, each in a process of its own, forked where torch has been imported.
+
+A cold start takes seconds.
+"""
 
 import os
 import signal
-import socket
 import subprocess
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Self
 
-from forked import SERVER, become, forked_children, serve
-
-SUPERVISORS = ("coop-local", "coop-sweep")
+from forked import SERVER, become
 
 
 class Command:
-    """A console command that has been started; its output goes to files. As a context it is killed at its end.
+    """A command that has been started; its output goes to files. As a context it is killed at its end.
 
-    environment: all variables; those of this process if None.
+    name: of a console command, or the file of a program. environment: all variables; those of this process if None.
+    out: a pipe that its standard output goes to, or a terminal that it begins a session on. nohup: ignore SIGHUP.
     """
 
     def __init__(
-        self, name: str, *flags: str | Path, cwd: Path | None = None, environment: Mapping[str, str] | None = None
+        self,
+        name: str | Path,
+        *flags: str | Path,
+        cwd: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+        out: Path | None = None,
+        nohup: bool = False,
     ) -> None:
-        self.arguments = [name, *map(str, flags)]
+        self.arguments = list(map(str, (name, *flags)))
         self._folder = tempfile.TemporaryDirectory()
-        self._files = [Path(self._folder.name, stream) for stream in ("out", "err")]
+        files = [Path(self._folder.name, stream) for stream in ("out", "err")]
+        self._files = files if out is None else [out, out if out.is_char_device() else files[1]]
         variables = dict(os.environ if environment is None else environment)
         self._process = SERVER.Process(
-            target=_run, args=(self.arguments, str(cwd or Path.cwd()), variables, list(map(str, self._files)))
+            target=_run, args=(self.arguments, str(cwd or Path.cwd()), variables, self._files, nohup)
         )
         self._process.start()
         assert self._process.pid is not None
@@ -46,7 +53,7 @@ class Command:
 
     def output(self) -> tuple[str, str]:
         """What it has written so far to standard output and to standard error."""
-        out, err = (file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files)
+        out, err = (file.read_text(encoding="utf-8") if file.is_file() else "" for file in self._files)
         return out, err
 
     @property
@@ -78,7 +85,7 @@ class Command:
 
 
 def run_command(
-    name: str,
+    name: str | Path,
     *flags: str | Path,
     cwd: Path | None = None,
     environment: Mapping[str, str] | None = None,
@@ -87,12 +94,22 @@ def run_command(
 ) -> subprocess.CompletedProcess[str]:
     """What `subprocess.run` does with the command's script, its output captured as text.
 
-    environment: see `Command`. check: raise CalledProcessError at another status than 0.
+    name, environment: see `Command`. check: raise CalledProcessError at another status than 0.
     """
     done = Command(name, *flags, cwd=cwd, environment=environment).end(timeout)
     if check and done.returncode:
         raise subprocess.CalledProcessError(done.returncode, done.args, done.stdout, done.stderr)
     return done
+
+
+def run_for_a_line(name: str, *flags: str | Path, cwd: Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    """What `run_command` returns, of a command whose reader goes once it has read a line."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.mkfifo(pipe := Path(folder, "pipe"))
+        with Command(name, *flags, cwd=cwd, out=pipe) as process:
+            with pipe.open(encoding="utf-8") as reader:
+                line = reader.readline()
+            return subprocess.CompletedProcess(process.arguments, process.wait(timeout), line, process.output()[1])
 
 
 def wait_for(what: str, reached: object, seconds: float = 60.0) -> None:
@@ -108,17 +125,16 @@ def lines(path: Path) -> int:
     return len(path.read_text().splitlines()) if path.exists() else 0
 
 
-def _run(arguments: Sequence[str], cwd: str, environment: Mapping[str, str], files: Sequence[str]) -> None:
+def _run(
+    arguments: Sequence[str], cwd: str, environment: Mapping[str, str], files: Sequence[Path], nohup: bool
+) -> None:
+    os.setsid()
     for number, file in enumerate(files, 1):
-        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        os.dup2(descriptor, number)
+        terminal = file.is_char_device()  # opened for reading too, it is the session's
+        descriptor = os.open(file, os.O_RDWR if terminal else os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        for each in (0, number) if terminal else (number,):
+            os.dup2(descriptor, each)
         os.close(descriptor)
-    with forked_children(_fork) if arguments[0] in SUPERVISORS else nullcontext():
-        become(arguments, cwd, environment)
-
-
-def _fork(asking: socket.socket, requests: socket.socket) -> None:
-    if os.fork() == 0:
-        asking.close()
-        serve(requests)
-        os._exit(0)
+    if nohup:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    become(arguments, cwd, environment)

@@ -8,6 +8,7 @@ import ctypes
 import json
 import multiprocessing
 import os
+import runpy
 import signal
 import socket
 import subprocess
@@ -15,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,12 +31,14 @@ SERVER.set_forkserver_preload(
     [
         *("coop.actors.cli", "coop.deploy.local", "coop.evaluation.cli", "coop.lockstep.cli", "coop.learner.process"),
         *("coop.common.envs.gymnasium_env", "coop.evaluation.evaluate", "coop.lockstep.run", "coop.studies.sweep.cli"),
-        *("coop.records.sinks.tensorboard", "matplotlib.backends.backend_agg", "matplotlib.style"),
+        *("coop.records.sinks.tensorboard", "coop.studies.report.writer", "matplotlib.backends.backend_agg"),
+        *("matplotlib.figure", "matplotlib.style"),
     ]
 )
 ADOPT, NAME = 36, 15  # PR_SET_CHILD_SUBREAPER, PR_SET_NAME
 LARGEST = 1 << 20  # bytes of a request
 POLL = 0.001  # seconds
+SUPERVISORS = ("coop-local", "coop-sweep")
 
 
 @contextmanager
@@ -113,8 +116,16 @@ def _begin(request: Any, descriptors: Sequence[int]) -> None:
     become([Path(arguments[0]).name, *arguments[1:]], cwd, environment)
 
 
+def _fork(asking: socket.socket, requests: socket.socket) -> None:
+    if os.fork() == 0:
+        asking.close()
+        serve(requests)
+        os._exit(0)
+
+
 def become(arguments: Sequence[str], cwd: str, environment: Mapping[str, str]) -> None:
-    """Run a console command in this process."""
+    """Run a console command, or a program in a file, in this process; what it starts in turn is forked as well."""
+    name = arguments[0]
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(environment)
@@ -122,8 +133,13 @@ def become(arguments: Sequence[str], cwd: str, environment: Mapping[str, str]) -
     others = [place for place in sys.path if not place.startswith(TESTS)]
     sys.path[:] = [*(own.split(os.pathsep) if own else ()), *others]
     sys.argv = list(arguments)
-    ctypes.CDLL(None).prctl(NAME, arguments[0].encode(), 0, 0, 0)
+    ctypes.CDLL(None).prctl(NAME, Path(name).name.encode(), 0, 0, 0)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
-    (script,) = entry_points(group="console_scripts", name=arguments[0])
-    script.load()()
+    with forked_children(_fork) if name in SUPERVISORS or name.endswith(".py") else nullcontext():
+        if name.endswith(".py"):
+            sys.path.insert(0, str(Path(name).parent))
+            runpy.run_path(name, run_name="__main__")
+        else:
+            (script,) = entry_points(group="console_scripts", name=name)
+            script.load()()

@@ -268,21 +268,21 @@ def test_a_registered_method_trains(tmp_path: Path) -> None:
     assert values[0] < values[1]
 
 
-@pytest.mark.parametrize("distributed", [False, True])
-def test_a_script_from_standard_input_waits_for_its_run(distributed: bool, tmp_path: Path) -> None:
-    script = (
-        f"import coop\ncoop.train(total_steps=300, run_dir={str(tmp_path / 'a')!r}, distributed={distributed})\n"
-        "print('at once')\n"
-    )
+def test_a_script_from_standard_input_waits_for_its_runs(tmp_path: Path) -> None:
+    script = "import coop\nfor distributed in (False, True):\n"
+    script += "    coop.train(total_steps=300, run_dir=str(distributed), distributed=distributed)\nprint('at once')\n"
     done = subprocess.run(
-        [sys.executable, "-"], input=script, capture_output=True, text=True, timeout=100, check=True, cwd=tmp_path
+        [sys.executable, "-"], input=script, capture_output=True, text=True, timeout=250, check=True, cwd=tmp_path
     )
-    settings, *printed = done.stdout.splitlines()
-    assert settings.startswith("settings: preset cartpole; method: coop; gamma: 0.95; replay: capacity 5,000, ")
-    assert (printed, done.stderr) == (["at once"], "")
-    summary = coop.load(tmp_path / "a").summary
-    assert summary is not None
-    assert summary["exit"] == "complete"
+    *settings, printed = done.stdout.splitlines()
+    assert len(settings) == 2
+    for line in settings:
+        assert line.startswith("settings: preset cartpole; method: coop; gamma: 0.95; replay: capacity 5,000, ")
+    assert (printed, done.stderr) == ("at once", "")
+    for distributed in (False, True):
+        summary = coop.load(tmp_path / str(distributed)).summary
+        assert summary is not None
+        assert summary["exit"] == "complete"
 
 
 def test_a_script_that_fails_stops_its_run(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run_command
 from samples import until
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -327,8 +328,8 @@ def test_the_methods_learn_a_game_in_turn_and_go_on_elsewhere(tmp_path: Path) ->
     """`make gpu-atari`, with tiny settings on the processor."""
     out = tmp_path / "out"
     tiny = ["--device", "cpu", "--emulators", "4", "--kind", "nips2013", "--starts", "40", "--least", "80"]
-    command = [sys.executable, str(BENCHMARKS / "gpu_atari.py"), *tiny, "--minutes", "0.001"]
-    command += ["--methods", "dqn", "coop", "--out"]
+    program = BENCHMARKS / "gpu_atari.py"
+    flags = [*tiny, "--minutes", "0.001", "--methods", "dqn", "coop", "--out"]
     found = []
     for place in (out, tmp_path / "elsewhere"):
         if place != out:
@@ -336,7 +337,9 @@ def test_the_methods_learn_a_game_in_turn_and_go_on_elsewhere(tmp_path: Path) ->
             with np.load(place / "coop-1.npz") as kept:
                 arrays = {"theta": kept["theta"] + 1, "square": kept["square"]}
             np.savez_compressed(place / "coop-1.npz", **arrays)
-        done = subprocess.run([*command, place], capture_output=True, text=True, check=False)
+            done = run_command(program, "--inside", *flags, place)  # in the environment that it prepares
+        else:
+            done = subprocess.run([sys.executable, program, *flags, place], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         assert "coop" in done.stdout.splitlines()[-2]
         found.append([json.loads((place / f"{method}.json").read_text()) for method in ("dqn", "coop")])
@@ -349,6 +352,6 @@ def test_the_methods_learn_a_game_in_turn_and_go_on_elsewhere(tmp_path: Path) ->
         assert first["updates"] == (first["steps"] - 40) // 4 + 1
     with np.load(out / "coop-1.npz") as before, np.load(tmp_path / "elsewhere" / "coop-1.npz") as after:
         np.testing.assert_allclose(after["theta"], before["theta"] + 1, atol=0.1)  # goes on from the file
-    other = subprocess.run([*command, out, "--game", "breakout"], capture_output=True, text=True, check=False)
+    other = run_command(program, *flags, out, "--game", "breakout")
     assert other.returncode == 2
     assert "is of pong" in other.stderr

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
@@ -273,6 +272,15 @@ def test_overwriting_moves_the_run_aside(run: Path) -> None:
     assert json.loads((run / "summary.json").read_text())["seed"] == 3
     both = run_command("coop-lockstep", "--overwrite", "--resume", "--run-dir", run)
     assert (both.returncode, "give one of them" in both.stderr) == (2, True)
+
+
+def test_overwriting_leaves_a_folder_without_a_run_as_it_is(tmp_path: Path) -> None:
+    for name in ("videos", "logs"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine.txt").write_text("mine")
+    before = contents(tmp_path)
+    assert resumption.overwrite(tmp_path) == ""
+    assert contents(tmp_path) == before
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_again_with_its_records_aside(run: Path) -> None:
@@ -609,8 +617,7 @@ def test_a_survey_stops_at_the_newest_whole_one(run: Path) -> None:
 @pytest.mark.timeout(900)
 def test_damage_on_purpose() -> None:
     """Some of the mutations of which docs/robustness.md tells: none silent, no traceback, no hang."""
-    command = [sys.executable, str(ROOT / "benchmarks" / "corrupt.py"), "--mutations", "200", "--seed", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=880)
+    done = run_command(ROOT / "benchmarks" / "corrupt.py", "--mutations", "200", "--seed", "1", timeout=880)
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^200 mutations in \d+ s: 0 silent", done.stdout, re.MULTILINE)
 

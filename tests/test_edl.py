@@ -143,7 +143,7 @@ def test_the_equations_by_svd(kind: str, actions: int, batch: int, trained: bool
 
 
 @settings(max_examples=settings.default.max_examples // 2)
-@given(st.integers(0, 2**31), st.booleans(), st.integers(2, 18), st.integers(1, 64))
+@given(st.integers(0, 2**31), st.booleans(), st.integers(2, 18), st.integers(1, 20))
 def test_the_equations_on_any_mlp(seed: int, trained: bool, actions: int, batch: int) -> None:
     network = build_network("mlp", _spec("mlp", actions), (96, 96), seed).double()
     _, x, error = _case("mlp", actions, batch, seed)

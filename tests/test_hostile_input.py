@@ -1,12 +1,11 @@
 """Hostile messages against live processes (`make fuzz` in short), and a checkpoint that would execute something."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from commands import run_command
 
 from coop.common.errors import RunError
 from coop.records.learner_checkpoints import load_learner
@@ -16,13 +15,7 @@ FUZZ = Path(__file__).parents[1] / "benchmarks" / "fuzz.py"
 
 @pytest.mark.timeout(300)  # 20 s on a free machine: every role of a run starts
 def test_broken_messages_change_nothing_and_valid_ones_stop_nothing() -> None:
-    done = subprocess.run(
-        [sys.executable, str(FUZZ), "--messages=3000", "--seed=7"],
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
+    done = run_command(FUZZ, "--messages=3000", "--seed=7", timeout=280)
     assert (done.returncode, done.stderr) == (0, "")
     assert "at rest; changed: nothing" in done.stdout
     assert "lost 0, duplicated 0" in done.stdout

@@ -14,7 +14,7 @@ import pytest
 from samples import make_segment
 from test_checkpoints import CONFIG, save
 
-from coop.common.errors import RunError
+from coop.common.errors import RunError, UsageError
 from coop.common.messaging.conversation import drive
 from coop.common.messaging.keys import replay_key
 from coop.common.messaging.messages.answers import Retry
@@ -26,6 +26,7 @@ from coop.common.process.lifecycle import Stop
 from coop.common.transitions import NO_IDS, NO_PRIORITIES, DrawRequest
 from coop.common.types import EnvSpec
 from coop.replay.core import ReplayCore, RetryLater
+from coop.replay.persistence import journal as journal_module
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import Journal, journal_files
 from coop.replay.persistence.recovery import recover
@@ -77,6 +78,34 @@ def test_a_kill_loses_nothing(spec: EnvSpec, tmp_path: Path) -> None:
     _assert_alike(twin, third)
     with pytest.raises(RunError, match="belongs to another run than the learner's"):
         recover(ReplayCore(CONFIG, spec), tmp_path, 1, 6)
+
+
+def test_a_journal_of_another_format_is_refused(spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as older:
+        older.setattr(journal_module, "FORMAT", 2)
+        Journal(tmp_path, 5, 1, keep=False).close()
+    with pytest.raises(UsageError, match=r"00000001\.log: format 2 of the journal, this program reads 3$"):
+        recover(ReplayCore(CONFIG, spec), tmp_path, 1, 5)
+
+
+@pytest.mark.parametrize("sync", [False, True])
+def test_a_new_file_is_on_the_disk_before_anything_in_it_is_acknowledged(
+    sync: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    fsync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        synced.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    journal = Journal(tmp_path / "journal", 5, 1, keep=False, sync=sync)
+    assert synced[-2:] == ["00000001.log", "journal"]
+    synced.clear()
+    journal.roll()
+    assert synced == (["00000001.log", "00000002.log", "journal"] if sync else [])
+    journal.close()
 
 
 @pytest.mark.parametrize("keep", [False, True])

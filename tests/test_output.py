@@ -1,6 +1,5 @@
 """Output whose reader or terminal goes away, descriptors that are closed, and SIGHUP: no run is lost, nothing fails."""
 
-import fcntl
 import json
 import os
 import pty
@@ -9,13 +8,13 @@ import signal
 import subprocess
 import sys
 import sysconfig
-import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from commands import Command, run_for_a_line, wait_for
 
 from coop.common.process.lifecycle import Stop
 from coop.records.learner_checkpoints import newest_checkpoint
@@ -54,24 +53,13 @@ def how_it_ended(path: Path) -> str:
 
 
 @contextmanager
-def on_a_terminal(line: str, cwd: Path, *, nohup: bool = False) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+def on_a_terminal(line: str, cwd: Path, *, nohup: bool = False) -> Iterator[tuple[Command, int]]:
     """Run a command in a session with a terminal; gives it and the other side of the terminal."""
-
-    def begin() -> None:
-        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-        if nohup:
-            signal.signal(signal.SIGHUP, signal.SIG_IGN)
-
     side, terminal = pty.openpty()
-    with subprocess.Popen(
-        line.split(), cwd=cwd, env=VARIABLES, stdin=terminal, stdout=terminal, stderr=terminal,
-        start_new_session=True, preexec_fn=begin,  # noqa: PLW1509 (of the child alone)
-    ) as process:  # fmt: skip
+    with Command(*line.split(), cwd=cwd, environment=VARIABLES, out=Path(os.ttyname(terminal)), nohup=nohup) as process:
+        wait_for("the terminal", lambda: select.select([side], [], [], 0)[0])
         os.close(terminal)
-        try:
-            yield process, side
-        finally:
-            process.kill()
+        yield process, side
 
 
 def read_until(side: int, path: Path) -> None:
@@ -85,9 +73,8 @@ def read_until(side: int, path: Path) -> None:
 
 
 def test_a_reader_that_goes_ends_a_run_with_a_closing_checkpoint(tmp_path: Path) -> None:
-    done = shell(f"coop-lockstep {LONG} --run-dir run | head -1; echo ${{PIPESTATUS[0]}}", tmp_path)
-    assert done.stdout.splitlines()[-1] == "141"
-    assert done.stderr == ""
+    done = run_for_a_line("coop-lockstep", *LONG.split(), "--run-dir", "run", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (141, "")
     assert how_it_ended(tmp_path / "run") == "interrupted"
     assert newest_checkpoint(tmp_path / "run") is not None
 

@@ -218,9 +218,10 @@ def test_without_the_largest_capacity_there_is_no_breaking_point(study: Path, tm
 
 
 def test_a_figure_that_can_t_be_written(study: Path, tmp_path: Path) -> None:
-    (tmp_path / "returns_steps.pdf").mkdir()
+    shutil.copytree(study / "coop-capacity=300-seed=1", tmp_path / "runs" / "one")
+    (tmp_path / "out" / "returns_steps.pdf").mkdir(parents=True)
     with pytest.raises(UsageError, match=r"--out .*: Is a directory"):
-        write_report(study, tmp_path)
+        write_report(tmp_path / "runs", tmp_path / "out")
 
 
 def test_what_is_no_study(study: Path, tmp_path: Path) -> None:

@@ -158,7 +158,8 @@ def files_of(config: RunConfig, seeds: list[int], folder: Path, stop: Stop, *, t
     with ExitStack() as stack:
         runs = []
         for seed in seeds:
-            runs.append(LockstepRun(replace(config, seed=seed), folder / str(seed), "test", Start(resume=True)))
+            path = folder / str(seed)
+            runs.append(LockstepRun(replace(config, seed=seed), path, "test", Start(resume=True), log="none"))
             stack.callback(runs[-1].close)
         if together:
             play_together(runs, stop)
@@ -218,11 +219,21 @@ class StopAt(Stop):
         return super().is_set()
 
 
+TWICE = {"total_steps": 600, "checkpoint_every": 130}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs that have been played by themselves."""
+    path = tmp_path_factory.mktemp("whole")
+    files_of(config_of("coop", TWICE), [1, 2], path, Stop(), together=False)
+    return path
+
+
 @pytest.mark.parametrize("first", ["together", "alone"])
-def test_runs_go_on_where_they_stopped_whoever_had_begun_them(first: str, tmp_path: Path) -> None:
+def test_runs_go_on_where_they_stopped_whoever_had_begun_them(first: str, whole: Path, tmp_path: Path) -> None:
     """Either way of playing goes on from the other's checkpoints; runs that are not equally far go on too."""
-    config = config_of("coop", {"total_steps": 600, "checkpoint_every": 130})
-    files_of(config, [1, 2], tmp_path / "whole", Stop(), together=False)
+    config = config_of("coop", TWICE)
     one = first == "together"
     files_of(config, [1, 2], tmp_path / "parts", StopAt(2 if one else 123), together=one)
     stopped = [read_summary(tmp_path / "parts" / str(seed)) for seed in (1, 2)]
@@ -230,7 +241,7 @@ def test_runs_go_on_where_they_stopped_whoever_had_begun_them(first: str, tmp_pa
     assert 0 < stopped[0]["env_steps"] < 600
     files_of(config, [1, 2], tmp_path / "parts", Stop(), together=not one)
     for seed in (1, 2):
-        assert_same_files(tmp_path / "whole" / str(seed), tmp_path / "parts" / str(seed), resumed=True)
+        assert_same_files(whole / str(seed), tmp_path / "parts" / str(seed), resumed=True)
 
 
 LONG = {"total_steps": 600, "checkpoint_every": 130}

@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from samples import until
 
 from coop.common.messaging.keys import evaluations_key, join_key, replay_key
 from coop.common.messaging.members import ROUTE
-from coop.common.messaging.messages.control import EndOfRun, Join, Leave, Limit, Snapshot
+from coop.common.messaging.messages.control import EndOfRun, Join, Leave, Limit, Limits, LimitsQuestion, Snapshot
 from coop.common.messaging.messages.evaluate import Evaluated, EvaluationRow
 from coop.common.messaging.messages.sample import encode_request
 from coop.common.messaging.messages.status import ActorStatus, ReplayStats, StatsQuestion
@@ -30,6 +31,18 @@ MAKE_KEYS = Path(__file__).parents[1] / "deploy" / "zenoh" / "make_keys.sh"
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="the script that makes keys needs openssl")
 RUN = "trusted"
 CA_LINE = re.compile(r'root_ca_certificate_base64: ".*"')
+SLOW = """
+import time
+import gymnasium
+from gymnasium.envs.classic_control import CartPoleEnv
+
+class Slow(CartPoleEnv):
+    def step(self, action):
+        time.sleep(0.004)
+        return super().step(action)
+
+gymnasium.register("Slow-v0", entry_point=Slow, max_episode_steps=200)
+"""
 
 
 def make_keys(folder: Path) -> Path:
@@ -69,21 +82,27 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(keys: Path) -> Iterator[tuple[str, str]]:
-    """Endpoints of learner and replay service of a run that goes on before and after each test, and ends well."""
+def run(keys: Path, quick_children: None) -> Iterator[tuple[str, str]]:
+    """Endpoints of learner and replay service of a run that goes on before and after each test, and ends well.
+
+    It is slow, as it lasts as long as the tests do.
+    """
     learner_at, replay_at = (free_endpoint("tls/127.0.0.1:0") for _ in range(2))
     folder = keys.parent / "run"
     joining = (f"--run={RUN}", "--connect", learner_at)
     files = f"--run-dir={folder}"
+    (keys.parent / "slow_envs.py").write_text(SLOW)
+    long = ("--total-steps=10000000", "--env.id=slow_envs:Slow-v0")
     commands = {
-        "learner": command("coop-learner", f"--run={RUN}", files, "--listen", learner_at, "--total-steps=10000000"),
+        "learner": command("coop-learner", f"--run={RUN}", files, "--listen", learner_at, *long),
         "replay": command("coop-replay", *joining, files, "--listen", replay_at),
-        "actor": command("coop-actor", *joining),
+        "actor": command("coop-actor", *joining, "--allow-import=slow_envs"),
     }
     with ExitStack() as stack:
         roles = []
         for name, line in commands.items():
-            role = ChildProcess(name, [*line, f"--zenoh-config={keys / name}.json5"], keys.parent / f"{name}.log")
+            line += [f"--zenoh-config={keys / name}.json5"]
+            role = ChildProcess(name, line, keys.parent / f"{name}.log", directory=keys.parent)
             role.start()
             stack.callback(role.end, 0.0)
             roles.append(role)
@@ -177,12 +196,30 @@ def test_an_evaluator_s_certificate_reads_weights_and_reports(run: tuple[str, st
                 node.ask(key, payload)
 
 
-def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys: Path) -> None:
-    """Not even as a Zenoh client, whose messages the learner would forward to the other actors."""
-    config = zenoh.Config.from_file(str(keys / "actor.json5"))
+@contextmanager
+def client(at: str, config_file: Path) -> Iterator[zenoh.Session]:
+    """A Zenoh client: others forward what it tells, and it asks whoever may answer."""
+    config = zenoh.Config.from_file(str(config_file))
     config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps(run[:1]))
-    with joined(run, keys / "actor.json5") as actor, zenoh.open(config) as forger:
+    config.insert_json5("connect/endpoints", json.dumps([at]))
+    with zenoh.open(config) as session:
+        yield session
+
+
+@pytest.mark.parametrize("role", ["actor", "evaluator"])
+def test_an_actor_s_or_evaluator_s_certificate_can_t_set_limits(role: str, run: tuple[str, str], keys: Path) -> None:
+    with joined(run, keys / "replay.json5", "watch") as inside, client(run[1], keys / f"{role}.json5") as forger:
+        key, question = replay_key(inside, "limits"), LimitsQuestion().encode(RUN)
+        before = Limits.decode(inside.ask(key, question))
+        heard = list(forger.get(replay_key(inside, "insert"), payload=b"junk", timeout=1.0))
+        assert bool(heard) == (role == "actor")
+        assert list(forger.get(key, payload=bytes(Limit(0.5, 32.0).encode(RUN)), timeout=1.0)) == []
+        after = Limits.decode(inside.ask(key, question))
+        assert (after.ratio, after.tolerance) == (before.ratio, before.tolerance)
+
+
+def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys: Path) -> None:
+    with joined(run, keys / "actor.json5") as actor, client(run[0], keys / "actor.json5") as forger:
         key = actor.key("weights", "1")
         received = actor.session.declare_subscriber(key, zenoh.handlers.FifoChannel(10_000))
         time.sleep(0.5)
@@ -196,20 +233,18 @@ def test_an_actor_s_certificate_can_t_publish_weights(run: tuple[str, str], keys
         assert b"forged" not in payloads
 
 
-IDLE = 500
-
-
 HELLO = bytes.fromhex("16030100cd010000c90303") + bytes(40)  # the beginning of a ClientHello of 210 bytes
+WORDS = (b"", HELLO[:1], HELLO[:11], HELLO)
 
 
 @contextmanager
-def idle(at: str, count: int = IDLE, words: bytes = b"") -> Iterator[list[socket.socket]]:
-    """Connections that say nothing, or no more than some words."""
+def idle(at: str, count: int, *words: bytes) -> Iterator[list[socket.socket]]:
+    """Connections that say nothing, or no more than one of some words in turn."""
     place = "127.0.0.1", int(at.rpartition(":")[2])
     with ExitStack() as stack:
         silent = [stack.enter_context(socket.create_connection(place)) for _ in range(count)]
-        for each in silent:
-            each.sendall(words)
+        for each, said in zip(silent, cycle(words)):
+            each.sendall(said)
         yield silent
 
 
@@ -224,13 +259,12 @@ def seconds_to_join(run: tuple[str, str], config: Path | None) -> float:
         return time.monotonic() - began
 
 
-@pytest.mark.parametrize("words", [b"", HELLO[:1], HELLO[:11], HELLO])
-def test_idle_connections_keep_nobody_out(words: bytes, run: tuple[str, str], keys: Path) -> None:
+def test_idle_connections_keep_nobody_out(run: tuple[str, str], keys: Path) -> None:
     """Neither while they are there, nor when their handshakes have taken too long, nor when they go."""
     with joined(run, keys / "replay.json5", "watch") as inside:
         with ExitStack() as stack:
             for at in run:
-                stack.enter_context(idle(at, words=words))
+                stack.enter_context(idle(at, 500, *WORDS))
             assert seconds_to_join(run, keys / "actor.json5") < 5
             time.sleep(11)  # Zenoh gives a handshake 10 s
             assert seconds_to_join(run, keys / "actor.json5") < 5
@@ -239,13 +273,24 @@ def test_idle_connections_keep_nobody_out(words: bytes, run: tuple[str, str], ke
         wait_for_more(inside)
 
 
+def test_strangers_who_begin_to_speak_keep_nobody_out_and_are_sent_away() -> None:
+    at = free_endpoint("tcp/127.0.0.1:0")
+    with Node(open_session((at,)), RUN, "learner", new_incarnation()), idle(at, 300, b"\x00") as strangers:
+        time.sleep(0.5)
+        with joined((at, at), None) as actor:
+            until(lambda: actor.presence.members("learner"), 4.0)
+        strangers[0].settimeout(20.0)
+        with suppress(ConnectionResetError):
+            assert strangers[0].recv(1) == b""
+
+
 @pytest.mark.parametrize("protocol", ["tls", "tcp"])
 def test_a_listener_hears_only_of_those_who_speak(protocol: str, keys: Path) -> None:
     at = free_endpoint(f"{protocol}/127.0.0.1:0")
     configs = (keys / "learner.json5", keys / "actor.json5") if protocol == "tls" else (None, None)
     with Node(open_session((at,), (), configs[0]), RUN, "learner", new_incarnation()) as learner:
         before = len(list(Path("/proc/self/fd").iterdir()))
-        with idle(at, 100) as silent:
+        with idle(at, 100, b"") as silent:
             time.sleep(0.2)
             assert len(list(Path("/proc/self/fd").iterdir())) - before == 100, "these ends of the connections alone"
             with joined((at, at), configs[1]) as actor:

@@ -1,9 +1,6 @@
 """Searches by Optuna over real runs, and the tables of all runs of a folder."""
 
-import os
 import runpy
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -11,6 +8,7 @@ from typing import Any
 
 import optuna
 import pytest
+from commands import Command
 
 import coop
 from coop.studies.report.packing import pack
@@ -177,16 +175,13 @@ def test_a_pruned_trial_s_run_is_stopped(tmp_path: Path) -> None:
 
 def test_a_search_that_was_killed_goes_on(tmp_path: Path) -> None:
     grid = {"fixed": {**FIXED, "total_steps": 2_000, "checkpoint_every": 100}, "vary": RATES}
-    script = f"import coop; coop.tune({grid!r}, {str(tmp_path)!r}, trials=1, workers=1)"
-    first = subprocess.Popen([sys.executable, "-c", script])
+    script = tmp_path / "search.py"
+    script.write_text(f"import coop; coop.tune({grid!r}, {str(tmp_path)!r}, trials=1, workers=1)")
     record = tmp_path / "trial-0000" / "metrics.jsonl"
-    try:
+    with Command(script) as first:  # which is killed at its end
         while not (record.exists() and record.stat().st_size):
-            assert first.poll() is None
+            assert first.returncode is None
             time.sleep(0.1)
-    finally:
-        os.kill(first.pid, signal.SIGKILL)
-        first.wait()
     while coop.load(tmp_path / "trial-0000").summary is None:  # its run saves its state and ends
         time.sleep(0.1)
     study = coop.tune(grid, tmp_path, trials=1, workers=1)
