@@ -1,6 +1,7 @@
 """Searches by Optuna over real runs, and the tables of all runs of a folder."""
 
 import runpy
+import subprocess
 import sys
 import time
 from pathlib import Path
