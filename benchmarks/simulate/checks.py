@@ -21,7 +21,7 @@ from coop.records.checkpoints import DONE, Damaged, check_part, checkpoint_numbe
 from coop.records.learner_checkpoints import load_learner
 from coop.records.run_ids import read_run_id
 from coop.replay.core import ReplayCore, Reply
-from coop.replay.persistence.checkpoints import part_path
+from coop.replay.persistence.checkpoints import part_path, settle_parts
 from coop.replay.persistence.storage import load_snapshot
 
 if TYPE_CHECKING:
@@ -331,6 +331,7 @@ class Checks:
             state = load_learner(path / "checkpoints" / str(newest))
             self.hold("checkpoint", state["agent"]["updates"] == newest, f"{newest} holds another number of updates")
         for folder in self._folders():
+            self._settle(folder)
             with suppress(Damaged):
                 if sealed != self._sealed:
                     self._restore(folder, newest)
@@ -339,6 +340,18 @@ class Checks:
                 self._sealed = sealed
                 return
         self.broken(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
+
+    def _settle(self, folder: Path) -> None:
+        """What the next replay service does first: a kill while one part replaces another leaves both, unnamed."""
+        world = self.cluster.world
+        holders = [each for each in world.processes if each.alive and each.state.get("folder") == folder]
+        if holders:
+            return
+        running, world.running = world.running, None  # no call of a process that its faults count
+        try:
+            settle_parts(folder)
+        finally:
+            world.running = running
 
     def _restore(self, folder: Path, number: int) -> None:
         core, path = ReplayCore(self.cluster.config, SPEC), part_path(folder, number)

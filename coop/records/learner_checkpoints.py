@@ -5,17 +5,28 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import torch
+from msgspec.structs import replace
 
 from coop.common.errors import CoopError, UsageError
 from coop.common.process.files import FileDigest, write_atomic
 from coop.common.process.output import warn
 from coop.common.process.untrusted import check_torch_file
-from coop.records.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
+from coop.records.checkpoints import (
+    LEARNER,
+    Damaged,
+    Manifest,
+    begin,
+    check_part,
+    checkpoint_path,
+    finish,
+    remove,
+    remove_old,
+)
 from coop.records.resumption import Whole, survey
 
 
@@ -29,15 +40,21 @@ def saving_checkpoint(
     records: Mapping[str, FileDigest],
     fallbacks: Sequence[str] = (),
     settings: str = "",
+    keep: bool = False,
 ) -> Iterator[Path]:
     """Save the learner's part, and seal the checkpoint once the body has made the replay service save its part.
 
     Deletes checkpoints that are too old. records, fallbacks, settings: see `Manifest`.
+    keep: a whole one with this number stays as it is until it is sealed anew: it holds the same agent.
 
     Raises:
-        OSError: the run directory cannot be written; nothing is left of this checkpoint.
+        OSError: the run directory cannot be written; nothing is left of this checkpoint, unless it was kept.
     """
     path = checkpoint_path(run_dir, number)
+    if keep and (whole := _whole(path, number, run_id)) is not None:
+        yield path
+        finish(run_dir, path, replace(whole, records=dict(records), fallbacks=list(fallbacks), settings=settings))
+        return
     try:
         begin(path)
         content = io.BytesIO()
@@ -50,6 +67,12 @@ def saving_checkpoint(
         remove(path)
         raise
     remove_old(run_dir, number)
+
+
+def _whole(path: Path, number: int, run_id: int) -> Manifest | None:
+    with suppress(Damaged):
+        return check_part(path, number, run_id)
+    return None
 
 
 def newest_checkpoint(run_dir: Path, settings: str = "", *, replay: bool = False) -> Whole | None:
