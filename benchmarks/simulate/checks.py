@@ -341,6 +341,14 @@ class Checks:
                 return
         self.broken(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
 
+    def place_of_part(self) -> str:
+        """The machine that holds the replay service's part of the newest checkpoint; empty if none does."""
+        newest = checkpoint_numbers(self.cluster.root / "learner" / "run", DONE)[-1:]
+        places = [
+            folder.parent.name for folder in self._folders() for each in newest if part_path(folder, each).exists()
+        ]
+        return places[0] if places else ""
+
     def _settle(self, folder: Path) -> None:
         """What the next replay service does first: a kill while one part replaces another leaves both, unnamed."""
         world = self.cluster.world
