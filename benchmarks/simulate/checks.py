@@ -67,6 +67,7 @@ class Checks:
         self._sealed: object = None  # the checkpoint that was looked at last
         self._bases: dict[int, int] = {}
         self._learner, self._counted = -1, 0
+        self._counting: object = None  # the core that draws for it
         self._last_ack = self._last_save = -1.0
         self._flats: dict[tuple[int, int], set[bytes]] = defaultdict(set)
         self._roles: list[tuple[float, int, tuple[int, int]]] = []  # when, who acts, and versions
@@ -191,15 +192,21 @@ class Checks:
     # ------------------------------------------------------------------------------------------------------------------
     # Draws and updates
 
-    def asked(self, request: DrawRequest) -> None:
-        """A learner asks: it will not ask for batches below its base again."""
+    def asked(self, core: ReplayCore, request: DrawRequest) -> None:
+        """A learner asks: it will not ask for batches below its base again.
+
+        The ratio is promised for what each core draws and the learner counts. What an earlier core had drawn, but is
+        lost with it, is no update: the learner asks for it again.
+        """
+        if request.incarnation != self._learner or core is not self._counting:
+            follows = core._learners[-1:] == [request.incarnation]
+            self._learner, self._counting = request.incarnation, core
+            self._counted = max(request.base, core.drawn if follows else 0)
         self._bases[request.incarnation] = max(self._bases.get(request.incarnation, 0), request.base)
 
     def drawn(self, core: Any, request: DrawRequest, reply: Reply, known: bool) -> None:  # noqa: ANN401
         """A batch has been drawn, or drawn again."""
         plan = self.cluster.plan
-        if request.incarnation != self._learner:
-            self._learner, self._counted = request.incarnation, request.base
         self._counted = max(self._counted, request.base, request.sequence + 1)
         ids = tuple(reply.batch.columns["ids"].tolist())
         key = request.incarnation, request.sequence
@@ -216,8 +223,9 @@ class Checks:
             self.hold("ratio", ahead >= -slack - 1e-9, f"draws are {-ahead:.1f} steps ahead")
 
     def counted(self, core: ReplayCore) -> int:
-        """Draws as the present learner counts them; as the core does before its first one."""
-        return self._counted if self._learner in core._learners[-1:] else core.drawn
+        """Draws as the present learner counts them; as the core does before the learner has asked it."""
+        # A core that was killed while it recorded a draw never answered it; the next one finds it in the journal.
+        return self._counted if core is self._counting and self._learner in core._learners[-1:] else core.drawn
 
     def inserted(self, before: int, ahead: float) -> None:
         """A segment has come in; before: transitions until then. ahead: steps by which acting was ahead then."""
