@@ -22,6 +22,7 @@ from coop.records.learner_checkpoints import load_learner
 from coop.records.run_ids import read_run_id
 from coop.replay.core import ReplayCore, Reply
 from coop.replay.persistence.checkpoints import part_path, settle_parts
+from coop.replay.persistence.journal import Journal
 from coop.replay.persistence.storage import load_snapshot
 
 if TYPE_CHECKING:
@@ -148,6 +149,7 @@ class Checks:
         folder = process.state["folder"]
         if self._folder not in (None, folder):
             self._forgive = True
+        unrecorded = self._core is not None and _lacks_draws(self._core)
         self._folder, self._core = folder, core
         for who, when in list(self.acked.items()):
             if not core._seen.seen(who[0], 0, who[1]):
@@ -157,7 +159,7 @@ class Checks:
                     continue
                 text = f"segment {who[1]} of actor {who[0]:x}, acknowledged at {when} s, is not in the restored table"
                 self.broken(f"acknowledged: {text}")
-        if self._forgive or self.cluster.met["bad flush"]:
+        if self._forgive or unrecorded:
             self._draws.clear()
         self._forgive = False
         self.look_at(core)
@@ -426,6 +428,16 @@ class Checks:
                 f"holds {core.table.inserted}, has drawn {core.drawn}: {core.inserts_wait_for}; {core.samples_wait_for}"
             )
         return "lives"
+
+
+def _lacks_draws(core: ReplayCore) -> bool:
+    """Whether draws that a core has answered are not in its journal: the disk was full, or failed a flush.
+
+    Inserts wait then; draws do not. Nothing is promised for them: if the process ends, the learner, which asks for
+    those that it has not received, gets others.
+    """
+    journal = core.recorder
+    return isinstance(journal, Journal) and (journal._failed is not None or bool(journal._late))
 
 
 @lru_cache(64)
