@@ -19,9 +19,9 @@ from coop.common.errors import RunError
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.transitions import DrawRequest
 from coop.common.types import EnvSpec, EpisodeRecord
-from coop.records.checkpoints import DONE, check_part, checkpoint_numbers
+from coop.records.checkpoints import DONE, RECORDS, check_part, checkpoint_numbers
 from coop.records.learner_checkpoints import load_learner, newest_checkpoint, saving_checkpoint
-from coop.records.resumption import go_back, survey
+from coop.records.resumption import Start, go_back, survey
 from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.episodes import MOST, EpisodeLog
 from coop.replay.persistence.checkpoints import ReplayCheckpoints, part_path, settle_parts
@@ -328,3 +328,26 @@ def test_a_checkpoint_that_is_saved_again_is_whole_meanwhile(tmp_path: Path) -> 
     with saving_checkpoint(tmp_path, 5, 100, {"flat": torch.ones(3)}, records={}, keep=True):
         pass
     assert load_learner(path)["flat"].tolist() == [1.0] * 3, "what is damaged is written"
+
+
+def test_a_checkpoint_that_is_replaced_is_whole_whenever_a_kill_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in RECORDS:
+        (tmp_path / name).touch()
+    save_learner(tmp_path, 100, {"kills": -1})
+    kills = 0
+    while True:
+        with monkeypatch.context() as patches:
+            _killed_after(kills, patches)
+            try:
+                save_learner(tmp_path, 100, {"kills": kills})
+            except Killed:
+                kills += 1
+            else:
+                break
+        found, _ = Start(resume=True).prepare(tmp_path, replay=False, load=load_learner)
+        assert found.newest is not None
+        assert found.newest.state["kills"] in range(-1, kills)
+    assert kills > 4
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["100"]

@@ -249,6 +249,14 @@ def settle(path: Path, number: int) -> None:
         remove(each)
 
 
+def settle_checkpoints(run_dir: Path) -> None:
+    """`settle` for all checkpoints of a run directory."""
+    with suppress(FileNotFoundError), os.scandir(run_dir / FOLDER) as entries:
+        names = {Path(entry.name).stem for entry in entries if Path(entry.name).suffix in (PART, OLD)}
+        for name in sorted(filter(_NUMBER.fullmatch, names)):
+            settle(run_dir / FOLDER / name, int(name))
+
+
 def _beside(path: Path, ending: str) -> Path:
     return path.with_name(path.name + ending)
 

@@ -18,11 +18,13 @@ from coop.common.process.output import warn
 from coop.common.process.untrusted import check_torch_file
 from coop.records.checkpoints import (
     LEARNER,
+    PART,
     Damaged,
     Manifest,
     begin,
     check_part,
     checkpoint_path,
+    exchange,
     finish,
     remove,
     remove_old,
@@ -45,16 +47,20 @@ def saving_checkpoint(
     """Save the learner's part, and seal the checkpoint once the body has made the replay service save its part.
 
     Deletes checkpoints that are too old. records, fallbacks, settings: see `Manifest`.
-    keep: a whole one with this number stays as it is until it is sealed anew: it holds the same agent.
+    keep: a whole one with this number, which holds the same agent, is only sealed anew; otherwise it is replaced once
+        the new one is whole.
 
     Raises:
-        OSError: the run directory cannot be written; nothing is left of this checkpoint, unless it was kept.
+        OSError: the run directory cannot be written; nothing is left of this checkpoint but a whole one of before.
     """
-    path = checkpoint_path(run_dir, number)
-    if keep and (whole := _whole(path, number, run_id)) is not None:
-        yield path
-        finish(run_dir, path, replace(whole, records=dict(records), fallbacks=list(fallbacks), settings=settings))
-        return
+    place = path = checkpoint_path(run_dir, number)
+    if (whole := _whole(path, number, run_id)) is not None:
+        if keep:
+            yield path
+            finish(run_dir, path, replace(whole, records=dict(records), fallbacks=list(fallbacks), settings=settings))
+            return
+        path = place.with_name(place.name + PART)
+        remove(path)
     try:
         begin(path)
         content = io.BytesIO()
@@ -63,6 +69,8 @@ def saving_checkpoint(
         yield path
         manifest = Manifest(run_id, number, files, dict(records), list(fallbacks), settings=settings)
         finish(run_dir, path, manifest)
+        if path != place:
+            exchange(path, place)
     except BaseException:
         remove(path)
         raise
