@@ -321,8 +321,8 @@ def test_a_checkpoint_that_is_saved_again_is_whole_meanwhile(tmp_path: Path) -> 
     with pytest.raises(RunError, match="no room"), saving:
         raise RunError(f"no room beside {check_part(path, 100, 5).number}")
     assert check_part(path, 100, 5).fallbacks == []
-    with saving_checkpoint(tmp_path, 5, 100, {}, records={}, fallbacks=fallbacks, keep=True) as folder:
-        (folder / "replay").mkdir()
+    with saving_checkpoint(tmp_path, 5, 100, {}, records={}, fallbacks=fallbacks, keep=True):
+        (path / "replay").mkdir()
     assert check_part(path, 100, 5).fallbacks == fallbacks
     assert (path / "replay").exists(), "where the replay service has written its part meanwhile"
     (path / "learner.pt").write_bytes(b"half")
