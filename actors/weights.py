@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from coop.common.messaging.transport import NoAnswer, Node
 from coop.common.messaging.wire import Message
 from coop.common.networks.acting import acting_network
 
+T = TypeVar("T")
 UNKNOWN = -1  # a version: no weights, or no role, received yet
 
 
@@ -63,10 +65,8 @@ class WeightsFollower:
     def refreshing(self) -> Conversation[None]:
         """See `refresh`."""
         for follower in self._weights:
-            if (message := follower.poll()) is not None:
-                self._load(message)
-        if (message := self._role.poll()) is not None:
-            self._follow(message)
+            self._load(follower.poll())
+        self._follow(self._role.poll())
         if not self.ready:
             yield from self.fetching()
         elif self._held[self._policy.acting] >= self._told[self._policy.acting]:
@@ -86,31 +86,42 @@ class WeightsFollower:
         """See `fetch`."""
         question = Current().encode(self._node.run)
         try:
-            for key in self._keys:
-                self._load((yield from asking(self._node, key, question, ANSWER_TIMEOUT)))
-            self._follow((yield from asking(self._node, role_key(self._node), question, ANSWER_TIMEOUT)))
+            for key, follower in zip(self._keys, self._weights, strict=True):
+                answer = yield from asking(self._node, key, question, ANSWER_TIMEOUT)
+                self._load(answer, follower.poll())
+            answer = yield from asking(self._node, role_key(self._node), question, ANSWER_TIMEOUT)
+            self._follow(answer, self._role.poll())
         except NoAnswer:
             return False
         return True
 
-    def _load(self, message: Message) -> None:
-        try:
-            weights = Weights.decode(message, self._size)
-        except BadMessage as error:
-            self._node.count_bad(self._node.key("weights"), error)
-            return
-        self._policy.networks[weights.network - 1].load(weights.flat)
-        self._held[weights.network - 1] = weights.version
+    def _load(self, *messages: Message | None) -> None:
+        """Load the newest of weights that came in any order: an answer, and a broadcast meanwhile."""
+        found = self._read(messages, "weights", lambda message: Weights.decode(message, self._size))
+        if found:
+            weights = max(found, key=lambda each: each.version)
+            self._policy.networks[weights.network - 1].load(weights.flat)
+            self._held[weights.network - 1] = weights.version
 
-    def _follow(self, message: Message) -> None:
-        try:
-            role = Role.decode(message)
-        except BadMessage as error:
-            self._node.count_bad(self._node.key("role"), error)
-            return
-        self._told = list(role.versions)
-        self.progress = role.updates, role.env_step
-        self._policy.acting = role.acting - 1
+    def _follow(self, *messages: Message | None) -> None:
+        """Follow the newest of roles that came in any order."""
+        found = self._read(messages, "role", Role.decode)
+        if found:
+            role = max(found, key=lambda each: each.updates)
+            self._told = list(role.versions)
+            self.progress = role.updates, role.env_step
+            self._policy.acting = role.acting - 1
+
+    def _read(self, messages: Iterable[Message | None], name: str, decode: Callable[[Message], T]) -> list[T]:
+        """Those that can be read; the others are counted."""
+        found = []
+        for message in messages:
+            try:
+                if message is not None:
+                    found.append(decode(message))
+            except BadMessage as error:
+                self._node.count_bad(self._node.key(name), error)
+        return found
 
 
 def make_policy(

@@ -134,6 +134,7 @@ class Watch:
         self._folder = folder
         self._status = node.latest(node.key("metrics", "learner", "*"))
         self._newest: dict[str, Any] = {}
+        self._asked = 0  # how often the replay service was asked for its state
 
     def steps(self) -> int:
         """The replay service's count of transitions."""
@@ -159,7 +160,8 @@ class Watch:
     def everything(self) -> dict[str, bytes]:
         """The states of both roles, as bytes."""
         key = replay_key(self.node, "snapshot")
-        self.node.ask(key, Snapshot(CHECKPOINT, []).encode(RUN), 60.0)
+        self._asked += 1
+        self.node.ask(key, Snapshot(CHECKPOINT, [], 1, self._asked).encode(RUN), 60.0)
         while self.node.ask(key, Written(CHECKPOINT).encode(RUN), 60.0).kind == "retry":
             pass
         saved = self._folder / "checkpoints" / str(CHECKPOINT) / "replay"

@@ -96,7 +96,7 @@ class Service:
 
     def _save(self) -> None:
         self._checkpoint += 1
-        self._ask(Snapshot(self._checkpoint, []).encode(self._node.run))
+        self._ask(Snapshot(self._checkpoint, [], 1, self._checkpoint).encode(self._node.run))
         while self._ask(Written(self._checkpoint).encode(self._node.run)) == "retry":
             pass
 

@@ -88,7 +88,7 @@ def targets(node: Node, reply: JoinReply) -> list[Target]:
         (replay_key(node, "limits"), Limit(1.0, 64.0).encode(RUN), "replay", limiting),
         (replay_key(node, "limits"), LimitsQuestion().encode(RUN), "replay", limiting),
         (replay_key(node, "stats"), StatsQuestion().encode(RUN), "replay", StatsQuestion.decode),
-        (replay_key(node, "snapshot"), Snapshot(7, [3]).encode(RUN), "replay", snapshot),
+        (replay_key(node, "snapshot"), Snapshot(7, [3], 1, 0).encode(RUN), "replay", snapshot),
         (replay_key(node, "snapshot"), Written(7).encode(RUN), "replay", snapshot),
         *(
             (join_key(node, role), Join(role, 5, []).encode(RUN), "learner", partial(joining, role))

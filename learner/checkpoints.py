@@ -46,6 +46,7 @@ class Checkpoints:
         self._samples = samples
         self._shared = shared
         self._writer: Task | None = None
+        self._asked = 0
 
     def begin(self, state: Callable[[], dict[str, Any]]) -> bool:
         """Begin a checkpoint between two updates; do nothing and return False while the last one is being written."""
@@ -80,7 +81,9 @@ class Checkpoints:
         began, run_dir = self._node.now(), self._run_dir
         try:
             try:
-                snapshot = Snapshot(number, checkpoint_numbers(run_dir, DONE)[-KEPT:])
+                keep = checkpoint_numbers(run_dir, DONE)[-KEPT:]
+                snapshot = Snapshot(number, keep, self._node.incarnation, self._asked)
+                self._asked += 1
                 yield from self._asking(snapshot.encode(self._node.run))
             finally:
                 self._samples.release()
@@ -92,6 +95,7 @@ class Checkpoints:
                 records=records,
                 fallbacks=self._directory.fallbacks,
                 settings=self._directory.settings,
+                keep=True,  # the replay service's part alone may hold more than before
             ):
                 written = Written(number).encode(self._node.run)
                 while (yield from self._asking(written)).kind == Retry.kind:

@@ -287,7 +287,8 @@ class ReplayService:
         if message.kind == Snapshot.kind:
             request = Snapshot.decode(message)
             with self._changing():
-                self._checkpoints.begin(self._core, self._changed, request.number, request.keep)
+                asked = request.learner, request.asked
+                self._checkpoints.begin(self._core, self._changed, request.number, request.keep, asked)
             return Ack(self._core.table.inserted).encode(self._node.run)
         number, until = Written.decode(message).number, self._node.now() + HOLD
         while not self._checkpoints.written(number):

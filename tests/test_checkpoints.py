@@ -1,7 +1,11 @@
 """Checkpoints on disk: what is restored goes on alike, torn ones are passed over, old ones go."""
 
+import os
 import threading
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +19,13 @@ from coop.common.errors import RunError
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.transitions import DrawRequest
 from coop.common.types import EnvSpec, EpisodeRecord
-from coop.records.checkpoints import DONE, checkpoint_numbers
+from coop.records.checkpoints import DONE, RECORDS, check_part, checkpoint_numbers
 from coop.records.learner_checkpoints import load_learner, newest_checkpoint, saving_checkpoint
-from coop.records.resumption import go_back, survey
+from coop.records.resumption import Start, go_back, survey
 from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.episodes import MOST, EpisodeLog
-from coop.replay.persistence.checkpoints import ReplayCheckpoints
+from coop.replay.persistence.checkpoints import ReplayCheckpoints, part_path, settle_parts
+from coop.replay.persistence.storage import Mark, save_snapshot
 
 CONFIG = RunConfig(
     run="test",
@@ -41,8 +46,11 @@ def _used_core(spec: EnvSpec) -> ReplayCore:
     return core
 
 
+_asked = count()
+
+
 def save(core: ReplayCore, checkpoints: ReplayCheckpoints, number: int, *keep: int) -> None:
-    checkpoints.begin(core, threading.Condition(), number, list(keep))
+    checkpoints.begin(core, threading.Condition(), number, list(keep), (1, next(_asked)))
     until(lambda: checkpoints.written(number))
 
 
@@ -111,6 +119,66 @@ def test_torn_parts_are_passed_over_and_old_ones_go(spec: EnvSpec, tmp_path: Pat
         ReplayCheckpoints(tmp_path, 6).restore(ReplayCore(CONFIG, spec), 30)
 
 
+class Killed(BaseException):
+    """In place of a kill."""
+
+
+def _killed_after(calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the process die at the next call for a file, of those that move or remove one, after so many."""
+    left = count(calls, -1)
+
+    def call(real: Callable[..., None], *args: object) -> None:
+        if next(left) <= 0:
+            raise Killed
+        real(*args)
+
+    for name in ("rename", "replace", "unlink", "rmdir"):
+        monkeypatch.setattr(os, name, partial(call, getattr(os, name)))
+
+
+def test_a_part_that_is_written_anew_is_whole_whenever_a_kill_comes(
+    spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core = _used_core(spec)
+    save(core, ReplayCheckpoints(tmp_path, 5), 10)
+    inserted, kills = core.table.inserted, 0
+    while True:
+        core.insert(make_segment(spec, 100 + kills))
+        with monkeypatch.context() as patches:
+            _killed_after(kills, patches)
+            try:
+                save_snapshot(core.snapshot(10, [10]), threading.Condition(), part_path(tmp_path, 10), Mark(5, 10, 0))
+            except Killed:
+                kills += 1
+            else:
+                break
+        settle_parts(tmp_path)
+        found = ReplayCheckpoints(tmp_path, 5)
+        assert found.intact() == [10], f"after {kills - 1} calls"
+        twin = ReplayCore(CONFIG, spec)
+        found.restore(twin, 10)
+        assert inserted <= twin.table.inserted <= core.table.inserted
+    assert kills > 8
+    assert [path.name for path in part_path(tmp_path, 10).parent.iterdir()] == ["replay"]
+
+
+def test_a_late_copy_of_a_request_begins_no_checkpoint(spec: EnvSpec, tmp_path: Path) -> None:
+    core, checkpoints, lock = _used_core(spec), ReplayCheckpoints(tmp_path, 5), threading.Condition()
+    for number, keep in ((10, []), (20, [10])):
+        checkpoints.begin(core, lock, number, keep, (1, number))
+        until(partial(checkpoints.written, number))
+    there = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    core.insert(make_segment(spec, 20))
+    checkpoints.begin(core, lock, 20, [10], (1, 20))
+    assert checkpoints.written(20)
+    with pytest.raises(RunError, match="checkpoint 10 was asked for before checkpoint 20"):
+        checkpoints.begin(core, lock, 10, [], (1, 10))
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == there
+    checkpoints.begin(core, lock, 10, [], (2, 0))
+    until(partial(checkpoints.written, 10))
+    assert checkpoints.intact() == [10], "another learner is back before it"
+
+
 def test_a_writer_that_dies_of_anything_has_written_nothing(
     spec: EnvSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,7 +188,7 @@ def test_a_writer_that_dies_of_anything_has_written_nothing(
     checkpoints = ReplayCheckpoints(tmp_path, 5)
     monkeypatch.setattr("coop.replay.persistence.storage.write_manifest", fails)
     monkeypatch.setattr(threading, "excepthook", lambda args: None)
-    checkpoints.begin(_used_core(spec), threading.Condition(), 10, [])
+    checkpoints.begin(_used_core(spec), threading.Condition(), 10, [], (1, 0))
     with pytest.raises(RunError, match="10/replay: OverflowError"):
         until(lambda: checkpoints.written(10))
 
@@ -244,3 +312,43 @@ def test_learner_checkpoints(tmp_path: Path) -> None:
     assert finished(tmp_path) == [200]
     assert not (tmp_path / "checkpoints" / "500").exists()
     assert newest_checkpoint(tmp_path) is not None
+
+
+def test_a_checkpoint_that_is_saved_again_is_whole_meanwhile(tmp_path: Path) -> None:
+    save_learner(tmp_path, 100, {"flat": torch.zeros(3)})
+    path, fallbacks = tmp_path / "checkpoints" / "100", ["checkpoint 110: DONE is missing"]
+    saving = saving_checkpoint(tmp_path, 5, 100, {}, records={}, fallbacks=fallbacks, keep=True)
+    with pytest.raises(RunError, match="no room"), saving:
+        raise RunError(f"no room beside {check_part(path, 100, 5).number}")
+    assert check_part(path, 100, 5).fallbacks == []
+    with saving_checkpoint(tmp_path, 5, 100, {}, records={}, fallbacks=fallbacks, keep=True):
+        (path / "replay").mkdir()
+    assert check_part(path, 100, 5).fallbacks == fallbacks
+    assert (path / "replay").exists(), "where the replay service has written its part meanwhile"
+    (path / "learner.pt").write_bytes(b"half")
+    with saving_checkpoint(tmp_path, 5, 100, {"flat": torch.ones(3)}, records={}, keep=True):
+        pass
+    assert load_learner(path)["flat"].tolist() == [1.0] * 3, "what is damaged is written"
+
+
+def test_a_checkpoint_that_is_replaced_is_whole_whenever_a_kill_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in RECORDS:
+        (tmp_path / name).touch()
+    save_learner(tmp_path, 100, {"kills": -1})
+    kills = 0
+    while True:
+        with monkeypatch.context() as patches:
+            _killed_after(kills, patches)
+            try:
+                save_learner(tmp_path, 100, {"kills": kills})
+            except Killed:
+                kills += 1
+            else:
+                break
+        found, _ = Start(resume=True).prepare(tmp_path, replay=False, load=load_learner)
+        assert found.newest is not None
+        assert found.newest.state["kills"] in range(-1, kills)
+    assert kills > 4
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["100"]

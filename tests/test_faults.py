@@ -79,7 +79,7 @@ def test_a_table_that_may_be_half_changed_is_not_used_any_more(
         raise ZeroDivisionError("half way")
 
     monkeypatch.setattr(core.table, question, fail)
-    payload = second if question == "insert" else Snapshot(1, []).encode("test")
+    payload = second if question == "insert" else Snapshot(1, [], 1, 0).encode("test")
     with pytest.raises(Refused, match="half way"):
         client.ask(replay_key(client, question), payload)
     until(stop.is_set)
@@ -89,7 +89,7 @@ def test_a_table_that_may_be_half_changed_is_not_used_any_more(
     monkeypatch.undo()
     assert "half changed" in Retry.decode(client.ask(replay_key(client, "insert"), second)).reason
     with pytest.raises(Refused, match="half changed"):
-        client.ask(replay_key(client, "snapshot"), Snapshot(2, []).encode("test"))
+        client.ask(replay_key(client, "snapshot"), Snapshot(2, [], 1, 1).encode("test"))
     stats = ReplayStats.decode(client.ask(replay_key(client, "stats"), StatsQuestion().encode("test")))
     assert (stats.faults, stats.inserted) == (1, 4)
 

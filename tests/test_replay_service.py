@@ -121,7 +121,7 @@ def test_snapshot_on_disk(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Pat
     _serve(server, core, tmp_path, client)
     client.ask(replay_key(client, "insert"), encode_segment("test", make_segment(spec)))
     key = replay_key(client, "snapshot")
-    client.ask(key, Snapshot(12, []).encode("test"))
+    client.ask(key, Snapshot(12, [], 1, 0).encode("test"))
     while client.ask(key, Written(12).encode("test")).kind == "retry":
         pass
     folder = tmp_path / "checkpoints" / "12" / "replay"

@@ -154,7 +154,7 @@ def test_an_actor_s_certificate_inserts_and_reads_weights_only(run: tuple[str, s
             (replay_key(actor, "sample"), encode_request(RUN, DrawRequest(1, 0, 0, 32, 0))),
             (replay_key(actor, "stats"), StatsQuestion().encode(RUN)),
             (replay_key(actor, "limits"), Limit(1.0, 64.0).encode(RUN)),
-            (replay_key(actor, "snapshot"), Snapshot(1, []).encode(RUN)),
+            (replay_key(actor, "snapshot"), Snapshot(1, [], 1, 0).encode(RUN)),
             (join_key(actor, "replay"), Join("replay", 1, ["tls/127.0.0.1:9"]).encode(RUN)),
         ):
             with pytest.raises(NoAnswer):

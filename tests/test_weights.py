@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import zenoh
 from msgspec.structs import replace as changed
-from samples import await_service
+from samples import await_service, until
 
 from coop.actors.policy import EpsilonGreedy
 from coop.actors.weights import WeightsFollower, make_policy
@@ -18,6 +18,7 @@ from coop.common.messaging.messages.control import JoinReply
 from coop.common.messaging.messages.weights import Role, Weights
 from coop.common.messaging.timing import GRACE
 from coop.common.messaging.transport import Node
+from coop.common.messaging.wire import Message
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.settings.config import NetworkSettings, RunConfig
 from coop.common.types import EnvSpec
@@ -98,6 +99,31 @@ def test_a_broadcast_that_was_lost_is_asked_for(nodes: tuple[Node, Node], spec: 
     refresh_until(follower, 5)
     assert time.monotonic() - began >= GRACE
     assert_equal(policy, agent)
+
+
+def test_an_older_broadcast_that_comes_before_the_answer_is_not_followed_after_it(
+    nodes: tuple[Node, Node], spec: EnvSpec
+) -> None:
+    learner, actor = nodes
+    agent, key = Agent(CONFIG, spec), role_key(learner)
+    policy = own_policy(spec)
+    follower, heard = WeightsFollower(actor, policy), actor.latest(key)
+
+    def answer(message: Message) -> bytearray:
+        learner.publish(key, Role(1, (0, 0), 14, 0).encode(learner.run))
+        until(lambda: heard.poll() is not None)
+        return Role(2, (0, 0), 15, 0).encode(learner.run)
+
+    for number, network in enumerate(agent.networks, 1):
+        weights = Weights(number, 0, network.snapshot()).encode(learner.run)
+        learner.serve(weights_key(learner, number), lambda message, weights=weights: weights)  # type: ignore[misc]
+    learner.serve(key, answer)
+    await_service(actor, key)
+    while not follower.ready:
+        follower.fetch()
+    assert (policy.acting, follower.progress) == (1, (15, 0))
+    follower.refresh()
+    assert (policy.acting, follower.progress) == (1, (15, 0))
 
 
 def test_broadcasts_that_take_long_hold_up_no_update(nodes: tuple[Node, Node], spec: EnvSpec) -> None:

@@ -21,7 +21,8 @@ from coop.records.checkpoints import DONE, Damaged, check_part, checkpoint_numbe
 from coop.records.learner_checkpoints import load_learner
 from coop.records.run_ids import read_run_id
 from coop.replay.core import ReplayCore, Reply
-from coop.replay.persistence.checkpoints import part_path
+from coop.replay.persistence.checkpoints import part_path, settle_parts
+from coop.replay.persistence.journal import Journal
 from coop.replay.persistence.storage import load_snapshot
 
 if TYPE_CHECKING:
@@ -66,7 +67,9 @@ class Checks:
         self._evaluations: set[float] = set()
         self._sealed: object = None  # the checkpoint that was looked at last
         self._bases: dict[int, int] = {}
+        self._inserted = 0  # transitions, at most, of which a learner has heard
         self._learner, self._counted = -1, 0
+        self._counting: object = None  # the core that draws for it
         self._last_ack = self._last_save = -1.0
         self._flats: dict[tuple[int, int], set[bytes]] = defaultdict(set)
         self._roles: list[tuple[float, int, tuple[int, int]]] = []  # when, who acts, and versions
@@ -146,6 +149,7 @@ class Checks:
         folder = process.state["folder"]
         if self._folder not in (None, folder):
             self._forgive = True
+        unrecorded = self._core is not None and _lacks_draws(self._core)
         self._folder, self._core = folder, core
         for who, when in list(self.acked.items()):
             if not core._seen.seen(who[0], 0, who[1]):
@@ -155,7 +159,7 @@ class Checks:
                     continue
                 text = f"segment {who[1]} of actor {who[0]:x}, acknowledged at {when} s, is not in the restored table"
                 self.broken(f"acknowledged: {text}")
-        if self._forgive or self.cluster.met["bad flush"]:
+        if self._forgive or unrecorded:
             self._draws.clear()
         self._forgive = False
         self.look_at(core)
@@ -191,15 +195,21 @@ class Checks:
     # ------------------------------------------------------------------------------------------------------------------
     # Draws and updates
 
-    def asked(self, request: DrawRequest) -> None:
-        """A learner asks: it will not ask for batches below its base again."""
+    def asked(self, core: ReplayCore, request: DrawRequest) -> None:
+        """A learner asks: it will not ask for batches below its base again.
+
+        The ratio is promised for what each core draws and the learner counts. What an earlier core had drawn, but is
+        lost with it, is no update: the learner asks for it again.
+        """
+        if request.incarnation != self._learner or core is not self._counting:
+            follows = core._learners[-1:] == [request.incarnation]
+            self._learner, self._counting = request.incarnation, core
+            self._counted = max(request.base, core.drawn if follows else 0)
         self._bases[request.incarnation] = max(self._bases.get(request.incarnation, 0), request.base)
 
     def drawn(self, core: Any, request: DrawRequest, reply: Reply, known: bool) -> None:  # noqa: ANN401
         """A batch has been drawn, or drawn again."""
         plan = self.cluster.plan
-        if request.incarnation != self._learner:
-            self._learner, self._counted = request.incarnation, request.base
         self._counted = max(self._counted, request.base, request.sequence + 1)
         ids = tuple(reply.batch.columns["ids"].tolist())
         key = request.incarnation, request.sequence
@@ -216,8 +226,9 @@ class Checks:
             self.hold("ratio", ahead >= -slack - 1e-9, f"draws are {-ahead:.1f} steps ahead")
 
     def counted(self, core: ReplayCore) -> int:
-        """Draws as the present learner counts them; as the core does before its first one."""
-        return self._counted if self._learner in core._learners[-1:] else core.drawn
+        """Draws as the present learner counts them; as the core does before the learner has asked it."""
+        # A core that was killed while it recorded a draw never answered it; the next one finds it in the journal.
+        return self._counted if core is self._counting and self._learner in core._learners[-1:] else core.drawn
 
     def inserted(self, before: int, ahead: float) -> None:
         """A segment has come in; before: transitions until then. ahead: steps by which acting was ahead then."""
@@ -233,6 +244,7 @@ class Checks:
     def trains(self, incarnation: int, agent: Any, batch: Batch, drawn: Drawn) -> None:  # noqa: ANN401
         """A learner is about to train with a batch."""
         number = agent.updates
+        self._inserted = max(self._inserted, drawn.inserted)
         self.hold("order", drawn.sequence == number, f"batch {drawn.sequence} in update {number}")
         expected = self._draws.get((incarnation, number))
         same = expected is None or expected == tuple(batch.ids.tolist())
@@ -267,8 +279,9 @@ class Checks:
         self.hold("evaluation", row.seconds not in self._evaluations, "recorded twice by one learner")
         self._evaluations.add(row.seconds)
         assert self._trainer is not None
-        known = row.env_step <= self._trainer.drawn.inserted or self.forgiven > 0
-        self.hold("evaluation", known, f"after {row.env_step} steps")
+        # The learner's count may be lower by now than it was: what nobody has acknowledged may be lost.
+        self._inserted = max(self._inserted, self._trainer.drawn.inserted)
+        self.hold("evaluation", row.env_step <= self._inserted, f"after {row.env_step} steps")
 
     def learner_begins(self, process: Process) -> None:
         """A learner's process has begun."""
@@ -331,6 +344,7 @@ class Checks:
             state = load_learner(path / "checkpoints" / str(newest))
             self.hold("checkpoint", state["agent"]["updates"] == newest, f"{newest} holds another number of updates")
         for folder in self._folders():
+            self._settle(folder)
             with suppress(Damaged):
                 if sealed != self._sealed:
                     self._restore(folder, newest)
@@ -339,6 +353,26 @@ class Checks:
                 self._sealed = sealed
                 return
         self.broken(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
+
+    def place_of_part(self) -> str:
+        """The machine that holds the replay service's part of the newest checkpoint; empty if none does."""
+        newest = checkpoint_numbers(self.cluster.root / "learner" / "run", DONE)[-1:]
+        places = [
+            folder.parent.name for folder in self._folders() for each in newest if part_path(folder, each).exists()
+        ]
+        return places[0] if places else ""
+
+    def _settle(self, folder: Path) -> None:
+        """What the next replay service does first: a kill while one part replaces another leaves both, unnamed."""
+        world = self.cluster.world
+        holders = [each for each in world.processes if each.alive and each.state.get("folder") == folder]
+        if holders:
+            return
+        running, world.running = world.running, None  # no call of a process that its faults count
+        try:
+            settle_parts(folder)
+        finally:
+            world.running = running
 
     def _restore(self, folder: Path, number: int) -> None:
         core, path = ReplayCore(self.cluster.config, SPEC), part_path(folder, number)
@@ -394,6 +428,16 @@ class Checks:
                 f"holds {core.table.inserted}, has drawn {core.drawn}: {core.inserts_wait_for}; {core.samples_wait_for}"
             )
         return "lives"
+
+
+def _lacks_draws(core: ReplayCore) -> bool:
+    """Whether draws that a core has answered are not in its journal: the disk was full, or failed a flush.
+
+    Inserts wait then; draws do not. Nothing is promised for them: if the process ends, the learner, which asks for
+    those that it has not received, gets others.
+    """
+    journal = core.recorder
+    return isinstance(journal, Journal) and (journal._failed is not None or bool(journal._late))
 
 
 @lru_cache(64)

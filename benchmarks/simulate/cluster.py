@@ -159,7 +159,11 @@ class Cluster:
         self.disk.deadly.pop(name, None)
         self.checks.ended(process, reason)
         if not self.complete and not name.startswith("replay second"):
-            self.world.after(self.world.random.uniform(0.25, 2.0), partial(self.begin, name))
+            # A run goes on from the newest checkpoint that both hold. If its part is elsewhere, the service here is
+            # refused by a line that names what is missing, and whoever runs it starts one there.
+            refused = "no checkpoint to resume from" in reason and name == "replay"
+            place = self.checks.place_of_part() if refused else ""
+            self.world.after(self.world.random.uniform(0.25, 2.0), partial(self.begin, name, place))
 
     # ------------------------------------------------------------------------------------------------------------------
 

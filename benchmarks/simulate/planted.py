@@ -9,7 +9,6 @@ from unittest.mock import patch
 
 from coop.actors.weights import WeightsFollower
 from coop.common.messaging.insert_client import InsertClient
-from coop.common.messaging.messages.weights import Role
 from coop.common.messaging.sample_client import SampleClient
 from coop.common.messaging.wire import Message
 from coop.learner.checkpoints import Checkpoints
@@ -69,11 +68,14 @@ def _short_window() -> Patches:
 
 
 def _ignored_swap() -> Patches:
-    def follow(self: Any, message: Any) -> None:  # noqa: ANN401
-        role = Role.decode(message)
-        self._told, self.progress = list(role.versions), (role.updates, role.env_step)
+    follow = WeightsFollower._follow
 
-    return [(WeightsFollower, "_follow", follow)]
+    def ignores(self: Any, *messages: Any) -> None:  # noqa: ANN401
+        acting = self._policy.acting
+        follow(self, *messages)
+        self._policy.acting = acting
+
+    return [(WeightsFollower, "_follow", ignores)]
 
 
 def _early_takeover() -> Patches:

@@ -41,8 +41,8 @@ def watched(checks: Checks) -> Watched:
             return outcome
 
         def draw(self, request: DrawRequest) -> Reply | RetryLater:
+            checks.asked(self, request)
             known = request.sequence < checks.counted(self)
-            checks.asked(request)
             outcome = super().draw(request)
             if not isinstance(outcome, RetryLater):
                 checks.drawn(self, request, outcome, known)

@@ -38,6 +38,7 @@ LEARNER = "learner.pt"
 REPLAY = "replay"
 DONE = "DONE"
 WRITING = "WRITING"
+PART, OLD = ".part", ".old"  # behind a folder's name: not yet in its place, and no longer
 KEPT = 2  # finished checkpoints
 ASKED = "ASKED"  # in the folder of checkpoints: somebody waits for a new one
 RECORDS = ("episodes.csv", "metrics.jsonl")
@@ -212,7 +213,7 @@ def remove(path: Path) -> None:
     """Delete a checkpoint, or the replay service's part of one, but nothing else that lies there."""
     with suppress(OSError):
         (path / WRITING).touch()  # a kill may leave a part of it
-        for inner in (path / REPLAY, path / f"{REPLAY}.part"):
+        for inner in (path / REPLAY, path / f"{REPLAY}{PART}", path / f"{REPLAY}{OLD}"):
             if inner.is_dir() and not inner.is_symlink():
                 remove(inner)
         for file in sorted(path.iterdir(), key=lambda file: (file.name != DONE, file.name == WRITING)):
@@ -220,6 +221,44 @@ def remove(path: Path) -> None:
                 file.unlink()
     with suppress(OSError):  # something else lies there
         path.rmdir()
+
+
+def exchange(new: Path, path: Path) -> None:
+    """Put a whole folder `NAME.part`, which is on the disk, in the place of a part that may be there; raises OSError.
+
+    A kill leaves one of the two whole, where `settle` finds it.
+    """
+    old = _beside(path, OLD)
+    remove(old)
+    if path.exists():
+        path.rename(old)
+    new.rename(path)
+    sync_folder(path.parent)
+    remove(old)
+
+
+def settle(path: Path, number: int) -> None:
+    """Complete an `exchange` that was killed, for the process that owns the folder; raises OSError."""
+    for each in (_beside(path, PART), _beside(path, OLD)):
+        if not each.exists():
+            continue
+        with suppress(Damaged):
+            if not path.exists() and check_part(each, number, None):
+                each.rename(path)
+                sync_folder(path.parent)
+        remove(each)
+
+
+def settle_checkpoints(run_dir: Path) -> None:
+    """`settle` for all checkpoints of a run directory."""
+    with suppress(FileNotFoundError), os.scandir(run_dir / FOLDER) as entries:
+        names = {Path(entry.name).stem for entry in entries if Path(entry.name).suffix in (PART, OLD)}
+        for name in sorted(filter(_NUMBER.fullmatch, names)):
+            settle(run_dir / FOLDER / name, int(name))
+
+
+def _beside(path: Path, ending: str) -> Path:
+    return path.with_name(path.name + ending)
 
 
 def finished(run_dir: Path) -> list[int]:

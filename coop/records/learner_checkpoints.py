@@ -5,17 +5,30 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import torch
+from msgspec.structs import replace
 
 from coop.common.errors import CoopError, UsageError
 from coop.common.process.files import FileDigest, write_atomic
 from coop.common.process.output import warn
 from coop.common.process.untrusted import check_torch_file
-from coop.records.checkpoints import LEARNER, Manifest, begin, checkpoint_path, finish, remove, remove_old
+from coop.records.checkpoints import (
+    LEARNER,
+    PART,
+    Damaged,
+    Manifest,
+    begin,
+    check_part,
+    checkpoint_path,
+    exchange,
+    finish,
+    remove,
+    remove_old,
+)
 from coop.records.resumption import Whole, survey
 
 
@@ -29,15 +42,25 @@ def saving_checkpoint(
     records: Mapping[str, FileDigest],
     fallbacks: Sequence[str] = (),
     settings: str = "",
+    keep: bool = False,
 ) -> Iterator[Path]:
     """Save the learner's part, and seal the checkpoint once the body has made the replay service save its part.
 
     Deletes checkpoints that are too old. records, fallbacks, settings: see `Manifest`.
+    keep: a whole one with this number, which holds the same agent, is only sealed anew; otherwise it is replaced once
+        the new one is whole.
 
     Raises:
-        OSError: the run directory cannot be written; nothing is left of this checkpoint.
+        OSError: the run directory cannot be written; nothing is left of this checkpoint but a whole one of before.
     """
-    path = checkpoint_path(run_dir, number)
+    place = path = checkpoint_path(run_dir, number)
+    if (whole := _whole(path, number, run_id)) is not None:
+        if keep:
+            yield path
+            finish(run_dir, path, replace(whole, records=dict(records), fallbacks=list(fallbacks), settings=settings))
+            return
+        path = place.with_name(place.name + PART)
+        remove(path)
     try:
         begin(path)
         content = io.BytesIO()
@@ -46,10 +69,18 @@ def saving_checkpoint(
         yield path
         manifest = Manifest(run_id, number, files, dict(records), list(fallbacks), settings=settings)
         finish(run_dir, path, manifest)
+        if path != place:
+            exchange(path, place)
     except BaseException:
         remove(path)
         raise
     remove_old(run_dir, number)
+
+
+def _whole(path: Path, number: int, run_id: int) -> Manifest | None:
+    with suppress(Damaged):
+        return check_part(path, number, run_id)
+    return None
 
 
 def newest_checkpoint(run_dir: Path, settings: str = "", *, replay: bool = False) -> Whole | None:

@@ -36,6 +36,7 @@ from coop.records.checkpoints import (
     finished,
     reason,
     remove,
+    settle_checkpoints,
     write_manifest,
 )
 from coop.records.run_ids import has_run_id, read_run_id
@@ -208,7 +209,8 @@ class Start:
     ) -> tuple[Survey, list[str]]:
         """Decide what to go on from in a directory whose locks this process holds; return it, and lines to say.
 
-        Nothing is changed but what `resume_from` and `overwrite` ask for. The arguments are those of `survey`.
+        Nothing is changed but what `resume_from` and `overwrite` ask for, and what a kill left half done. The
+        arguments are those of `survey`.
 
         Raises:
             UsageError: a run is there that can't be gone on with.
@@ -216,6 +218,8 @@ class Start:
         """
         notices = []
         try:
+            if self.goes_on:
+                settle_checkpoints(run_dir)
             if self.overwrite:
                 notices.append(overwrite(run_dir))
             if self.resume_from is not None:

@@ -21,6 +21,7 @@ from coop.records.checkpoints import (
     checkpoint_path,
     read_manifest,
     remove,
+    settle,
 )
 from coop.replay.core import ReplayCore
 from coop.replay.persistence.journal import Journal, journal_names
@@ -43,17 +44,27 @@ class ReplayCheckpoints:
         self._start = start
         self._writer: Task | None = None
         self._number = -1
+        self._asked = -1, -1  # the learner that has asked for it, and which of its requests that was
         self._on_disk = False
         self._problem = ""
 
-    def begin(self, core: ReplayCore, lock: threading.Condition, number: int, keep: list[int]) -> None:
+    def begin(
+        self, core: ReplayCore, lock: threading.Condition, number: int, keep: list[int], asked: tuple[int, int]
+    ) -> None:
         """Freeze the core's present state and begin to write it; return before it is written.
 
-        keep: the older checkpoints still needed. A repeated call for the checkpoint being written changes nothing.
+        keep: the older checkpoints still needed. asked: the learner that asks, and which of its requests this is; a
+        repeated one changes nothing.
 
         Raises:
-            RunError: another checkpoint is being written, or there is no space for the journal.
+            RunError: another checkpoint is being written, the request is older than the last one, or there is no space
+                for the journal.
         """
+        learner, last = self._asked
+        if asked == self._asked:
+            return
+        if asked[0] == learner and asked[1] < last:
+            raise RunError(f"checkpoint {number} was asked for before checkpoint {self._number}")
         if self._is_writing():
             if number == self._number:
                 return
@@ -83,7 +94,7 @@ class ReplayCheckpoints:
                 with lock:
                     lock.notify_all()
 
-        self._number, self._on_disk, self._problem = number, False, ""
+        self._number, self._on_disk, self._problem, self._asked = number, False, "", asked
         self._writer = self._start(f"checkpoint {number}", write())
 
     def written(self, number: int) -> bool:
@@ -190,6 +201,12 @@ class ReplayCheckpoints:
         remove(path)
         with contextlib.suppress(OSError):  # the folder may contain the learner's part
             path.parent.rmdir()
+
+
+def settle_parts(folder: Path) -> None:
+    """Complete what a kill has left half done, before anything is read; raises OSError."""
+    for number in checkpoint_numbers(folder):
+        settle(part_path(folder, number), number)
 
 
 def part_path(folder: Path, number: int) -> Path:

@@ -8,7 +8,7 @@ from coop.common.errors import RunError, UsageError
 from coop.records.checkpoints import Damaged, read_manifest
 from coop.records.locks import RunLock
 from coop.records.run_ids import check_owner, claim, has_run_id, read_run_id
-from coop.replay.persistence.checkpoints import part_numbers, part_path
+from coop.replay.persistence.checkpoints import part_numbers, part_path, settle_parts
 from coop.replay.persistence.journal import journal_files, read_owner
 
 
@@ -47,7 +47,7 @@ class ReplayFolder:
         return f"goes on in {self.path}"
 
     def lock(self) -> RunLock:
-        """Lock the folder and assign it to the run.
+        """Lock the folder, assign it to the run, and complete what a kill has left half done in it.
 
         Raises:
             RunError: another process uses it, it now belongs to another run, or it cannot be written.
@@ -55,9 +55,13 @@ class ReplayFolder:
         lock = RunLock(self.path, "coop-replay", ("replay",))
         try:
             claim(self.path, self.run_id)
+            settle_parts(self.path)
         except RunError:
             lock.release()
             raise
+        except OSError as error:
+            lock.release()
+            raise RunError(f"{self.path}: {error.strerror or error}") from error
         lock.sign()
         return lock
 

@@ -19,11 +19,20 @@ import numpy as np
 from coop.common.errors import BadMessage, CoopError
 from coop.common.messaging import wire
 from coop.common.messaging.messages.sample import BatchReader, encode_batch
-from coop.common.process.files import PIECE, FileDigest, SyncedFile, make_folder, sync_folder
+from coop.common.process.files import PIECE, FileDigest, SyncedFile, make_folder
 from coop.common.process.untrusted import load_array, read_bytes
 from coop.common.transitions import KEPT, columns_of
 from coop.common.types import Array, EnvSpec, EpisodeEnd, EpisodeRecord
-from coop.records.checkpoints import Damaged, Manifest, check_part, read_manifest, remove, write_manifest
+from coop.records.checkpoints import (
+    PART,
+    Damaged,
+    Manifest,
+    check_part,
+    exchange,
+    read_manifest,
+    remove,
+    write_manifest,
+)
 from coop.records.run_ids import check_owner
 from coop.replay.core import CoreSnapshot, ReplayCore
 from coop.replay.table.numbering import EPISODES
@@ -66,15 +75,13 @@ def save_snapshot(snapshot: CoreSnapshot, lock: threading.Condition, path: Path,
     Raises:
         OSError: the folder cannot be written.
     """
-    part = path.with_name(path.name + ".part")
+    part = path.with_name(path.name + PART)
     try:
         remove(part)
         make_folder(part)
         files = _write(snapshot, lock, part)
         write_manifest(part, Manifest(mark.run_id, mark.number, files, journal=mark.journal))
-        remove(path)
-        part.replace(path)
-        sync_folder(path.parent)
+        exchange(part, path)
     except OSError:
         remove(part)
         raise

@@ -119,12 +119,18 @@ class Farewell(Body, frozen=True):
 
 
 class Snapshot(Body, frozen=True):
-    """Begins the part of checkpoint `number`; of the older checkpoints, only `keep` is kept."""
+    """Begins the part of checkpoint `number`; of the older checkpoints, only `keep` is kept.
+
+    learner: incarnation of the one that asks. asked: how many checkpoints it has asked for before; a late copy of an
+    earlier request begins nothing.
+    """
 
     kind: ClassVar[str] = "snapshot"
 
     number: Updates
     keep: Checkpoints
+    learner: Incarnation
+    asked: Counter
 
 
 class Written(Body, frozen=True):
