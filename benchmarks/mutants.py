@@ -81,10 +81,12 @@ def main() -> None:
     """Run the mutants and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="mutants to run, such as 'coop.learner.trainer*'; all if not given")
+    parser.add_argument("--max-children", default="2", help="processes at a time (default %(default)s)")
     parser.add_argument("--report", action="store_true", help="print the table of what has been run before")
     options = parser.parse_args()
     if not options.report:
-        done = subprocess.run(["mutmut", "run", *options.names, "--max-children", "2"], check=False)
+        command = ["mutmut", "run", *options.names, "--max-children", options.max_children]
+        done = subprocess.run(command, check=False)
         if done.returncode:
             sys.exit(done.returncode)
     entries = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))

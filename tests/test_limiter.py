@@ -8,7 +8,7 @@ from random import Random
 
 import msgpack
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from coop.common.errors import UsageError
@@ -49,6 +49,7 @@ def test_why_not_insert(limiter: RateLimiter, inserted: int, drawn: int, reason:
     changed=st.booleans(),
     total=st.sampled_from((None, 200)),
 )
+@example(ratio=1.0, tolerance=4, inserted=40, more=0, changed=False, total=None)  # the first step with draws
 def test_below_which_number_draws_are_admitted(
     ratio: float, tolerance: int, inserted: int, more: int, changed: bool, total: int | None
 ) -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from coop.common.settings.config import LearnerSettings
 from coop.common.transitions import Batch
@@ -43,6 +44,9 @@ def test_costs_and_slopes(name: str, costs: list[float], slopes: list[float]) ->
     for found, expected in ((loss.cost(ERRORS), costs), (loss.slope(ERRORS), slopes)):
         assert found.dtype == np.float32
         assert found.tolist() == expected
+    tensor = torch.from_numpy(ERRORS)
+    torch.testing.assert_close(loss.cost(tensor), torch.tensor(costs), rtol=0, atol=0)
+    torch.testing.assert_close(loss.slope(tensor), torch.tensor(slopes), rtol=0, atol=0)
 
 
 def test_td_errors() -> None:

@@ -21,6 +21,7 @@ from coop.common.settings.tables import resolve
 from coop.common.transitions import Batch
 from coop.learner.agent import Agent
 from coop.learner.methods.rule import UpdateRule
+from coop.learner.methods.step import to_host
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "methods"
 
@@ -191,6 +192,48 @@ def test_a_method_s_metrics_are_columns(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(Counting, "name", "loss")
     with pytest.raises(coop.RunError, match="its metrics can't be called 'loss', as others are"):
         coop.train(run_dir=tmp_path / "b", **flags).wait()
+
+
+class Sees(UpdateRule):
+    """Keeps the steps that its hooks see."""
+
+    def targets(self, step: Any) -> Any:
+        self.outer = step
+        return super().targets(step)
+
+    def loss(self, step: Any, q: torch.Tensor) -> torch.Tensor:
+        self.inner = step
+        return q.sum()
+
+
+def test_costs_see_the_step_in_tensors() -> None:
+    agent, (first, second) = agent_of("dqn"), batches(2)
+    rule = agent.rule = Sees(agent.config, np.random.default_rng(0))
+    for batch in (first, second):
+        agent.update(batch)
+    outer, inner = rule.outer, rule.inner
+    for name in ("online", "target", "batch", "inputs"):
+        assert getattr(inner, name) is getattr(outer, name)
+    assert inner.batch is second
+    assert outer.update == inner.update == 1
+    assert outer.mask is outer.next_mask is inner.mask is inner.next_mask is None
+    for name in ("actions", "rewards", "discounts", "weights", "targets"):
+        np.testing.assert_array_equal(getattr(inner, name).numpy(), getattr(outer, name), strict=True)
+
+
+def test_a_rule_gets_numpy_unless_its_own_class_says_otherwise() -> None:
+    class Plain(UpdateRule):
+        pass
+
+    class There(UpdateRule):
+        on_device = True
+
+    class Below(There):
+        pass
+
+    assert [kind.on_device for kind in (UpdateRule, Plain, There, Below)] == [True, False, True, False]
+    whole, half = to_host(torch.tensor([1, 2])), to_host(torch.tensor([0.5], dtype=torch.bfloat16))
+    assert (whole.dtype, half.dtype) == (np.int64, np.float32)
 
 
 def test_targets_of_another_shape_are_refused() -> None:

@@ -116,6 +116,7 @@ def test_a_restored_table_goes_on_as_the_saved_one() -> None:
 def test_impossible_rows_are_refused_and_change_nothing(rows: list[int], kept: slice, words: str) -> None:
     class Wrong(Eviction):
         def place(self, first: int, count: int) -> Any:
+            assert (first, count) == (0, 4)
             return np.array(rows), kept
 
     table = table_of(Wrong)
@@ -124,11 +125,21 @@ def test_impossible_rows_are_refused_and_change_nothing(rows: list[int], kept: s
     assert (len(table), table.inserted) == (0, 0)
 
 
-@pytest.mark.parametrize(("rows", "words"), [([0, 9], "rows 0 to 9 of 4"), ([0], "1 rows"), ([-1, 0], "rows -1 to 0")])
-def test_impossible_draws_are_refused(rows: list[int], words: str) -> None:
+@pytest.mark.parametrize(
+    ("rows", "weights", "words"),
+    [
+        ([0, 9], 2, "rows 0 to 9 of 4"),
+        ([0, 4], 2, "rows 0 to 4 of 4"),
+        ([-1, 0], 2, "rows -1 to 0"),
+        ([0], 1, "1 rows, 1 weights, not 2"),
+        ([0, 1], 1, "2 rows, 1 weights, not 2"),
+        ([0], 2, "1 rows, 2 weights, not 2"),
+    ],
+)
+def test_impossible_draws_are_refused(rows: list[int], weights: int, words: str) -> None:
     class Wrong(Sampling):
         def draw(self, count: int, size: int) -> Any:
-            return np.array(rows), np.ones(len(rows), np.float32)
+            return np.array(rows), np.ones(weights, np.float32)
 
     table = table_of(Wrong)
     table.insert(make_segment(SPEC))

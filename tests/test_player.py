@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gates import mask_of
 from gymnasium.envs.classic_control import CartPoleEnv
 
 from coop.actors.player import Player, Turn
@@ -81,6 +82,18 @@ def test_an_end_tells_the_values_of_the_last_observation_by_both_networks() -> N
         last = turn.steps.next_obs[0]  # not obs, which is the next episode's first
         assert (end.q1_mean, end.q2_mean) == policy.mean_values(last)
     assert end.q1_mean != end.q2_mean
+
+
+def test_masks_choose_actions_and_what_an_end_tells() -> None:
+    """Episodes are cut behind two steps, where the last observation allows two of four actions; others are errors."""
+    player, env, policy = make_player(settings=EnvSettings(id="gates:Gates-v0", max_episode_steps=2))
+    turns = play(player, 8)
+    env.close()
+    ends = [(turn.steps.next_obs[stream], end) for turn in turns for stream, end in turn.ended.items()]
+    assert len(ends) == 12
+    for last, end in ends:
+        assert (end.q1_mean, end.q2_mean) == policy.mean_values(last, mask_of(last))
+        assert end.q1_mean != policy.mean_values(last)[0]
 
 
 def test_epsilon_follows_the_steps_of_the_whole_run() -> None:

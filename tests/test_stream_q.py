@@ -246,6 +246,14 @@ def test_a_time_limit_bootstraps_and_begins_an_episode() -> None:
     np.testing.assert_allclose(agent.networks[0].snapshot()[:2], [7 / 3, math.sqrt(7 / 3)], rtol=1e-6)
 
 
+def test_masks_by_hand() -> None:
+    """As the first of the three steps, but only action 1 is allowed: greedy, and the next state's value is -x'."""
+    agent, only = linear_agent(), np.array([[False, True]])
+    step = msgspec.structs.replace(transition(1, 1, 2, 4), mask=only, next_mask=only)
+    assert agent.update(step).td_errors[0] == pytest.approx(2 - 0.5 * math.sqrt(0.5))
+    np.testing.assert_allclose(traces(agent), [0, 0, 0, 1], atol=1e-7)
+
+
 def test_the_reward_that_ends_an_episode_begins_no_sum() -> None:
     """u is 2, then 3 in place of 0.5 * 2 + 3, of variance 1/2; nothing is added to the terminal reward."""
     agent = linear_agent()
