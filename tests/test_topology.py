@@ -55,12 +55,15 @@ def run(name: str, *flags: str) -> subprocess.CompletedProcess[str]:
 
 
 def children(pid: int) -> dict[str, int]:
-    """Direct children by their command's name, the last one of each."""
+    """The roles among the direct children by their command's name, the last one of each.
+
+    A command that is forked here has a child of its own name, which forks its roles.
+    """
     found = {}
     for entry in Path("/proc").iterdir():
         with suppress(OSError, ValueError):
             name, _, rest = (entry / "stat").read_text().partition("(")[2].rpartition(")")
-            if int(rest.split()[1]) == pid and name.startswith("coop-"):
+            if int(rest.split()[1]) == pid and name.startswith("coop-") and name != "coop-local":
                 found[name] = int(entry.name)
     return found
 
