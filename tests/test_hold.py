@@ -50,6 +50,17 @@ def runs_of(well: dict[str, float]) -> pd.DataFrame:
 BAD, GOOD = 0.5, 1.0
 
 
+def test_the_packed_cells_are_of_this_plan_and_grid(tmp_path: Path) -> None:
+    rows = play.packed_rows()
+    assert rows
+    assert all(len(found) == len(SEEDS) for found in rows.values())
+    other, text = tmp_path / "grid.toml", play.GRID.read_text()
+    other.write_text(f"# said in other words\n{text}")
+    assert play.sealed(grid=other) == play.sealed()
+    other.write_text(text.replace("529]", "528]"))
+    assert play.sealed(grid=other) != play.sealed()
+
+
 @pytest.mark.parametrize(
     ("good", "answer"),
     [

@@ -191,8 +191,9 @@ def _of(statistic: Callable[[Any], Any], values: NDArray[np.float32]) -> float:
 
 
 def sealed(plan: Path = PLAN, grid: Path = GRID) -> dict[str, str]:
-    """The SHA-256 of the plan as it began, and of the grid."""
-    return {"plan": registered(plan), "grid": hashlib.sha256(grid.read_bytes()).hexdigest()}
+    """The SHA-256 of the plan as it began, and of the grid's tables."""
+    tables = json.dumps(tomllib.loads(grid.read_text(encoding="utf-8")), sort_keys=True)
+    return {"plan": registered(plan), "grid": hashlib.sha256(tables.encode()).hexdigest()}
 
 
 def pack(grid: HoldGrid, out: Path, path: Path) -> int:
