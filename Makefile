@@ -18,7 +18,7 @@ run: $(RUNS)
 	@$(BIN)/coop-local --preset cartpole --method coop --actors 2 --total-steps 20000 --run-dir runs/first-light-$(STAMP)
 
 test: check
-	@$(BIN)/python -m pytest -n 6 --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 check: $(READY)
 	@$(BIN)/ruff check --quiet .
