@@ -104,10 +104,9 @@ class Journal:
         self._accepted = accepted
         self._late: list[tuple[int, bytes]] = []  # records of draws for which there was no space
         self._failed: OSError | None = None  # the first flush that has failed, if records must survive the machine
+        self._file = self._number = self._records = self._end = self._flushed = 0
         make_folder(folder)
-        self._open(number)
-        self.sync(number)
-        self._flushed = self._end
+        self._open(number, flush=True)
 
     def insert(self, payload: bytes, transitions: int) -> None:
         """Record an insert request; raises OSError, and then has recorded nothing."""
@@ -129,24 +128,14 @@ class Journal:
         """Begin the next file and return its number; raises OSError, and then continues the present file."""
         self._append_late()
         self._write(END, b"")  # remains of an older file may follow
-        before = self._file, self._number, self._records, self._end
+        before = self._file
         try:
-            self._open(self._number + 1)
+            self._open(self._number + 1, flush=self._sync)
         except OSError:
             self._end -= HEADER_BYTES
             self._records -= 1
             raise
-        if self._sync:
-            try:
-                self.sync(self._number)
-            except OSError:
-                os.close(self._file)
-                with contextlib.suppress(OSError):
-                    _path(self._folder, self._number).unlink()
-                self._append_to(*before)
-                raise
-            self._flushed = self._end
-        os.close(before[0])
+        os.close(before)
         return self._number
 
     def flush(self, lock: threading.Condition) -> None:
@@ -203,7 +192,8 @@ class Journal:
             if number < before:
                 _path(self._folder, number).replace(self._folder / _SPARE)
 
-    def _open(self, number: int) -> None:
+    def _open(self, number: int, *, flush: bool) -> None:
+        """Begin a file, flushed if asked for; raises OSError, and then continues the present one."""
         path = _path(self._folder, number)
         payload = msgpack.packb([FORMAT, self._run_id, number])
         with contextlib.suppress(FileNotFoundError):
@@ -211,14 +201,15 @@ class Journal:
         file = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
         try:
             end = _write(file, 0, Header(_checksum(payload), BEGIN, number, 0, self._accepted, len(payload)), payload)
+            if flush:
+                self.sync(number)
+                self._flushed = end
         except OSError:
             os.close(file)
-            path.unlink()
+            with contextlib.suppress(OSError):
+                path.unlink()
             raise
-        self._append_to(file, number, 1, end)
-
-    def _append_to(self, file: int, number: int, records: int, end: int) -> None:
-        self._file, self._number, self._records, self._end = file, number, records, end
+        self._file, self._number, self._records, self._end = file, number, 1, end
 
     def _append(self, kind: int, payload: bytes, transitions: int = 0) -> None:
         if self._end > ROLL_AT:
