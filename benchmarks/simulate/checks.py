@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from contextlib import suppress
+from collections.abc import Collection
 from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.simulate.roles import SPEC, STEPS
+from benchmarks.simulate.roles import STEPS
+from benchmarks.simulate.sealed import Checkpoints
 from benchmarks.simulate.world import Process, Violation
 from coop.common.messaging import wire
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.messaging.messages.weights import Role
 from coop.common.transitions import Batch, Drawn, DrawRequest, Segment
 from coop.learner.trainer import Effects, Trainer
-from coop.records.checkpoints import DONE, Damaged, check_part, checkpoint_numbers, read_manifest
-from coop.records.learner_checkpoints import load_learner
-from coop.records.run_ids import read_run_id
 from coop.replay.core import ReplayCore, Reply
-from coop.replay.persistence.checkpoints import part_path, settle_parts
 from coop.replay.persistence.journal import Journal
-from coop.replay.persistence.storage import load_snapshot
 
 if TYPE_CHECKING:
     from benchmarks.simulate.cluster import Cluster
@@ -49,12 +44,13 @@ class Checks:
     """Knows what was promised: which segments have been acknowledged, what was drawn, broadcast and saved.
 
     Attributes:
-        done: how often each invariant was looked at.
+        done: how often each invariant was looked at. checkpoints: looks at those that are sealed.
     """
 
     def __init__(self, cluster: Cluster) -> None:
         self.cluster = cluster
         self.done: Counter[str] = Counter()
+        self.checkpoints = Checkpoints(self)
         self._believed: Counter[int] = Counter()  # transitions acknowledged to each actor
         self.serving = -1  # incarnation of the replay service that the learner has admitted
         self.acked: dict[tuple[int, int], str] = {}  # segments, with when
@@ -65,7 +61,6 @@ class Checks:
         self._draws: dict[tuple[int, int], tuple[int, ...]] = {}
         self._owners: dict[int, tuple[Reply, int]] = {}
         self._evaluations: set[float] = set()
-        self._sealed: object = None  # the checkpoint that was looked at last
         self._bases: dict[int, int] = {}
         self._inserted = 0  # transitions, at most, of which a learner has heard
         self._learner, self._counted = -1, 0
@@ -134,14 +129,7 @@ class Checks:
         """A role has said something."""
         if process.role == "learner" and ("saved, " in text or "goes on without it" in text):
             self._last_save = self.cluster.world.now
-            numbers = checkpoint_numbers(self.cluster.root / "learner" / "run", DONE)
-            parts = [part_path(folder, numbers[-1]) for folder in self._folders()] if numbers else []
-            there = not parts or any((part / DONE).exists() for part in parts)
-            self.hold("checkpoint", there, f"{numbers[-1:]} is sealed without the replay service's part")
-
-    def _folders(self) -> list[Path]:
-        """Where replay services keep their parts."""
-        return [self.cluster.root / place / "table" for place in ("replay", "elsewhere")]
+            self.checkpoints.look_at_parts()
 
     def service_begins(self, process: Process, core: ReplayCore) -> None:
         """A replay service has restored what it holds."""
@@ -163,10 +151,11 @@ class Checks:
             self._draws.clear()
         self._forgive = False
         self.look_at(core)
-        self.look_at_checkpoints()
+        self.checkpoints.look()
 
-    def look_at(self, core: ReplayCore) -> None:
-        """Look at all that a table holds."""
+    def look_at(self, core: ReplayCore, promised: Collection[tuple[int, int]] | None = None) -> None:
+        """Look at all that a table holds; promised: segments that must be there, by default those acknowledged."""
+        promised = self.acked if promised is None else promised
         table = core.table
         size = len(table)
         accepted = 0
@@ -185,11 +174,11 @@ class Checks:
         self.hold("eviction", ids[-1] == table.inserted - 1 and ids[0] == table.inserted - size, "not the newest")
         known = {first + step for first in self._sent.values() for step in range(STEPS)}
         self.hold("content", known.issuperset(numbers.tolist()), "a transition that nobody sent")
-        for who in self.acked:
+        for who in promised:
             self.hold("acknowledged", core._seen.seen(who[0], 0, who[1]), f"segment {who[1]} has disappeared")
         if table.capacity >= table.inserted:
             held = set(numbers.tolist())
-            for who in self.acked:
+            for who in promised:
                 self.hold("acknowledged", self._sent[who] in held, f"segment {who[1]} was not evicted, but is gone")
 
     # ------------------------------------------------------------------------------------------------------------------
@@ -288,7 +277,7 @@ class Checks:
         self._evaluations.clear()
         self._roles.clear()
         self._began_at = self.cluster.world.now
-        self.look_at_checkpoints()
+        self.checkpoints.look()
 
     def look(self, process: Process, weights: Any, policy: Any) -> None:  # noqa: ANN401
         """An actor has looked for weights: those that it acts with must be whole, and after a while the newest."""
@@ -329,63 +318,6 @@ class Checks:
         self.hold("role", held >= newest, f"{process.name} acts with version {held}, {newest} was broadcast")
 
     # ------------------------------------------------------------------------------------------------------------------
-    # Checkpoints
-
-    def look_at_checkpoints(self) -> None:
-        """The newest checkpoint that is said to be whole must be so."""
-        root = self.cluster.root
-        path = root / "learner" / "run"
-        numbers = checkpoint_numbers(path, DONE)
-        if not numbers:
-            return
-        newest = numbers[-1]
-        sealed = newest, (path / "checkpoints" / str(newest) / DONE).stat().st_mtime_ns
-        if sealed != self._sealed:
-            state = load_learner(path / "checkpoints" / str(newest))
-            self.hold("checkpoint", state["agent"]["updates"] == newest, f"{newest} holds another number of updates")
-        for folder in self._folders():
-            self._settle(folder)
-            with suppress(Damaged):
-                if sealed != self._sealed:
-                    self._restore(folder, newest)
-                else:
-                    check_part(part_path(folder, newest), newest, None)
-                self._sealed = sealed
-                return
-        self.broken(f"checkpoint: {newest} is sealed, but the replay service has no whole part of it")
-
-    def place_of_part(self) -> str:
-        """The machine that holds the replay service's part of the newest checkpoint; empty if none does."""
-        newest = checkpoint_numbers(self.cluster.root / "learner" / "run", DONE)[-1:]
-        places = [
-            folder.parent.name for folder in self._folders() for each in newest if part_path(folder, each).exists()
-        ]
-        return places[0] if places else ""
-
-    def _settle(self, folder: Path) -> None:
-        """What the next replay service does first: a kill while one part replaces another leaves both, unnamed."""
-        world = self.cluster.world
-        holders = [each for each in world.processes if each.alive and each.state.get("folder") == folder]
-        if holders:
-            return
-        running, world.running = world.running, None  # no call of a process that its faults count
-        try:
-            settle_parts(folder)
-        finally:
-            world.running = running
-
-    def _restore(self, folder: Path, number: int) -> None:
-        core, path = ReplayCore(self.cluster.config, SPEC), part_path(folder, number)
-        mark = load_snapshot(core, path, read_manifest(path).run, number)
-        self.hold("checkpoint", mark.run_id == read_run_id(folder), f"part of {number} is another run's")
-        acked, self.acked = self.acked, {}
-        self.look_at(core)
-        self.acked = acked
-        # Where draws may be lost, as in an empty table elsewhere, the learner's next request says how many there were.
-        exact = self.cluster.plan.journal != "off" and not self.cluster.met["crash"] and not self.forgiven
-        self.hold("checkpoint", core.drawn >= number or not exact, f"part of {number} has drawn {core.drawn}")
-
-    # ------------------------------------------------------------------------------------------------------------------
     # Ends
 
     def ended(self, process: Process, reason: str) -> None:
@@ -413,7 +345,7 @@ class Checks:
         """Look at everything once more."""
         if self._core is not None:
             self.look_at(self._core)
-        self.look_at_checkpoints()
+        self.checkpoints.look()
 
     def state_of(self, process: Process) -> str:
         """What a process is about, in words."""

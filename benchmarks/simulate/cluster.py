@@ -162,7 +162,7 @@ class Cluster:
             # A run goes on from the newest checkpoint that both hold. If its part is elsewhere, the service here is
             # refused by a line that names what is missing, and whoever runs it starts one there.
             refused = "no checkpoint to resume from" in reason and name == "replay"
-            place = self.checks.place_of_part() if refused else ""
+            place = self.checks.checkpoints.place_of_part() if refused else ""
             self.world.after(self.world.random.uniform(0.25, 2.0), partial(self.begin, name, place))
 
     # ------------------------------------------------------------------------------------------------------------------
