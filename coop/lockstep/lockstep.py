@@ -15,6 +15,7 @@ from coop.actors.policy import EpsilonGreedy
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import RunError, UsageError
 from coop.common.numbers import generator_state, set_generator_state
+from coop.common.process.console import say
 from coop.common.settings.config import RunConfig
 from coop.common.types import EpisodeRecord
 from coop.learner.trainer import Effects, Trainer
@@ -126,6 +127,14 @@ class Lockstep:
         except OSError as error:
             text = f"checkpoint {self.agent.updates} in {directory.path}: {error.strerror or error}"
             raise RunError(text) from error
+
+    def save_on_the_way(self, directory: RunDirectory) -> None:
+        """Save a checkpoint that was due; one for which there is no space costs a line."""
+        self.trainer.checkpoint_begun()
+        try:
+            self.save(directory)
+        except RunError as error:
+            say(f"{error}; the run goes on without it")
 
     def restore(self, checkpoint: Whole, replaying: Replaying = lambda played, actions: None) -> None:
         """Restore a whole checkpoint from `save`.

@@ -164,11 +164,7 @@ def play_lockstep(
                 if take_request(directory.path):
                     trainer.ask_checkpoint()
             if trainer.checkpoint_due() and not trainer.outcome():
-                trainer.checkpoint_begun()
-                try:
-                    run.save(directory)
-                except RunError as error:
-                    say(f"{error}; the run goes on without it")
+                run.save_on_the_way(directory)
             if time.monotonic() >= due:
                 due = time.monotonic() + PROGRESS_EVERY
                 progress(run.progress())

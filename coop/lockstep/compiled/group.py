@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 
 from coop.common.errors import CoopError, RunError, first_line
-from coop.common.process.console import say
 from coop.common.process.lifecycle import Stop
 from coop.learner.summary import summarise
 from coop.lockstep.compiled.seeds import MOST, Seeds
@@ -112,12 +111,8 @@ class Group:
             if look and take_request(self._files[run].path):
                 run.trainer.ask_checkpoint()
             if run.trainer.checkpoint_due() and seeds.step < run.config.total_steps:
-                run.trainer.checkpoint_begun()
                 seeds.save_into(k)
-                try:
-                    run.save(self._files[run])
-                except RunError as error:
-                    say(f"{error}; the run goes on without it")
+                run.save_on_the_way(self._files[run])
 
     def _end(self, run: Lockstep, outcome: str) -> None:
         """Save a run for good, and complete its files."""
