@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -155,6 +156,22 @@ def train_once(network: Network, optimizer: Any, state: Carry, batch: tuple[jax.
     gradient = jax.grad(loss)(state["online"])
     step, moments = optimizer.update(gradient, state["moments"], state["online"])
     return state | {"online": optax.apply_updates(state["online"], step), "moments": moments}
+
+
+def play_to(mean: float, most: int, each: int, run: Callable[[Any], tuple[Any, Any]], state: Any) -> tuple[int, bool]:
+    """Play until the mean of 100 returns or so many steps are reached; the steps, and whether the mean was.
+
+    run: plays `each` steps; returns the new state, whether an episode ended with each, and the returns until then.
+    """
+    returns: deque[float] = deque(maxlen=100)
+    steps, solved = 0, False
+    while steps < most and not solved:
+        state, (ended, totals) = run(state)
+        for total in totals[ended].tolist():
+            returns.append(total)
+            solved = solved or (len(returns) == 100 and sum(returns) / 100 >= mean)
+        steps += each
+    return min(steps, most), solved
 
 
 def apart(state: Any) -> Any:

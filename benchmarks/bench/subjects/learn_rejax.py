@@ -5,11 +5,10 @@ It has no returns over several steps, and takes the end of an episode by its lim
 
 import json
 import sys
-from collections import deque
 
 import jax
 import jax.numpy as jnp
-from jax_dqn import apart, learning_settings
+from jax_dqn import apart, learning_settings, play_to
 from jax_rejax import make
 
 LOOKED = 1000  # steps between looks at the returns
@@ -30,12 +29,4 @@ def iteration(carry, _):
 run = jax.jit(lambda carry: jax.lax.scan(iteration, carry, None, iterations), donate_argnums=0)
 state = apart(algorithm.init_state(jax.random.PRNGKey(int(sys.argv[2]))))
 carry = state, jnp.zeros(algorithm.num_envs)
-returns: deque[float] = deque(maxlen=100)
-steps, solved = 0, False
-while steps < most and not solved:
-    carry, (ended, totals) = run(carry)
-    for total in totals[ended].tolist():
-        returns.append(total)
-        solved = solved or (len(returns) == 100 and sum(returns) / 100 >= mean)
-    steps += iterations * algorithm.num_envs
-print(json.dumps([min(steps, most), solved]))
+print(json.dumps(play_to(mean, most, iterations * algorithm.num_envs, run, carry)))
