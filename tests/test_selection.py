@@ -7,11 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from coop.replay.table.policies import Floats, Rows, TableView
-from coop.replay.table.selection import Fifo, LowestPriority, Proportional, Reservoir, SumTree, Uniform
+from coop.replay.table.selection import Fifo, LowestPriority, Proportional, Reservoir, Uniform
 
 
 def view(capacity: int, rng: np.random.Generator | None = None, priorities: Floats | None = None) -> TableView:
@@ -140,65 +138,3 @@ def test_proportional_draws_once_from_each_share() -> None:
         assert (rows // 2).tolist() == [0, 1, 2, 3]
         seen.add(tuple(rows % 2))
     assert len(seen) == 16  # which of the two in a share does not depend on the other shares
-
-
-@given(
-    capacity=st.sampled_from([1, 5, 64, 65, 300, 2048, 2049, 5000]),
-    updates=st.lists(st.tuples(st.integers(0, 4999), st.floats(0, 1e6)), min_size=1, max_size=60),
-    fractions=st.lists(st.floats(0, 1, exclude_max=True), min_size=1, max_size=20),
-)
-def test_sum_tree_equals_running_sums(capacity: int, updates: list[tuple[int, float]], fractions: list[float]) -> None:
-    tree, values = SumTree(capacity), np.zeros(capacity)
-    rows = np.array([row % capacity for row, _ in updates])
-    given_values = np.array([value for _, value in updates])
-    values[rows] = given_values
-    tree.update(rows, given_values)
-    np.testing.assert_array_equal(tree.values(np.arange(capacity)), values)
-    assert tree.total == pytest.approx(values.sum())
-    again = SumTree(capacity)
-    again.update(np.arange(capacity), values)
-    for one, other in zip(again._levels + again._running, tree._levels + tree._running, strict=True):
-        np.testing.assert_array_equal(one, other)
-    if tree.total > 0:
-        sums = np.array(fractions) * tree.total
-        found = tree.find(sums)
-        assert (values[found] > 0).all()
-        before = np.concatenate([[0.0], np.cumsum(values)])
-        margin = 1e-9 * tree.total
-        assert (before[found] - margin <= sums).all()
-        assert (sums <= before[found + 1] + margin).all()
-
-
-@pytest.mark.parametrize("value", [2.0, 2.0**-20])
-@pytest.mark.parametrize("capacity", [1, 64, 65, 2048, 2049, 5000, 140_000])
-def test_sum_tree_finds_every_row(capacity: int, value: float) -> None:
-    tree = SumTree(capacity)
-    tree.update(np.arange(capacity), np.full(capacity, value))
-    assert tree.total == value * capacity
-    for share in (0.0, 0.5, 0.75):
-        np.testing.assert_array_equal(tree.find(value * (np.arange(capacity) + share)), np.arange(capacity))
-    assert tree.find(np.array([tree.total])).tolist() == [capacity - 1]  # to which a share below 1 may be rounded
-
-
-def test_sum_tree_rounds_inside_a_group() -> None:
-    """A sum below its node's end may equal the end after the sum before the node is taken away."""
-    values = np.zeros(4096)
-    values[0], values[64] = 1.5 * 2**-53, 1 - 2**-52
-    tree = SumTree(4096)
-    tree.update(np.arange(4096), values)
-    assert tree.find(np.array([1 - 2**-53])).tolist() == [64]
-
-
-@pytest.mark.parametrize("largest", [1.0, 1e-6])
-def test_sum_tree_at_the_seams(largest: float) -> None:
-    """Sums at the border of two values, where rounding decides, never find a value of 0 or a row that isn't there."""
-    rng = np.random.default_rng(0)
-    for _ in range(300):
-        values = largest * rng.random(200) * (rng.random(200) < 0.5)
-        tree = SumTree(200)
-        tree.update(np.arange(200), values)
-        seams = np.concatenate([level.cumsum(axis=-1).reshape(-1) for level in tree._levels])
-        sums = np.concatenate([np.nextafter(seams, 0), seams, np.nextafter(seams, np.inf)])
-        found = tree.find(sums[sums < tree.total])
-        assert found.max() < 200
-        assert (values[found] > 0).all()

@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coop.replay.table.policies import Eviction, Floats, Rows, Sampling, TableView
+from coop.replay.table.sum_tree import make_sum_tree
 
 PRIORITY_FLOOR = 1e-6
-GROUP_BITS = 6
-GROUP = 1 << GROUP_BITS
-TOP = 2048  # nodes, whose running sums take less time than another level
 
 
 class Fifo(Eviction):
@@ -95,7 +93,7 @@ class Proportional(Sampling):
 
     def __init__(self, table: TableView) -> None:
         super().__init__(table)
-        self._tree = SumTree(table.capacity)
+        self._tree = make_sum_tree(table.capacity)
         self._alpha, self._beta = table.priority_exponent, table.importance_exponent
 
     def draw(self, count: int, size: int) -> tuple[Rows, NDArray[np.float32]]:
@@ -109,59 +107,3 @@ class Proportional(Sampling):
     def prioritise(self, rows: Rows, priorities: Floats) -> None:
         """Set p_i^alpha of these rows; if a row repeats, its last priority counts."""
         self._tree.update(rows, np.maximum(priorities, PRIORITY_FLOOR) ** self._alpha)
-
-
-class SumTree:
-    """Sums of non-negative values, `GROUP` to a node: values are set and found by running sum in O(log n).
-
-    Every node is always the sum of its group, added from left to right, so the tree depends only on its values, not
-    on the order of updates: a restored tree equals the saved one to the bit. The running sums of each group
-    are kept, so that a search only compares. The lowest level of at most `TOP` nodes is the last, one group.
-    """
-
-    def __init__(self, capacity: int) -> None:
-        self._levels: list[Floats] = []  # [groups, GROUP], from the values up; the last one is [1, nodes]
-        self._running: list[Floats] = []  # of each level, [groups, GROUP + 1]: 0, and the sums of a group's first
-        nodes = capacity
-        while nodes > TOP:
-            nodes = -(-nodes // GROUP)
-            self._levels.append(np.zeros((nodes, GROUP)))
-            self._running.append(np.zeros((nodes, GROUP + 1)))
-        self._levels.append(np.zeros((1, nodes)))
-        self._running.append(np.zeros((1, nodes + 1)))
-
-    @property
-    def total(self) -> float:
-        """Sum of all values."""
-        return float(self._running[-1][0, -1])
-
-    def values(self, rows: Rows) -> Floats:
-        """Values at these rows."""
-        found: Floats = self._levels[0].ravel()[rows]
-        return found
-
-    def update(self, rows: Rows, values: Floats) -> None:
-        """Set values; if a row repeats, its last value counts."""
-        self._levels[0].ravel()[rows] = values
-        for below, running, above in zip(self._levels, self._running, self._levels[1:], strict=False):
-            rows = rows >> GROUP_BITS
-            sums = below.take(rows, axis=0).cumsum(axis=1)
-            running[rows, 1:] = sums
-            above.ravel()[rows] = sums[:, -1]
-        self._levels[-1].cumsum(out=self._running[-1][0, 1:])
-
-    def find(self, sums: Floats) -> Rows:
-        """For each running sum in [0, total), the row whose value covers it; never a row whose value is 0."""
-        lines = np.arange(len(sums))
-        top = self._running[-1][0]
-        # Rounding may move a sum to the end of its node, which no value covers.
-        sums = np.minimum(sums, np.nextafter(top[-1], 0))
-        nodes: Rows = top.searchsorted(sums, "right") - 1
-        before = top[nodes]
-        for running in self._running[-2::-1]:
-            inside = running.take(nodes, axis=0)
-            sums = np.minimum(sums - before, np.nextafter(inside[:, -1], 0))
-            child = (inside > sums[:, None]).argmax(axis=1) - 1
-            before = inside[lines, child]
-            nodes = nodes * GROUP + child
-        return nodes

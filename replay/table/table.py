@@ -279,7 +279,8 @@ class Table:
         not finite, and for different lengths.
         """
         given = np.asarray(priorities, np.float64)
-        if len(ids) != len(given) or not ((given >= 0) & (given < np.inf)).all():
+        largest = float(given.max(initial=0))
+        if len(ids) != len(given) or not (given.min(initial=0) >= 0 and largest < np.inf):  # NaN is neither
             raise ValueError("priorities: must be finite, at least 0, and one for each id")
         if not self._prioritized:
             return
@@ -288,9 +289,11 @@ class Table:
         else:
             rows = np.array([self._row_of.get(number, self.capacity) for number in ids.tolist()], np.intp)
         held = (rows < len(self)) & (self._columns.ids.take(rows, mode="clip") == ids)
-        rows, given = rows[held], given[held]
+        if not held.all():
+            rows, given = rows[held], given[held]
+            largest = float(given.max(initial=0))
         if len(rows):
-            self._max_priority = max(self._max_priority, float(given.max()))
+            self._max_priority = max(self._max_priority, largest)
             self._set_priorities(rows, given)
 
     def snapshot(self) -> TableSnapshot:

@@ -6,27 +6,15 @@ operation rounds on its own: numba contracts nothing without `fastmath`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
-
-import numba
 import numpy as np
 
+from coop.common.compiling import compiled
 from coop.common.types import Array
 
 LARGEST = np.finfo(np.float32).max
-Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 
-def _jit(loop: Loop) -> Loop:
-    """Compile a function at its first call; the result is kept on the disk, if there is a place for it."""
-    try:
-        return cast(Loop, numba.njit(cache=True, error_model="numpy")(loop))
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        return cast(Loop, numba.njit(error_model="numpy")(loop))
-
-
-@_jit
+@compiled
 def push(
     state: Array,
     cos: Array,
@@ -75,7 +63,7 @@ def push(
     return some
 
 
-@_jit
+@compiled
 def gather(
     obs: Array,
     next_obs: Array,
@@ -117,7 +105,7 @@ def gather(
             seen[k, 4, b] = 1 if terminated[k, row] else 0
 
 
-@_jit
+@compiled
 def insert(
     rows: Array,
     new_obs: Array,
@@ -164,7 +152,7 @@ def insert(
         reuse[k, row] = 0
 
 
-@_jit
+@compiled
 def rectify(
     columns: Array,
     bias: Array,
@@ -179,7 +167,7 @@ def rectify(
                 line[b] = zero if value <= zero else value
 
 
-@_jit
+@compiled
 def rectify_both(
     columns: Array,
     bias: Array,
@@ -201,7 +189,7 @@ def rectify_both(
                     h[k, b, i] = columns[k, i, b]
 
 
-@_jit
+@compiled
 def shift(
     columns: Array,
     bias: Array,
@@ -213,7 +201,7 @@ def shift(
                 columns[k, i, b] += bias[k, i]
 
 
-@_jit
+@compiled
 def temporal(
     values: Array,
     next_values: Array,
@@ -253,7 +241,7 @@ def temporal(
     return finite
 
 
-@_jit
+@compiled
 def summed(
     delta: Array,
     bias: Array,
@@ -269,7 +257,7 @@ def summed(
                 sums[i] += line[i]
 
 
-@_jit
+@compiled
 def masked(
     delta: Array,
     h: Array,
@@ -285,7 +273,7 @@ def masked(
     summed(delta, bias)
 
 
-@_jit
+@compiled
 def spread(
     shared: Array,
     h: Array,
@@ -302,7 +290,7 @@ def spread(
                     line[i] = source[i] * (one if active[i] > zero else zero)
 
 
-@_jit
+@compiled
 def muted(
     t: Array,
     h: Array,
@@ -317,7 +305,7 @@ def muted(
                     line[i] *= one if active[i] > zero else zero
 
 
-@_jit
+@compiled
 def whiten(
     grams: Array,
     e: Array,
@@ -356,7 +344,7 @@ def whiten(
     return any_doubt
 
 
-@_jit
+@compiled
 def adam(
     theta: Array,
     gradient: Array,
