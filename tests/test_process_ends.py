@@ -147,4 +147,6 @@ def test_a_command_s_own_words_are_those_of_its_last_start(tmp_path: Path) -> No
     assert child.why().startswith("x ended (exit status 3): coop-x: error: ")
     assert "earlier" not in child.why()
     assert child.last_line() == "cleaning up"
+    assert child.has_said("error")
+    assert not child.has_said("an earlier one")
     assert child.own_words().startswith("3 coop-x: error: ")

@@ -134,6 +134,10 @@ class ChildProcess:
         lines = self._lines()
         return lines[-1] if lines else ""
 
+    def has_said(self, words: str) -> bool:
+        """Whether a line that it has printed since this start holds `words`."""
+        return any(words in line for line in self._lines())
+
     def _reason(self) -> str:
         """The line in which it says why it failed, or else its last line."""
         return reason_in(self._lines())
