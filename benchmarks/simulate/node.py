@@ -19,6 +19,7 @@ from coop.common.messaging.keys import run_key, stop_key
 from coop.common.messaging.messages.answers import Error
 from coop.common.messaging.messages.control import EndOfRun
 from coop.common.messaging.presence import Presence
+from coop.common.messaging.runs import check_run, identified, name_of
 from coop.common.messaging.timing import ASK_TIMEOUT, LEASE
 from coop.common.messaging.transport import NoAnswer, Refused
 from coop.common.messaging.wire import Message
@@ -33,6 +34,7 @@ class SimAnswer:
     def __init__(self, node: SimNode, key: str, timeout: float) -> None:
         self.node = node
         self.key = key
+        self._run = node.run
         self._raw: bytes | None = None
         self._settled = False
         self._then: Callable[[], None] | None = None
@@ -80,20 +82,28 @@ class SimAnswer:
         message = wire.decode(self._raw)
         if message.kind == Error.kind:
             raise Refused(Error.decode(message).problem)
-        return message
+        try:
+            return check_run(message, self._run)
+        except BadMessage as error:
+            raise NoAnswer(f"an answer that can't be read: {error}") from error
 
 
 class SimLatest:
     """The newest value of a broadcast key."""
 
-    def __init__(self, node: SimNode) -> None:
+    def __init__(self, node: SimNode, key: str) -> None:
         self._node = node
+        self._key = key
         self.raw: bytes | None = None
 
     def poll(self) -> Message | None:
         """See `Latest`."""
         raw, self.raw = self.raw, None
-        return None if raw is None else self._node.read(raw)
+        try:
+            return None if raw is None else self._node.read(raw)
+        except BadMessage as error:
+            self._node.count_bad(self._key, error)
+            return None
 
 
 class _Inline(Executor):
@@ -184,7 +194,7 @@ class _Server:
         if not isinstance(error, CoopError):
             self.node.faults.note(f"serving {self.key}", error)
         self.queue.popleft()
-        self._send(bytes(Error.of(error).encode(RUN)), answer, link)
+        self._send(bytes(Error.of(error).encode(self.node.run)), answer, link)
 
     def _reply(self, payload: bytearray) -> None:
         _, answer, link = self.queue.popleft()
@@ -219,9 +229,11 @@ class SimNode:
 
     Attributes:
         on_reply: called with the node, the key, the question and the answer whenever one leaves.
+        on_heard: called with the node, the one that has broadcast, and the key, whenever that was obeyed.
     """
 
     on_reply: Callable[[SimNode, str, Message, bytes], None] = staticmethod(lambda node, key, message, reply: None)
+    on_heard: Callable[[SimNode, SimNode, str], None] = staticmethod(lambda node, source, key: None)
 
     def __init__(
         self,
@@ -231,10 +243,12 @@ class SimNode:
         incarnation: int,
         listen: str = "",
         connect: Sequence[str] = (),
+        run: str = RUN,
     ) -> None:
         self.network = network
         self.process = process
-        self.run = RUN
+        self.run = run
+        self.run_name = name_of(run)
         self.role = role
         self.incarnation = incarnation
         self.bad_messages = 0
@@ -254,7 +268,12 @@ class SimNode:
 
     def key(self, *parts: str) -> str:
         """See `Node`."""
-        return run_key(RUN, *parts)
+        return run_key(self.run_name, *parts)
+
+    def belong(self, run_id: int) -> None:
+        """See `Node`."""
+        self.run = identified(self.run_name, run_id)
+        self.process.state["run"] = run_id
 
     def now(self) -> float:
         """See `Node`."""
@@ -270,14 +289,13 @@ class SimNode:
 
     def read(self, payload: bytes) -> Message:
         """See `Node`."""
-        message = wire.decode(payload)
-        if message.run != RUN:
-            raise BadMessage("run", f"{message.run!r}; this is run {RUN!r}")
-        return message
+        return check_run(wire.decode(payload), self.run)
 
     def count_bad(self, place: str, error: BadMessage) -> None:
-        """Nobody sends bad messages here."""
-        raise Violation(f"a bad message at {place}: {error}")
+        """Nobody sends bad messages here, but another run of the same name its own."""
+        if error.field != "run":
+            raise Violation(f"a bad message at {place}: {error}")
+        self.bad_messages += 1
 
     def linked(self, other: SimNode) -> bool:
         """Whether there is a link."""
@@ -322,7 +340,7 @@ class SimNode:
         for link in self.links:
             other = link.other(self)
             if other.wants(key):
-                self.network.send(self, link, lambda o=other: o.receive(key, raw))  # type: ignore[misc]
+                self.network.send(self, link, lambda o=other: o.receive(key, raw, self))  # type: ignore[misc]
 
     announce = publish
 
@@ -330,7 +348,7 @@ class SimNode:
         """Whether this node follows a key."""
         return key in self._latest or any(fnmatchcase(key, pattern) for pattern, _ in self._calls)
 
-    def receive(self, key: str, raw: bytes) -> None:
+    def receive(self, key: str, raw: bytes, source: SimNode) -> None:
         """Take a broadcast."""
         if not self.open:
             return
@@ -339,7 +357,12 @@ class SimNode:
             self._latest[key].raw = raw
         for pattern, call in self._calls:
             if fnmatchcase(key, pattern):
-                call(key, self.read(raw))
+                try:
+                    call(key, self.read(raw))
+                except BadMessage as error:
+                    self.count_bad(key, error)
+                else:
+                    self.on_heard(self, source, key)
 
     def arrived(self, key: str, raw: bytes) -> None:
         """Remember what has been said about the acting role."""
@@ -351,7 +374,7 @@ class SimNode:
 
     def latest(self, key: str) -> SimLatest:
         """See `Node`."""
-        self._latest[key] = SimLatest(self)
+        self._latest[key] = SimLatest(self, key)
         return self._latest[key]
 
     def on(self, key: str, doing: str, call: Callable[[str, Message], None]) -> None:
