@@ -15,9 +15,8 @@ from typing import Any
 from unittest.mock import patch
 
 import msgspec
-import numpy as np
 
-from benchmarks.simulate import roles
+from benchmarks.simulate import quick, roles
 from benchmarks.simulate.agent import NoDiagnostics, Plain
 from benchmarks.simulate.checks import Checks
 from benchmarks.simulate.disk import Disk
@@ -289,10 +288,8 @@ class Cluster:
         checks, ids = self.checks, self._numbers
         kinds = watched(checks)
         with contextlib.ExitStack() as stack:
-
-            def replace(place: str, what: object) -> None:
-                stack.enter_context(patch(place, what))
-
+            quick.install(stack)
+            replace = partial(quick.replace, stack)
             replace("coop.replay.cli.ReplayCore", kinds.core)
             replace("coop.replay.cli.ReplayService", kinds.service)
             replace("coop.learner.process.Roster", kinds.roster)
@@ -302,7 +299,6 @@ class Cluster:
             replace("coop.learner.trainer.METRICS_EVERY", 1 << 40)
             replace("coop.replay.core.check_memory", lambda config, spec: None)
             replace("coop.replay.service.new_incarnation", self.incarnation)
-            replace("coop.replay.persistence.storage.load_array", lambda path, small: np.load(path))  # not mapped
             replace("coop.records.learner_checkpoints.torch", Plain)
             replace("coop.records.learner_checkpoints.check_torch_file", lambda path: None)
             replace("coop.learner.telemetry.Diagnostics", NoDiagnostics)

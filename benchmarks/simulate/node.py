@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
 from benchmarks.simulate.network import Link, Network
+from benchmarks.simulate.server import Server
 from benchmarks.simulate.world import Activity, Process, Violation
-from coop.common.errors import BadMessage, CoopError
+from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.conversation import Conversation
 from coop.common.messaging.keys import run_key, stop_key
@@ -26,6 +27,7 @@ from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
 
 RUN = "run"
+_fits = lru_cache(1024)(fnmatchcase)
 
 
 class SimAnswer:
@@ -126,104 +128,6 @@ class _Loud:
         raise Violation(f"a bug, {place}: {error!r}") from error
 
 
-class _Server:
-    """Answers the questions of one key, one after another."""
-
-    def __init__(
-        self,
-        node: SimNode,
-        key: str,
-        answer: Callable[[Message], bytearray | Conversation[bytearray]],
-        flush: Callable[[], bytearray | None] | None,
-    ) -> None:
-        self.node, self.key, self.answer, self.flush = node, key, answer, flush
-        self.queue: deque[tuple[bytes, SimAnswer, Link]] = deque()
-        self.held: Conversation[bytearray] | None = None
-        self.current: Message | None = None
-        self.turn = 0
-        self._unflushed: list[tuple[bytes, SimAnswer, Link, Message]] = []
-
-    def receive(self, raw: bytes, answer: SimAnswer, link: Link) -> None:
-        """Take a question."""
-        self.queue.append((raw, answer, link))
-        if self.held is None and len(self.queue) == 1:
-            self._next()
-
-    def _next(self) -> None:
-        while self.queue and self.held is None:
-            raw, answer, link = self.queue[0]
-            try:
-                self.current = self.node.read(raw)
-                given = self.answer(self.current)
-            except Exception as error:  # as in `Node._serve`
-                self._refuse(error, answer, link)
-                continue
-            if isinstance(given, bytearray):
-                self._reply(given)
-            else:
-                self.held = given
-                self.go_on()
-                return
-
-    def go_on(self) -> None:
-        """Resume the conversation that answers."""
-        if self.held is None:
-            return
-        self.turn += 1
-        try:
-            wait = next(self.held)
-        except StopIteration as end:
-            self.held = None
-            self._reply(end.value)
-        except Exception as error:
-            self.held = None
-            _, answer, link = self.queue[0]
-            self._refuse(error, answer, link)
-        else:
-            assert isinstance(wait, float | int)
-            turn, process = self.turn, self.node.process
-            process.world.after(wait, lambda: process.do(lambda: self._timed(turn)))
-            return
-        self._next()
-
-    def _timed(self, turn: int) -> None:
-        if turn == self.turn:
-            self.go_on()
-
-    def _refuse(self, error: Exception, answer: SimAnswer, link: Link) -> None:
-        if not isinstance(error, CoopError):
-            self.node.faults.note(f"serving {self.key}", error)
-        self.queue.popleft()
-        self._send(bytes(Error.of(error).encode(self.node.run)), answer, link)
-
-    def _reply(self, payload: bytearray) -> None:
-        _, answer, link = self.queue.popleft()
-        assert self.current is not None
-        reply = bytes(payload)
-        if self.flush is None:
-            self._give(reply, answer, link, self.current)
-            return
-        self._unflushed.append((reply, answer, link, self.current))
-        if len(self._unflushed) == 1:
-            process = self.node.process
-            process.world.after(process.world.disk_delay(process), lambda: process.do(self._flush))
-
-    def _flush(self) -> None:
-        group, self._unflushed = self._unflushed, []
-        assert self.flush is not None
-        instead = self.flush()
-        for reply, answer, link, message in group:
-            self._give(reply if instead is None else bytes(instead), answer, link, message)
-
-    def _give(self, reply: bytes, answer: SimAnswer, link: Link, message: Message) -> None:
-        self.node.on_reply(self.node, self.key, message, reply)
-        self._send(reply, answer, link)
-
-    def _send(self, reply: bytes, answer: SimAnswer, link: Link) -> None:
-        if link.up:
-            self.node.network.send(self.node, link, lambda: answer.give(reply))
-
-
 class SimNode:
     """One process's place in a run: a `Node`.
 
@@ -257,7 +161,7 @@ class SimNode:
         self.links: list[Link] = []
         self.open = True
         self.session = SimpleNamespace(liveliness=lambda: SimpleNamespace(get=lambda key, timeout: ()))
-        self._servers: dict[str, _Server] = {}
+        self._servers: dict[str, Server] = {}
         self._latest: dict[str, SimLatest] = {}
         self._calls: list[tuple[str, Callable[[str, Message], None]]] = []
         process.nodes.append(self)
@@ -322,7 +226,7 @@ class SimNode:
         changed: threading.Condition | None = None,
     ) -> None:
         """See `Node`."""
-        self._servers[key] = _Server(self, key, answer, flush)
+        self._servers[key] = Server(self, key, answer, flush)
         if changed is not None:
             changed.notify_all = self._changed  # type: ignore[method-assign]
 
@@ -346,7 +250,7 @@ class SimNode:
 
     def wants(self, key: str) -> bool:
         """Whether this node follows a key."""
-        return key in self._latest or any(fnmatchcase(key, pattern) for pattern, _ in self._calls)
+        return key in self._latest or any(_fits(key, pattern) for pattern, _ in self._calls)
 
     def receive(self, key: str, raw: bytes, source: SimNode) -> None:
         """Take a broadcast."""
@@ -356,7 +260,7 @@ class SimNode:
         if key in self._latest:
             self._latest[key].raw = raw
         for pattern, call in self._calls:
-            if fnmatchcase(key, pattern):
+            if _fits(key, pattern):
                 try:
                     call(key, self.read(raw))
                 except BadMessage as error:
