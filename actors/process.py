@@ -91,7 +91,7 @@ def _play(node: Node, stop: Stop, options: ActorOptions, request: Join, reply: J
     with (
         RoutedReplay(node)
         if options.mode == "client"
-        else ReplayRoute(options.run, request.incarnation, open_route, reply.replay_endpoints)
+        else ReplayRoute(node.run, request.incarnation, open_route, reply.replay_endpoints)
     ) as route:
 
         def learned(answer: JoinReply, _: float) -> None:

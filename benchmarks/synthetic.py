@@ -150,7 +150,11 @@ class SyntheticActor:
 
     def ask(self) -> None:
         """Ask the learner for news of the run's members, as an actor does every few seconds."""
-        self._asked = [_begin(self._session, join_key(self._space, "actor"), self._request.encode(self._space.run))]
+        self._asked = [
+            _begin(
+                self._session, join_key(self._space, "actor"), self._request.encode(self._space.run), self._space.run
+            )
+        ]
 
     def age(self) -> float:
         """Seconds since the broadcast of the parameters that act now; asks for newer ones if it missed them."""
@@ -175,14 +179,14 @@ class SyntheticActor:
         """Tell the learner that this actor stops; its links go with the process."""
         with contextlib.suppress(NoAnswer):
             payload = Leave(self._incarnation).encode(self._space.run)
-            _begin(self._session, join_key(self._space, "actor"), payload).wait()
+            _begin(self._session, join_key(self._space, "actor"), payload, self._space.run).wait()
 
     def _join(self) -> Sequence[str]:
         """Ask the learner until it answers with the replay service's endpoints."""
         deadline, key = time.monotonic() + PATIENCE, join_key(self._space, "actor")
         while time.monotonic() < deadline:
             with contextlib.suppress(NoAnswer):
-                answer = _begin(self._session, key, self._request.encode(self._space.run)).wait()
+                answer = _begin(self._session, key, self._request.encode(self._space.run), self._space.run).wait()
                 endpoints: list[str] = answer.fields["replay_endpoints"]
                 self._request = msgspec.structs.replace(self._request, index=answer.fields["index"])
                 if endpoints:
@@ -193,17 +197,19 @@ class SyntheticActor:
     def _fetch(self) -> None:
         """Ask the learner for both networks; the next role will tell their versions."""
         question = Current().encode(self._space.run)
-        self._asked = [_begin(self._session, weights_key(self._space, network), question) for network in (1, 2)]
+        self._asked = [
+            _begin(self._session, weights_key(self._space, network), question, self._space.run) for network in (1, 2)
+        ]
         self._fetched = True
 
     def _insert(self, payload: bytearray) -> Pending:
-        return _begin(self._route, replay_key(self._space, "insert"), payload)
+        return _begin(self._route, replay_key(self._space, "insert"), payload, self._space.run)
 
     def _subscribe(self, key: str) -> Any:  # noqa: ANN401 (zenoh's subscriber)
         return self._session.declare_subscriber(key, RingChannel(1))
 
 
-def _begin(session: zenoh.Session, key: str, payload: bytearray) -> Pending:
+def _begin(session: zenoh.Session, key: str, payload: bytearray, run: str) -> Pending:
     """Send a query as a `Node` does; an actor's node would have threads of its own."""
     handler = session.get(
         key,
@@ -213,4 +219,4 @@ def _begin(session: zenoh.Session, key: str, payload: bytearray) -> Pending:
         congestion_control=zenoh.CongestionControl.BLOCK,
         consolidation=zenoh.ConsolidationMode.NONE,
     )
-    return Pending(handler, key)
+    return Pending(handler, key, run)

@@ -93,6 +93,7 @@ def training_run(
     held = [each.number for each in reversed(found.whole)]
     shared = SharedCheckpoints(held, str(path), restart=options.restart)
     run_id = claim_run_directory(path, config) if found.newest is None else found.newest.manifest.run
+    node.belong(run_id)
     roster = Roster(path, node.now(), run_id)
     layout = agent.networks[0].layout_digest()
     join_service = JoinService(node, config, spec, layout, run_id, shared, roster, console.event)

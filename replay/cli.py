@@ -127,11 +127,9 @@ def _service(
     """Build a service from the folder's state: the learner's checkpoint, and the journal after it if there is one.
 
     Raises:
-        RunError: the folder belongs to another run, or the journal cannot be read or written.
+        RunError: the journal cannot be read or written.
         UsageError: the folder's table has other settings, or the data set of `replay.preload` can't be used.
     """
-    if reply.run_id != folder.run_id:
-        raise RunError(f"another learner of run {node.run!r} has begun while this one joined")
     core = ReplayCore(reply.config, reply.spec, shared_memory=shared_memory)
     checkpoints = ReplayCheckpoints(folder.path, folder.run_id, start=node.start)
     try:

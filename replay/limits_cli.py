@@ -40,7 +40,7 @@ def _run() -> None:
     if reply is None:
         return
     endpoints = (*options.connect, *reply.replay_endpoints)
-    with Node(open_session((), endpoints, options.zenoh_config), options.run, "watch", 0) as node:
+    with Node(open_session((), endpoints, options.zenoh_config), node.run, "watch", 0) as node:
         now = _ask(node, LimitsQuestion().encode(node.run))
         if options.ratio is not None or options.tolerance is not None:
             ratio = now.ratio if options.ratio is None else options.ratio
@@ -55,6 +55,6 @@ def _ask(node: Node, question: bytearray) -> Limits:
     try:
         return Limits.decode(node.ask(replay_key(node, "limits"), question))
     except NoAnswer as error:
-        raise RunError(f"the replay service of run {node.run!r} does not answer") from error
+        raise RunError(f"the replay service of run {node.run_name!r} does not answer") from error
     except Refused as error:
         raise RunError(f"the replay service refused: {error}") from error

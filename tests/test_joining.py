@@ -11,13 +11,22 @@ from samples import await_service, make_segment
 from coop.common.errors import JoinError
 from coop.common.messaging import joining, wire
 from coop.common.messaging.joining import difference, join, leave_run
-from coop.common.messaging.keys import join_key, replay_key
+from coop.common.messaging.keys import join_key, replay_key, stop_key
 from coop.common.messaging.members import Origin
-from coop.common.messaging.messages.control import EndOfRun, Join, JoinReply, Leave, Limit, Limits, LimitsQuestion
+from coop.common.messaging.messages.control import (
+    EndOfRun,
+    Join,
+    JoinReply,
+    Leave,
+    Limit,
+    Limits,
+    LimitsQuestion,
+    Snapshot,
+)
 from coop.common.messaging.messages.sample import encode_request
-from coop.common.messaging.messages.weights import Current
+from coop.common.messaging.messages.weights import Current, Role
 from coop.common.messaging.session import open_session
-from coop.common.messaging.transport import Node, Refused
+from coop.common.messaging.transport import NoAnswer, Node, Refused
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import RunConfig
 from coop.common.transitions import DrawRequest
@@ -62,6 +71,50 @@ def test_another_run_is_named(nodes: tuple[Node, Node], endpoint: str) -> None:
         pytest.raises(JoinError, match="no learner of run 'other' found at there within 1 s; there is run 'test'"),
     ):
         join(stranger, Stop(), REQUEST, ("there",), 1)
+
+
+def test_nothing_of_another_run_of_the_same_name_is_taken(
+    nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path
+) -> None:
+    here, there = nodes
+    folder = tmp_path / "replay"
+    core = ReplayCore(RunConfig(run="test"), spec)
+    ReplayService(here, core, ReplayCheckpoints(folder, 5)).start()
+    here.serve("coop/test/role", lambda message: Role(1, (0, 0), 0, 0).encode("test#6"))
+    await_service(there, replay_key(there, "snapshot"))  # the last one that the service declares
+    stop = Stop()
+    here.follow_stop(stop)
+    draw = DrawRequest(1, 0, 0, core.batch_size, 0)
+    here.belong(5)
+    there.belong(6)
+    await_service(there, "coop/test/role")
+    for key, request in (
+        ("sample", encode_request(there.run, draw)),
+        ("snapshot", Snapshot(5, [], 1, 0).encode("test#6")),
+    ):
+        with pytest.raises(Refused, match=r"^run: 'test#6'; this is run 'test#5'$"):
+            there.ask(replay_key(there, key), request)
+    assert (core.drawn, core.repeatable(), folder.exists()) == (0, [], False)
+    there.announce(stop_key(there), EndOfRun.because("complete").encode(there.run))
+    there.belong(5)
+    with pytest.raises(NoAnswer, match="run: 'test#6'; this is run 'test#5'"):
+        there.ask("coop/test/role", Current().encode(there.run))
+    assert there.ask(replay_key(there, "sample"), encode_request(there.run, draw)).kind == "retry"
+    there.announce(stop_key(there), EndOfRun.because("interrupted").encode(there.run))
+    assert stop.wait(10)
+    assert "interrupted" in stop.reason
+
+
+def test_who_has_joined_belongs_to_that_run_alone(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
+    learner, actor = nodes
+    _receive(learner, spec)
+    await_service(actor, join_key(actor, "actor"))
+    assert actor.run == "test"
+    assert join(actor, Stop(), REQUEST, ("there",), 5) is not None
+    assert (actor.run, actor.run_name, actor.key("role")) == ("test#9", "test", "coop/test/role")
+    learner.belong(10)  # another one, at the same address
+    with pytest.raises(JoinError, match=r"^the learner of run 'test' refused: run: 'test#9'; this is run 'test#a'$"):
+        join(actor, Stop(), REQUEST, ("there",), 5)
 
 
 MINE = JoinReply(RunConfig(), EnvSpec("CartPole-v0", (4,), "float32", 1, 2), "abc", 0, [], 5, 0)

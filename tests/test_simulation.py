@@ -50,7 +50,7 @@ def test_a_planted_bug_is_found_said_and_made_small() -> None:
     assert str(small.plan.faults[0]) in text
 
 
-@pytest.mark.parametrize("bug", ["skipped-batch", "short-window"])
+@pytest.mark.parametrize("bug", ["skipped-batch", "short-window", "any-run"])
 def test_other_planted_bugs_are_found(bug: str) -> None:
     count, found = find(bug, 0, 60)
     assert found is not None, f"{PLANTED[bug][0]}: not found in {count} seeds"
@@ -80,6 +80,28 @@ def test_a_disk_that_fails_a_flush_and_dies_loses_nothing_acknowledged(seed: int
     assert outcome.plan.journal == "sync"
     assert outcome.met["bad flush"] == outcome.met["crash"] == 1
     assert not outcome.forgiven
+
+
+@pytest.mark.parametrize("away", ["freeze", "kill", "partition"])
+def test_a_second_learner_on_the_same_folder_waits_for_the_first_one_s_end(away: str) -> None:
+    faults = (
+        Fault(1.0, away, "learner", "replay", length=3.0),
+        Fault(1.1, "second learner", "learner", "on the same folder"),
+    )
+    outcome = simulate(0, replace(make_plan(0), faults=faults, total=96, every=0.1), words=True)
+    _assert_holds(outcome)
+    refused = any("learner second 1 ends: RunError: /learner/run: learner uses it" in line for line in outcome.trace)
+    assert refused == (away != "kill")
+    assert outcome.checks["one learner"] >= 2 - refused
+
+
+def test_a_learner_of_another_run_of_the_same_name_is_refused() -> None:
+    faults = (Fault(1.0, "second learner", "learner", "elsewhere", 4.0),)
+    outcome = simulate(0, replace(make_plan(0), faults=faults, total=96, every=0.1), words=True)
+    _assert_holds(outcome)
+    ends = [line for line in outcome.trace if "learner second 1 ends: Refused: run: 'run#" in line]
+    assert len(ends) == 1
+    assert outcome.checks["one run"] > 0
 
 
 def test_a_flush_that_outlives_the_confirmation_acknowledges_nothing() -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Collection
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from benchmarks.simulate.roles import STEPS
 from benchmarks.simulate.sealed import Checkpoints
+from benchmarks.simulate.strangers import Strangers
 from benchmarks.simulate.world import Process, Violation
 from coop.common.messaging import wire
 from coop.common.messaging.messages.evaluate import EvaluationRow
@@ -37,6 +39,8 @@ EXPECTED = (  # how processes end that meet faults, in words
     "the journal can't be flushed",
     "another learner",
     "no checkpoint to resume from",
+    "; this is run ",
+    "belongs to another run",
 )
 
 
@@ -44,13 +48,15 @@ class Checks:
     """Knows what was promised: which segments have been acknowledged, what was drawn, broadcast and saved.
 
     Attributes:
-        done: how often each invariant was looked at. checkpoints: looks at those that are sealed.
+        done: how often each invariant was looked at. checkpoints: looks at those that are sealed. strangers: knows who
+            takes part in another run; what follows is about this one.
     """
 
     def __init__(self, cluster: Cluster) -> None:
         self.cluster = cluster
         self.done: Counter[str] = Counter()
         self.checkpoints = Checkpoints(self)
+        self.strangers = Strangers(self)
         self._believed: Counter[int] = Counter()  # transitions acknowledged to each actor
         self.serving = -1  # incarnation of the replay service that the learner has admitted
         self.acked: dict[tuple[int, int], str] = {}  # segments, with when
@@ -94,6 +100,9 @@ class Checks:
 
     def on_reply(self, node: Any, key: str, message: wire.Message, reply: bytes) -> None:  # noqa: ANN401
         """An answer leaves."""
+        self.strangers.answers(node, key, message)
+        if self.strangers.foreign(node.process):
+            return
         if node.role == "learner" and key.endswith("/config/replay") and message.kind == "leave":
             self._departs(message.fields["incarnation"], wire.decode(reply).kind)
         if node.role != "replay" or not key.endswith(("/insert", "/sample")):
@@ -118,7 +127,8 @@ class Checks:
         """The learner answers a replay service that wants to leave."""
         if answer != "farewell" or incarnation != self.serving or self._trainer is None:
             return
-        learner = self.cluster.roles["learner"]
+        learner = self.cluster.learner
+        assert learner is not None
         if learner.stop.is_set() or self._trainer.outcome() or not self._trainer.agent.updates:
             return
         self.hold(
@@ -127,7 +137,7 @@ class Checks:
 
     def said(self, process: Process, text: str) -> None:
         """A role has said something."""
-        if process.role == "learner" and ("saved, " in text or "goes on without it" in text):
+        if process is self.cluster.learner and ("saved, " in text or "goes on without it" in text):
             self._last_save = self.cluster.world.now
             self.checkpoints.look_at_parts()
 
@@ -263,8 +273,10 @@ class Checks:
     # ------------------------------------------------------------------------------------------------------------------
     # Weights
 
-    def evaluated(self, row: EvaluationRow) -> None:
+    def evaluated(self, folder: Path, row: EvaluationRow) -> None:
         """The learner has recorded an evaluation, whose seconds no other has."""
+        if self.strangers.foreign_folder(folder):
+            return
         self.hold("evaluation", row.seconds not in self._evaluations, "recorded twice by one learner")
         self._evaluations.add(row.seconds)
         assert self._trainer is not None
@@ -281,6 +293,8 @@ class Checks:
 
     def look(self, process: Process, weights: Any, policy: Any) -> None:  # noqa: ANN401
         """An actor has looked for weights: those that it acts with must be whole, and after a while the newest."""
+        if self.strangers.foreign(process):
+            return
         now, network = self.cluster.world.now, self.cluster.network
         acked = process.state["inserts"].acked
         given = self._believed[process.state["incarnation"]]
@@ -288,7 +302,8 @@ class Checks:
         if not weights.ready:
             return
         heard = process.state.pop("roles", ())
-        told = [process.state.get("role"), *map(_acting, heard)]
+        roles = (acting for run, acting in map(_acting, heard) if run == process.nodes[0].run)
+        told = [process.state.get("role"), *roles]
         process.state["role"] = told[-1]
         self.hold("role", policy.acting in told, f"{process.name} acts with network {policy.acting + 1}")
         for number, each in enumerate(policy.networks):
@@ -296,10 +311,11 @@ class Checks:
             expected = self._flats.get((number, held))
             if held and expected is not None:
                 self.hold("weights", each.flat.tobytes() in expected, f"network {number + 1} is not version {held}")
-        learner = self.cluster.roles.get("learner")
+        learner = self.cluster.learner
         calm = max(network.disturbed, process.since, 0.0 if learner is None else learner.since, self._began_at)
         node = process.nodes[0]
-        linked = [link for link in node.links if link.other(node).role == "learner"]
+        others = (link.other(node) for link in node.links)
+        linked = [other for other in others if other.role == "learner" and not self.strangers.foreign(other.process)]
         weather = network.weather
         if now - calm < STALE or network.cuts or weather.lost or weather.delay > 0.01 or not linked:
             process.state.pop("calm", None)
@@ -325,7 +341,8 @@ class Checks:
         expected = not reason or any(words in reason for words in EXPECTED)
         expected |= process.stop.is_set() and ("was not begun" in reason or "no answer to" in reason)
         self.hold("ends", expected, f"{process.name}: {reason}")
-        if process.role == "replay" and self.cluster.plan.journal == "off":
+        foreign = self.strangers.foreign(process)
+        if process.role == "replay" and self.cluster.plan.journal == "off" and not foreign:
             self._forgive = True
 
     def crashed(self, top: str) -> None:
@@ -373,9 +390,10 @@ def _lacks_draws(core: ReplayCore) -> bool:
 
 
 @lru_cache(64)
-def _acting(role: bytes) -> int:
-    """The network that acts, from 0 on."""
-    return Role.decode(wire.decode(role)).acting - 1
+def _acting(role: bytes) -> tuple[str, int]:
+    """Whose role it is, and the network that acts, from 0 on."""
+    message = wire.decode(role)
+    return message.run, Role.decode(message).acting - 1
 
 
 def _digest(agent: Any) -> bytes:  # noqa: ANN401

@@ -15,9 +15,8 @@ from typing import Any
 from unittest.mock import patch
 
 import msgspec
-import numpy as np
 
-from benchmarks.simulate import roles
+from benchmarks.simulate import quick, roles
 from benchmarks.simulate.agent import NoDiagnostics, Plain
 from benchmarks.simulate.checks import Checks
 from benchmarks.simulate.disk import Disk
@@ -28,6 +27,7 @@ from benchmarks.simulate.world import Machine, Process, Violation, World
 from coop.common.errors import RunError
 from coop.common.settings.config import ActorSettings, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.tables import to_tables
+from coop.learner.trainer import Trainer
 
 ENDS_WITHIN = 240.0  # seconds after the last fault: a lost acknowledgement alone takes a minute to be missed
 LEAVES_WITHIN = 90.0  # seconds that other roles may take once the run is complete: their patience is 60
@@ -54,6 +54,8 @@ class Cluster:
         self.met: Counter[str] = Counter()
         self.slow: dict[str, float] = {}
         self.roles: dict[str, Process] = {}
+        self.learner: Process | None = None  # of this run, the last one that has got its folder
+        self._heads = [roles.LEARNER, *[roles.STRANGER] * plan.strangers]  # endpoints that the others know
         self.locks: dict[Path, Process] = {}
         self._numbers = random.Random(f"ids {seed}")
         self._actors = 0
@@ -111,7 +113,7 @@ class Cluster:
     # ------------------------------------------------------------------------------------------------------------------
 
     def begin(self, name: str, place: str = "") -> None:
-        """Start a role's process; `place`: another folder than usual, for a second replay service."""
+        """Start a role's process; `place`: another folder than usual, for a second replay service or learner."""
         present = self.roles.get(name)
         if self.complete or (present is not None and present.alive):
             return
@@ -122,33 +124,46 @@ class Cluster:
         process.on_end = partial(self._ended, name, process)
         incarnation = self.incarnation()
         process.state["incarnation"] = incarnation
+        self.checks.strangers.begins(process, stranger=role == "learner" and bool(place))
         self.world.tell(name, "starts, incarnation", f"{incarnation:x}")
         process.do(lambda: self._hold(process, role, incarnation, place or machine.name))
 
     def _hold(self, process: Process, role: str, incarnation: int, place: str) -> None:
-        network, plan = self.network, self.plan
+        network, plan, heads = self.network, self.plan, self._heads
         if role == "learner":
-            path = self.root / "learner" / "run"
-            conversation: Any = roles.learner(
-                network, process, self.config, path, watched_trainer(self.checks, incarnation), incarnation
-            )
-            self.checks.learner_begins(process)
+            own = place == "learner"
+            path = self.root / place / ("run" if own else process.name)
+            at = roles.LEARNER if own else roles.STRANGER
+            kind = watched_trainer(self.checks, incarnation) if own else Trainer
+            lock = partial(self._locked, process, path)
+            conversation: Any = roles.learner(network, process, self.config, path, at, lock, kind, incarnation)
         elif role == "replay":
             self._services += 1
             at, path = f"tcp/replay:{self._services}", self.root / place / "table"
             process.state["folder"] = path
-            conversation = roles.replay(network, process, path, at, incarnation)
+            conversation = roles.replay(network, process, path, at, heads, incarnation)
         elif role == "actor":
             number, self._actors = self._actors, self._actors + 1
             look, sent = self.checks.look, self.checks.sent
-            conversation = roles.actor(network, process, number, incarnation, plan.every, plan.window, look, sent)
+            conversation = roles.actor(
+                network, process, heads, number, incarnation, plan.every, plan.window, look, sent
+            )
         else:
-            conversation = roles.evaluator(network, process, incarnation, 0.5)
+            conversation = roles.evaluator(network, process, heads, incarnation, 0.5)
         activity = process.start(role, conversation, process.stop)
         activity.on_result = lambda result: self._done(process, result)
 
+    def _locked(self, process: Process, path: Path) -> _Lock:
+        """The lock of a learner's folder."""
+        lock = _Lock(self, path, process.name, ("learner",))
+        self.checks.strangers.took(process, path)
+        if not self.checks.strangers.foreign(process):
+            self.learner = process
+            self.checks.learner_begins(process)
+        return lock
+
     def _done(self, process: Process, result: Any) -> None:  # noqa: ANN401
-        if process.role == "learner" and result is not None:
+        if process is self.learner and result is not None:
             self.world.tell("learner", "concludes:", result.exit)
             if result.exit.startswith("complete"):
                 self.checks.concluded(result)
@@ -158,7 +173,7 @@ class Cluster:
     def _ended(self, name: str, process: Process, reason: str) -> None:
         self.disk.deadly.pop(name, None)
         self.checks.ended(process, reason)
-        if not self.complete and not name.startswith("replay second"):
+        if not self.complete and " second " not in name:
             # A run goes on from the newest checkpoint that both hold. If its part is elsewhere, the service here is
             # refused by a line that names what is missing, and whoever runs it starts one there.
             refused = "no checkpoint to resume from" in reason and name == "replay"
@@ -229,6 +244,20 @@ class Cluster:
         place = "elsewhere" if fault.other == "elsewhere" else "replay"
         self.begin(f"replay second {self.met['second']}", place)
 
+    def _second_learner(self, fault: Fault) -> None:
+        name = f"learner second {self.met[fault.kind]}"
+        elsewhere = fault.other == "elsewhere"
+        self.begin(name, "elsewhere" if elsewhere else "")
+        if elsewhere:  # while it is there, restarted roles may join its run for good
+            self.world.after(fault.length, partial(self._end_second, name, told=bool(fault.number)))
+
+    def _end_second(self, name: str, *, told: bool) -> None:
+        process = self.roles[name]
+        if told:
+            process.do(lambda: process.stop.set("interrupted", exit_status=143))
+        else:
+            process.end("killed")
+
     def _second_actor(self, fault: Fault) -> None:
         self.begin(f"actor {2 + self.met[fault.kind]}")
 
@@ -259,10 +288,8 @@ class Cluster:
         checks, ids = self.checks, self._numbers
         kinds = watched(checks)
         with contextlib.ExitStack() as stack:
-
-            def replace(place: str, what: object) -> None:
-                stack.enter_context(patch(place, what))
-
+            quick.install(stack)
+            replace = partial(quick.replace, stack)
             replace("coop.replay.cli.ReplayCore", kinds.core)
             replace("coop.replay.cli.ReplayService", kinds.service)
             replace("coop.learner.process.Roster", kinds.roster)
@@ -272,7 +299,6 @@ class Cluster:
             replace("coop.learner.trainer.METRICS_EVERY", 1 << 40)
             replace("coop.replay.core.check_memory", lambda config, spec: None)
             replace("coop.replay.service.new_incarnation", self.incarnation)
-            replace("coop.replay.persistence.storage.load_array", lambda path, small: np.load(path))  # not mapped
             replace("coop.records.learner_checkpoints.torch", Plain)
             replace("coop.records.learner_checkpoints.check_torch_file", lambda path: None)
             replace("coop.learner.telemetry.Diagnostics", NoDiagnostics)
@@ -291,6 +317,7 @@ class Cluster:
             replace("coop.common.messaging.messages.control._modules", lambda tables: ())
             replace("coop.common.messaging.joining.identity", lambda config: {})
             replace("benchmarks.simulate.node.SimNode.on_reply", staticmethod(checks.on_reply))
+            replace("benchmarks.simulate.node.SimNode.on_heard", staticmethod(checks.strangers.heard))
             yield
 
     def _read(self, tables: dict[str, Any]) -> RunConfig:

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
 from benchmarks.simulate.network import Link, Network
+from benchmarks.simulate.server import Server
 from benchmarks.simulate.world import Activity, Process, Violation
-from coop.common.errors import BadMessage, CoopError
+from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.conversation import Conversation
 from coop.common.messaging.keys import run_key, stop_key
 from coop.common.messaging.messages.answers import Error
 from coop.common.messaging.messages.control import EndOfRun
 from coop.common.messaging.presence import Presence
+from coop.common.messaging.runs import check_run, identified, name_of
 from coop.common.messaging.timing import ASK_TIMEOUT, LEASE
 from coop.common.messaging.transport import NoAnswer, Refused
 from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
 
 RUN = "run"
+_fits = lru_cache(1024)(fnmatchcase)
 
 
 class SimAnswer:
@@ -33,6 +36,7 @@ class SimAnswer:
     def __init__(self, node: SimNode, key: str, timeout: float) -> None:
         self.node = node
         self.key = key
+        self._run = node.run
         self._raw: bytes | None = None
         self._settled = False
         self._then: Callable[[], None] | None = None
@@ -80,20 +84,28 @@ class SimAnswer:
         message = wire.decode(self._raw)
         if message.kind == Error.kind:
             raise Refused(Error.decode(message).problem)
-        return message
+        try:
+            return check_run(message, self._run)
+        except BadMessage as error:
+            raise NoAnswer(f"an answer that can't be read: {error}") from error
 
 
 class SimLatest:
     """The newest value of a broadcast key."""
 
-    def __init__(self, node: SimNode) -> None:
+    def __init__(self, node: SimNode, key: str) -> None:
         self._node = node
+        self._key = key
         self.raw: bytes | None = None
 
     def poll(self) -> Message | None:
         """See `Latest`."""
         raw, self.raw = self.raw, None
-        return None if raw is None else self._node.read(raw)
+        try:
+            return None if raw is None else self._node.read(raw)
+        except BadMessage as error:
+            self._node.count_bad(self._key, error)
+            return None
 
 
 class _Inline(Executor):
@@ -116,112 +128,16 @@ class _Loud:
         raise Violation(f"a bug, {place}: {error!r}") from error
 
 
-class _Server:
-    """Answers the questions of one key, one after another."""
-
-    def __init__(
-        self,
-        node: SimNode,
-        key: str,
-        answer: Callable[[Message], bytearray | Conversation[bytearray]],
-        flush: Callable[[], bytearray | None] | None,
-    ) -> None:
-        self.node, self.key, self.answer, self.flush = node, key, answer, flush
-        self.queue: deque[tuple[bytes, SimAnswer, Link]] = deque()
-        self.held: Conversation[bytearray] | None = None
-        self.current: Message | None = None
-        self.turn = 0
-        self._unflushed: list[tuple[bytes, SimAnswer, Link, Message]] = []
-
-    def receive(self, raw: bytes, answer: SimAnswer, link: Link) -> None:
-        """Take a question."""
-        self.queue.append((raw, answer, link))
-        if self.held is None and len(self.queue) == 1:
-            self._next()
-
-    def _next(self) -> None:
-        while self.queue and self.held is None:
-            raw, answer, link = self.queue[0]
-            try:
-                self.current = self.node.read(raw)
-                given = self.answer(self.current)
-            except Exception as error:  # as in `Node._serve`
-                self._refuse(error, answer, link)
-                continue
-            if isinstance(given, bytearray):
-                self._reply(given)
-            else:
-                self.held = given
-                self.go_on()
-                return
-
-    def go_on(self) -> None:
-        """Resume the conversation that answers."""
-        if self.held is None:
-            return
-        self.turn += 1
-        try:
-            wait = next(self.held)
-        except StopIteration as end:
-            self.held = None
-            self._reply(end.value)
-        except Exception as error:
-            self.held = None
-            _, answer, link = self.queue[0]
-            self._refuse(error, answer, link)
-        else:
-            assert isinstance(wait, float | int)
-            turn, process = self.turn, self.node.process
-            process.world.after(wait, lambda: process.do(lambda: self._timed(turn)))
-            return
-        self._next()
-
-    def _timed(self, turn: int) -> None:
-        if turn == self.turn:
-            self.go_on()
-
-    def _refuse(self, error: Exception, answer: SimAnswer, link: Link) -> None:
-        if not isinstance(error, CoopError):
-            self.node.faults.note(f"serving {self.key}", error)
-        self.queue.popleft()
-        self._send(bytes(Error.of(error).encode(RUN)), answer, link)
-
-    def _reply(self, payload: bytearray) -> None:
-        _, answer, link = self.queue.popleft()
-        assert self.current is not None
-        reply = bytes(payload)
-        if self.flush is None:
-            self._give(reply, answer, link, self.current)
-            return
-        self._unflushed.append((reply, answer, link, self.current))
-        if len(self._unflushed) == 1:
-            process = self.node.process
-            process.world.after(process.world.disk_delay(process), lambda: process.do(self._flush))
-
-    def _flush(self) -> None:
-        group, self._unflushed = self._unflushed, []
-        assert self.flush is not None
-        instead = self.flush()
-        for reply, answer, link, message in group:
-            self._give(reply if instead is None else bytes(instead), answer, link, message)
-
-    def _give(self, reply: bytes, answer: SimAnswer, link: Link, message: Message) -> None:
-        self.node.on_reply(self.node, self.key, message, reply)
-        self._send(reply, answer, link)
-
-    def _send(self, reply: bytes, answer: SimAnswer, link: Link) -> None:
-        if link.up:
-            self.node.network.send(self.node, link, lambda: answer.give(reply))
-
-
 class SimNode:
     """One process's place in a run: a `Node`.
 
     Attributes:
         on_reply: called with the node, the key, the question and the answer whenever one leaves.
+        on_heard: called with the node, the one that has broadcast, and the key, whenever that was obeyed.
     """
 
     on_reply: Callable[[SimNode, str, Message, bytes], None] = staticmethod(lambda node, key, message, reply: None)
+    on_heard: Callable[[SimNode, SimNode, str], None] = staticmethod(lambda node, source, key: None)
 
     def __init__(
         self,
@@ -231,10 +147,12 @@ class SimNode:
         incarnation: int,
         listen: str = "",
         connect: Sequence[str] = (),
+        run: str = RUN,
     ) -> None:
         self.network = network
         self.process = process
-        self.run = RUN
+        self.run = run
+        self.run_name = name_of(run)
         self.role = role
         self.incarnation = incarnation
         self.bad_messages = 0
@@ -243,7 +161,7 @@ class SimNode:
         self.links: list[Link] = []
         self.open = True
         self.session = SimpleNamespace(liveliness=lambda: SimpleNamespace(get=lambda key, timeout: ()))
-        self._servers: dict[str, _Server] = {}
+        self._servers: dict[str, Server] = {}
         self._latest: dict[str, SimLatest] = {}
         self._calls: list[tuple[str, Callable[[str, Message], None]]] = []
         process.nodes.append(self)
@@ -254,7 +172,12 @@ class SimNode:
 
     def key(self, *parts: str) -> str:
         """See `Node`."""
-        return run_key(RUN, *parts)
+        return run_key(self.run_name, *parts)
+
+    def belong(self, run_id: int) -> None:
+        """See `Node`."""
+        self.run = identified(self.run_name, run_id)
+        self.process.state["run"] = run_id
 
     def now(self) -> float:
         """See `Node`."""
@@ -270,14 +193,13 @@ class SimNode:
 
     def read(self, payload: bytes) -> Message:
         """See `Node`."""
-        message = wire.decode(payload)
-        if message.run != RUN:
-            raise BadMessage("run", f"{message.run!r}; this is run {RUN!r}")
-        return message
+        return check_run(wire.decode(payload), self.run)
 
     def count_bad(self, place: str, error: BadMessage) -> None:
-        """Nobody sends bad messages here."""
-        raise Violation(f"a bad message at {place}: {error}")
+        """Nobody sends bad messages here, but another run of the same name its own."""
+        if error.field != "run":
+            raise Violation(f"a bad message at {place}: {error}")
+        self.bad_messages += 1
 
     def linked(self, other: SimNode) -> bool:
         """Whether there is a link."""
@@ -304,7 +226,7 @@ class SimNode:
         changed: threading.Condition | None = None,
     ) -> None:
         """See `Node`."""
-        self._servers[key] = _Server(self, key, answer, flush)
+        self._servers[key] = Server(self, key, answer, flush)
         if changed is not None:
             changed.notify_all = self._changed  # type: ignore[method-assign]
 
@@ -322,15 +244,15 @@ class SimNode:
         for link in self.links:
             other = link.other(self)
             if other.wants(key):
-                self.network.send(self, link, lambda o=other: o.receive(key, raw))  # type: ignore[misc]
+                self.network.send(self, link, lambda o=other: o.receive(key, raw, self))  # type: ignore[misc]
 
     announce = publish
 
     def wants(self, key: str) -> bool:
         """Whether this node follows a key."""
-        return key in self._latest or any(fnmatchcase(key, pattern) for pattern, _ in self._calls)
+        return key in self._latest or any(_fits(key, pattern) for pattern, _ in self._calls)
 
-    def receive(self, key: str, raw: bytes) -> None:
+    def receive(self, key: str, raw: bytes, source: SimNode) -> None:
         """Take a broadcast."""
         if not self.open:
             return
@@ -338,8 +260,13 @@ class SimNode:
         if key in self._latest:
             self._latest[key].raw = raw
         for pattern, call in self._calls:
-            if fnmatchcase(key, pattern):
-                call(key, self.read(raw))
+            if _fits(key, pattern):
+                try:
+                    call(key, self.read(raw))
+                except BadMessage as error:
+                    self.count_bad(key, error)
+                else:
+                    self.on_heard(self, source, key)
 
     def arrived(self, key: str, raw: bytes) -> None:
         """Remember what has been said about the acting role."""
@@ -351,7 +278,7 @@ class SimNode:
 
     def latest(self, key: str) -> SimLatest:
         """See `Node`."""
-        self._latest[key] = SimLatest(self)
+        self._latest[key] = SimLatest(self, key)
         return self._latest[key]
 
     def on(self, key: str, doing: str, call: Callable[[str, Message], None]) -> None:

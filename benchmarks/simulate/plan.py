@@ -22,8 +22,9 @@ KINDS = (
     "second",
     "second actor",
     "bad flush",
+    "second learner",
 )
-_WEIGHTS = (6, 5, 4, 6, 8, 4, 3, 6, 2, 3, 1, 4, 1, 0)  # the last one comes by itself
+_WEIGHTS = (6, 5, 4, 6, 8, 4, 3, 6, 2, 3, 1, 4, 1, 0, 0)  # the last ones come by themselves
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class Fault:
             "second": f"a second replay service starts, {self.other}",
             "second actor": "another actor joins",
             "bad flush": f"the disk of {self.target} fails the next flush, and loses what it was to write",
+            "second learner": f"a second learner starts, {self.other}",
         }
         return f"{self.at:7.3f} s  {words[self.kind]}"
 
@@ -82,6 +84,11 @@ class Plan:
     actors: int
     evaluator: bool
     faults: tuple[Fault, ...]
+
+    @property
+    def strangers(self) -> bool:
+        """Whether the learner of another run of the same name appears, where the roles of this one reach it."""
+        return any(fault.kind == "second learner" and fault.other == "elsewhere" for fault in self.faults)
 
     def __str__(self) -> str:
         return (
@@ -113,7 +120,12 @@ def make_plan(seed: int) -> Plan:
         every=every,
         actors=actors,
         evaluator=draw.random() < 0.3,
-        faults=tuple(sorted([*_faults(draw, lasts), *_bad_flush(draw, lasts)], key=lambda fault: fault.at)),
+        faults=tuple(
+            sorted(
+                [*_faults(draw, lasts), *_bad_flush(draw, lasts), *_second_learner(seed, lasts)],
+                key=lambda fault: fault.at,
+            )
+        ),
     )
 
 
@@ -158,3 +170,18 @@ def _bad_flush(draw: random.Random, lasts: float) -> list[Fault]:
     at, target = draw.uniform(0.2, 1.2 * lasts), draw.choice(("learner", "replay", "replay"))
     then = [Fault(at + draw.uniform(0.1, 4.0), "crash", target)] if draw.random() < 0.7 else []
     return [Fault(at, "bad flush", target), *then]
+
+
+def _second_learner(seed: int, lasts: float) -> list[Fault]:
+    """Another learner, often just when the first one is away; drawn apart, so that all else is as without it."""
+    draw = random.Random(f"second learner {seed}")
+    if draw.random() > 0.25:
+        return []
+    at, where = draw.uniform(0.2, 1.2 * lasts), draw.choice(("elsewhere", "elsewhere", "on the same folder"))
+    stays, told = draw.uniform(0.5, 6.0), float(draw.random() < 0.5)
+    found = [Fault(at, "second learner", "learner", where, stays, told)]
+    if draw.random() < 0.6:
+        kinds = (("kill", ""), ("freeze", ""), ("partition", "replay"), ("partition", "actors"), ("cut", "replay"))
+        kind, other = draw.choice(kinds)
+        found.append(Fault(max(0.1, at + draw.uniform(-2.0, 0.5)), kind, "learner", other, draw.uniform(1.0, 6.0)))
+    return found

@@ -175,6 +175,10 @@ def _closing_once() -> Patches:
     return [(LearnerService, "_saving", saving)]
 
 
+def _any_run() -> Patches:
+    return [("benchmarks.simulate.node", "check_run", lambda message, run: message)]
+
+
 PLANTED: dict[str, tuple[str, Callable[[], Patches]]] = {
     "ack-before-write": ("a segment is acknowledged before its record is in the journal", _ack_before_write),
     "ack-before-flush": ("the sync journal acknowledges without a flush", _ack_before_flush),
@@ -194,6 +198,7 @@ PLANTED: dict[str, tuple[str, Callable[[], Patches]]] = {
     "late-acknowledgement": ("as it was: a slow flush outlives the confirmation", _late_acknowledgement),
     "closing-once": ("as it was: a replay service that restarts makes a complete run fail", _closing_once),
     "journal-begins-late": ("a checkpoint names the wrong file of the journal that continues it", _journal_begins_late),
+    "any-run": ("as it was: messages of another run of the same name are taken", _any_run),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,6 +41,7 @@ from coop.replay.cli import serving_run
 SPEC = EnvSpec("numbers", (1,), "float32", 1, 2)
 STEPS = 4  # of a segment
 LEARNER = "tcp/learner:1"
+STRANGER = "tcp/elsewhere:1"  # where the learner of another run of the same name listens
 JOIN_TIMEOUT = 60.0  # seconds, as in the product
 PATIENCE = 60.0  # seconds
 ACTOR_NUMBERS = 4096  # transitions of one actor process, so that all have numbers of their own
@@ -69,7 +71,7 @@ class Directory:
 
     def __init__(
         self,
-        recorded: Callable[[EvaluationRow], None],
+        recorded: Callable[[Path, EvaluationRow], None],
         path: Path,
         config: RunConfig,
         found: Any,  # noqa: ANN401
@@ -105,7 +107,7 @@ class Directory:
 
     def evaluation(self, row: EvaluationRow) -> None:
         """See `RunDirectory`."""
-        self._recorded(row)
+        self._recorded(self.path, row)
 
     def conclude(self, summary: Any, title: str) -> None:  # noqa: ANN401
         """See `RunDirectory`."""
@@ -128,22 +130,32 @@ def claim_directory(draw: random.Random, path: Path, config: RunConfig, known: i
 
 
 def learner(
-    network: Network, process: Process, config: RunConfig, path: Path, trainer_kind: type[Trainer], incarnation: int
+    network: Network,
+    process: Process,
+    config: RunConfig,
+    path: Path,
+    at: str,
+    locked: Callable[[], AbstractContextManager[object]],
+    trainer_kind: type[Trainer],
+    incarnation: int,
 ) -> Conversation[Any]:
-    """As `coop-learner --resume`."""
+    """As `coop-learner --resume`, at an endpoint; locked: takes the lock of its folder."""
     console, stop = Lines(process), process.stop
-    found, notices = Start(resume=True).prepare(path, replay=False, load=load_learner, every=True)
-    for line in notices:
-        console.event(line)
-    trainer = trainer_kind(FewNumbers(config, SPEC), process.now())
-    node = SimNode(network, process, "learner", incarnation, listen=LEARNER)
-    options = SimpleNamespace(restart=False, shared_memory=False, prometheus="", log="")
-    return (yield from training_run(node, stop, trainer, found, options, [LEARNER], console))
+    with locked():
+        found, notices = Start(resume=True).prepare(path, replay=False, load=load_learner, every=True)
+        for line in notices:
+            console.event(line)
+        trainer = trainer_kind(FewNumbers(config, SPEC), process.now())
+        node = SimNode(network, process, "learner", incarnation, listen=at)
+        options = SimpleNamespace(restart=False, shared_memory=False, prometheus="", log="")
+        return (yield from training_run(node, stop, trainer, found, options, [at], console))
 
 
-def replay(network: Network, process: Process, path: Path, at: str, incarnation: int) -> Conversation[None]:
-    """As `coop-replay --resume`."""
-    node = SimNode(network, process, "replay", incarnation, listen=at, connect=[LEARNER])
+def replay(
+    network: Network, process: Process, path: Path, at: str, connect: Sequence[str], incarnation: int
+) -> Conversation[None]:
+    """As `coop-replay --resume`; connect: endpoints of learners, here and below."""
+    node = SimNode(network, process, "replay", incarnation, listen=at, connect=connect)
     options: Any = SimpleNamespace(
         run=RUN,
         connect=(),
@@ -160,9 +172,11 @@ def replay(network: Network, process: Process, path: Path, at: str, incarnation:
 class Route(ReplayRoute):
     """An actor's route, over the simulated network."""
 
-    def __init__(self, network: Network, process: Process, incarnation: int, endpoints: Sequence[str]) -> None:
-        self._make = partial(SimNode, network, process, ROUTE, incarnation)
-        super().__init__(RUN, incarnation, lambda endpoints: None, endpoints)  # type: ignore[arg-type,return-value]
+    def __init__(
+        self, network: Network, process: Process, run: str, incarnation: int, endpoints: Sequence[str]
+    ) -> None:
+        self._make = partial(SimNode, network, process, ROUTE, incarnation, run=run)
+        super().__init__(run, incarnation, lambda endpoints: None, endpoints)  # type: ignore[arg-type,return-value]
 
     def _open(self, endpoints: Sequence[str]) -> Any:  # noqa: ANN401
         return self._make(connect=list(endpoints))
@@ -204,6 +218,7 @@ def make_segment(incarnation: int, number: int, sequence: int, version: int) -> 
 def actor(
     network: Network,
     process: Process,
+    connect: Sequence[str],
     number: int,
     incarnation: int,
     every: float,
@@ -216,13 +231,13 @@ def actor(
     every: seconds of a segment's steps. look, sent: called after each look at the weights, and for each segment.
     """
     stop, console = process.stop, Lines(process)
-    node: Any = SimNode(network, process, "actor", incarnation, connect=[LEARNER])
+    node: Any = SimNode(network, process, "actor", incarnation, connect=connect)
     node.follow_stop(stop)
     request = Join("actor", incarnation, [])
     reply = yield from joining(node, request, (), JOIN_TIMEOUT, need_replay=True, event=console.event)
     if reply is not None:
         policy = Policy()
-        route = Route(network, process, incarnation, reply.replay_endpoints)
+        route = Route(network, process, node.run, incarnation, reply.replay_endpoints)
         weights = WeightsFollower(node, policy)  # type: ignore[arg-type]
         inserts = InsertClient(route, stop, window)
         process.state.update(policy=policy, weights=weights, inserts=inserts)
@@ -246,10 +261,12 @@ def actor(
     yield from leaving(node, request)
 
 
-def evaluator(network: Network, process: Process, incarnation: int, every: float) -> Conversation[None]:
+def evaluator(
+    network: Network, process: Process, connect: Sequence[str], incarnation: int, every: float
+) -> Conversation[None]:
     """As `coop-eval --connect`: follows the weights and reports what they are worth."""
     stop, console = process.stop, Lines(process)
-    node: Any = SimNode(network, process, "evaluator", incarnation, connect=[LEARNER])
+    node: Any = SimNode(network, process, "evaluator", incarnation, connect=connect)
     node.follow_stop(stop)
     request = Join("evaluator", incarnation, [])
     reply = yield from joining(node, request, (), JOIN_TIMEOUT, event=console.event)
@@ -264,6 +281,6 @@ def evaluator(network: Network, process: Process, incarnation: int, every: float
                     row = EvaluationRow(
                         env_step, update, 1, 1, 1.0, 0.0, 0.0, float(incarnation % 10**6 * 100 + number)
                     )
-                    yield from reporting(node, stop, Evaluated(incarnation, number, row).encode(RUN))
+                    yield from reporting(node, stop, Evaluated(incarnation, number, row).encode(node.run))
                     number += 1
     yield from leaving(node, request)

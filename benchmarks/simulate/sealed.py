@@ -25,8 +25,13 @@ class Checkpoints:
         self._checks = checks
         self._root = checks.cluster.root
         self._run = self._root / "learner" / "run"
-        self._folders = [self._root / place / "table" for place in ("replay", "elsewhere")]  # of replay services' parts
         self._sealed: object = None  # the checkpoint that was looked at last
+
+    @property
+    def _folders(self) -> list[Path]:
+        """Those of the replay services' parts."""
+        folders = (self._root / place / "table" for place in ("replay", "elsewhere"))
+        return [folder for folder in folders if not self._checks.strangers.foreign_folder(folder)]
 
     def look_at_parts(self) -> None:
         """The newest sealed checkpoint has a sealed part of the replay service."""

@@ -29,8 +29,11 @@ def watched(checks: Checks) -> Watched:
         """See `ReplayCore`."""
 
         since = 0
+        foreign = False  # it holds another run's transitions
 
         def insert(self, segment: Segment, payload: bytes = b"") -> int | RetryLater:
+            if self.foreign:
+                return super().insert(segment, payload)
             before, ahead = self.table.inserted, self.limiter.ahead(self.table.inserted, checks.counted(self))
             outcome = super().insert(segment, payload)
             if self.table.inserted > before:
@@ -41,6 +44,8 @@ def watched(checks: Checks) -> Watched:
             return outcome
 
         def draw(self, request: DrawRequest) -> Reply | RetryLater:
+            if self.foreign:
+                return super().draw(request)
             checks.asked(self, request)
             known = request.sequence < checks.counted(self)
             outcome = super().draw(request)
@@ -53,14 +58,17 @@ def watched(checks: Checks) -> Watched:
 
         def __init__(self, node: Any, core: Any, *rest: Any, **named: Any) -> None:  # noqa: ANN401
             super().__init__(node, core, *rest, **named)
-            checks.service_begins(node.process, core)
+            core.foreign = checks.strangers.foreign(node.process)
+            if not core.foreign:
+                checks.service_begins(node.process, core)
 
     class Members(Roster):
         """See `Roster`; tells whom it admits."""
 
         def replay(self, *args: Any) -> int:  # noqa: ANN401
             index = super().replay(*args)
-            checks.serving = self.serving
+            if self._path is not None and not checks.strangers.foreign_folder(self._path.parent):
+                checks.serving = self.serving
             return index
 
     return Watched(Core, Service, Members)

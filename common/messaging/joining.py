@@ -76,14 +76,19 @@ def joining(
             if isinstance(answer, str):
                 vacant_by = vacant_by or node.now() + HANDOVER_TIMEOUT
                 if node.now() > vacant_by:
-                    raise JoinError(f"run {node.run!r}: {answer}")
+                    raise JoinError(f"run {node.run_name!r}: {answer}")
             elif answer.replay_endpoints or not need_replay:
+                node.belong(answer.run_id)
                 return answer
         if node.now() > deadline and vacant_by is None:
             if answered:
-                raise JoinError(f"no replay service of run {node.run!r} found at {where} within {timeout:g} s")
+                raise JoinError(f"no replay service of run {node.run_name!r} found at {where} within {timeout:g} s")
             raise JoinError(no_learner(node, connect, timeout))
-        awaited = f"a replay service of run {node.run!r}" if answered else f"the learner of run {node.run!r} at {where}"
+        awaited = (
+            f"a replay service of run {node.run_name!r}"
+            if answered
+            else f"the learner of run {node.run_name!r} at {where}"
+        )
         if text := stall.check(node.now(), 0, f"waiting for {awaited}"):
             event(text)
         if (yield RETRY_PAUSE):
@@ -101,7 +106,7 @@ def _ask_to_join(node: Node, request: Join) -> Conversation[JoinReply | str]:
         message = yield from asking(node, join_key(node, request.role), request.encode(node.run), JOIN_ANSWER)
         return Retry.decode(message).reason if message.kind == Retry.kind else JoinReply.decode(message)
     except (Refused, BadMessage) as error:
-        raise JoinError(f"the learner of run {node.run!r} refused: {error}") from error
+        raise JoinError(f"the learner of run {node.run_name!r} refused: {error}") from error
 
 
 def leave_run(node: Node, request: Join) -> None:
@@ -131,7 +136,7 @@ def leaving(node: Node, request: Join) -> Conversation[None]:
 
 def no_learner(node: Node, connect: Sequence[str], timeout: float) -> str:
     """That no learner was found within `timeout` seconds, and why that may be."""
-    text = f"no learner of run {node.run!r} found at {_where(connect)} within {timeout:g} s"
+    text = f"no learner of run {node.run_name!r} found at {_where(connect)} within {timeout:g} s"
     if unknown := unknown_hosts(connect):
         text = f"{text}; the host {unknown[0]!r} is not known"
     others = other_runs(node)
@@ -194,7 +199,7 @@ class Membership:
         known, asked = self._node.presence.members("learner"), self._node.now()
         while not (yield ASK_EVERY):
             if self._node.presence.absence("learner") > self._patience:
-                text = f"the learner of run {self._node.run!r} has been gone for {self._patience:g} s"
+                text = f"the learner of run {self._node.run_name!r} has been gone for {self._patience:g} s"
                 self._stop.set(text, failed=True)
                 return
             there = self._node.presence.members("learner")

@@ -28,6 +28,7 @@ from coop.common.messaging.messages.answers import Error
 from coop.common.messaging.messages.control import EndOfRun
 from coop.common.messaging.messages.status import Status
 from coop.common.messaging.presence import Presence
+from coop.common.messaging.runs import check_run, identified, name_of
 from coop.common.messaging.timing import ASK_TIMEOUT
 from coop.common.messaging.wire import Message
 from coop.common.process.console import say, stamped
@@ -56,11 +57,17 @@ def new_incarnation() -> int:
 
 
 class Pending:
-    """A query in flight: an `Answer`."""
+    """A query in flight: an `Answer`.
 
-    def __init__(self, handler: Any, key: str) -> None:  # noqa: ANN401 (zenoh's handler of replies)
+    Args:
+        handler: Zenoh's, of replies.
+        run: of the process that asks, as its messages name it; an answer of another one is none.
+    """
+
+    def __init__(self, handler: Any, key: str, run: str) -> None:  # noqa: ANN401
         self._handler = handler
         self._key = key
+        self._run = run
         self._reply: zenoh.Reply | None = None
         self._lost = False
 
@@ -84,7 +91,7 @@ class Pending:
             return None
         if self._reply is None:
             raise NoAnswer(f"no answer to {self._key}")
-        return _answer(self._reply)
+        return _answer(self._reply, self._run)
 
     def wait(self) -> Message:
         """Wait for the answer; raises as `ready`."""
@@ -105,11 +112,12 @@ class Node:
     """One process's place in a run.
 
     Args:
-        run: name of the run, the prefix of every key.
+        run: name of the run, the prefix of every key; with its id, if that is known.
         role: "learner", "replay", "actor" or "watch".
         incarnation: the random id drawn at start.
 
     Attributes:
+        run: what messages say of their run: its name, and its id once that is known, see `belong`. run_name: its name.
         presence: the run's other connected members.
         faults: bugs of this program in this node's threads.
     """
@@ -117,6 +125,7 @@ class Node:
     def __init__(self, session: zenoh.Session, run: str, role: str, incarnation: int) -> None:
         self.session = session
         self.run = run
+        self.run_name = name_of(run)
         self.incarnation = incarnation
         self.bad_messages = 0
         self.faults = Faults()
@@ -132,7 +141,11 @@ class Node:
 
     def key(self, *parts: str) -> str:
         """A key of this run."""
-        return run_key(self.run, *parts)
+        return run_key(self.run_name, *parts)
+
+    def belong(self, run_id: int) -> None:
+        """Take part in this one of the runs of the name; from now on others' messages are refused."""
+        self.run = identified(self.run_name, run_id)
 
     def begin(self, key: str, payload: bytearray, timeout: float = ASK_TIMEOUT) -> Pending:
         """Send a query and return at once."""
@@ -144,7 +157,7 @@ class Node:
             congestion_control=zenoh.CongestionControl.BLOCK,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
-        return Pending(handler, key)
+        return Pending(handler, key, self.run)
 
     def now(self) -> float:
         """Seconds of this process's clock, which never goes back."""
@@ -240,10 +253,7 @@ class Node:
 
     def read(self, payload: zenoh.ZBytes | None) -> Message:
         """Decode a payload of this run; raises BadMessage."""
-        message = wire.decode(b"" if payload is None else payload.to_bytes())
-        if message.run != self.run:
-            raise BadMessage("run", f"{message.run!r}; this is run {self.run!r}")
-        return message
+        return check_run(wire.decode(b"" if payload is None else payload.to_bytes()), self.run)
 
     def count_bad(self, place: str, error: BadMessage) -> None:
         """Count a refused message, and say what is wrong with it, for each field once at each place; thread-safe.
@@ -335,18 +345,18 @@ def _reply(key: str, query: Any, answered: bytearray) -> None:  # noqa: ANN401 (
         query.reply(key, answered)
 
 
-def _answer(reply: zenoh.Reply) -> Message:
+def _answer(reply: zenoh.Reply, run: str) -> Message:
     part = reply.ok or reply.err
     assert part is not None
     raw = part.payload.to_bytes()
     try:
         message = wire.decode(raw)
-        problem = None if reply.ok is not None else Error.decode(message).problem
+        if reply.ok is not None:
+            return check_run(message, run)
+        problem = Error.decode(message).problem
     except BadMessage as error:
         if error.field == "protocol":  # asking again would not help
             raise Refused(str(error)) from error
         text = f"an answer that can't be read: {error}" if reply.ok is not None else raw.decode(errors="replace")
         raise NoAnswer(text) from error
-    if problem is not None:
-        raise Refused(problem)
-    return message
+    raise Refused(problem)

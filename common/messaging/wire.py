@@ -21,7 +21,7 @@ from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import BadMessage
 from coop.common.types import Array
 
-PROTOCOL = 9
+PROTOCOL = 10
 MAGIC = 0x434F4F50  # "COOP"
 ALIGNMENT = 64
 MAX_HEADER = 1 << 20
