@@ -41,6 +41,7 @@ CALM = 30.0  # seconds without faults, at the beginning and at the end
 SETTLED = 2.0  # seconds after everybody's return from which on the learner's rate counts
 KINDS = ("kill", "kill", "freeze", "cut")
 RATE, GROWTH = 0.8, {"threads": 1.0, "descriptors": 1.0}
+APART = ("journal", "aside", "tb")  # folders of a run that grow: TensorBoard has a file of each start
 TICK = 0.1
 
 
@@ -178,7 +179,7 @@ class Storm:
                     self.samples[name].append(measure(process.pid))
                 except (OSError, KeyError):
                     continue
-        self.files.append(sum(1 for path in self._folder.rglob("*") if not {"journal", "aside"} & {*path.parts}))
+        self.files.append(sum(1 for path in self._folder.rglob("*") if not {*APART} & {*path.parts}))
 
 
 def ride(storm: Storm, kills: int, joins: int, give_up: float) -> None:
@@ -262,7 +263,7 @@ def report(storm: Storm, seconds: float) -> list[str]:
     folder = storm.roles.folder
     roster, kept = (folder / "roster.json").stat().st_size, len(checkpoint_numbers(folder))
     print(
-        f"{'run directory':22}{first:.0f} -> {last:.0f} files but for journal/ and aside/, roster.json {roster} bytes"
+        f"{'run directory':22}{first:.0f} -> {last:.0f} files but for {'/, '.join(APART)}/, roster.json {roster} bytes"
     )
     if last > first + 5 or kept > 3:
         problems.append("the run's files become more")
