@@ -27,7 +27,8 @@ from coop.common.imports import hand_over, import_module, permit, remember
 from coop.common.process import untrusted
 from coop.common.process.files import LineFile, measure, write_atomic
 from coop.common.process.untrusted import check_links, check_run_name, check_torch_file, load_array, page_sizes
-from coop.common.settings.tables import sealed_toml
+from coop.common.settings.fields import _read_table
+from coop.common.settings.tables import load_tables, parse_run_config, sealed_toml
 from coop.lockstep.reexecute import reexecute
 from coop.records.checkpoints import read_manifest, write_manifest
 from coop.records.locks import RunLock
@@ -39,6 +40,7 @@ from coop.studies.report.packing import study_file
 from coop.studies.report.sources import open_source
 from coop.studies.sweep.folder import CellFolder
 from coop.studies.sweep.grid import parse_grid
+from coop.studies.tuning import Space
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -375,6 +377,29 @@ def test_a_checkpoint_asks_for_no_more_than_it_holds(tmp_path: Path) -> None:
 def text(word: str) -> bytes:
     """A text in a pickle."""
     return b"X" + len(word).to_bytes(4, "little") + word.encode()
+
+
+WITHOUT_END = {
+    "lists": f"a = {'[' * 20_000}{']' * 20_000}",
+    "digits": f"a = {'9' * 5_000}",
+    "tables": f"{'a.' * 5_000}a = 1",
+}
+
+
+@pytest.mark.parametrize("kind", WITHOUT_END)
+def test_a_text_in_toml_without_end_is_refused_in_a_line(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "one.toml").write_text(text := WITHOUT_END[kind])
+    readers: list[Callable[[], object]] = [
+        lambda: load_tables(None, tmp_path / "one.toml"),
+        lambda: parse_run_config(text, "here"),
+        lambda: parse_grid(text, "here"),
+        lambda: Space(tmp_path / "one.toml"),
+    ]
+    for read in readers:
+        with pytest.raises(UsageError, match=r"(one\.toml|here): [^\n]*(recursion|digits|nests)"):
+            read()
+    with pytest.raises(ValueError, match="is no inline TOML table"):
+        _read_table([f"{{{text}}}"])
 
 
 @pytest.mark.parametrize("claimed", ["bytes", "entry"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import tomllib
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
@@ -20,7 +19,7 @@ from coop.common.process.files import make_folder
 from coop.common.process.limits import cores
 from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.overrides import merged, nested
-from coop.common.settings.reading import checked
+from coop.common.settings.reading import checked, parse_toml
 from coop.records.following import EPISODES, Following
 from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import read_summary
@@ -97,13 +96,12 @@ class Space:
     def __init__(self, grid: str | Path | Mapping[str, Any]) -> None:
         """Read a grid; raises UsageError, also for settings that no run takes."""
         try:
-            tables = dict(grid) if isinstance(grid, Mapping) else tomllib.loads(read_text(Path(grid), MAX_SETTINGS))
+            tables = dict(grid) if isinstance(grid, Mapping) else parse_toml(read_text(Path(grid), MAX_SETTINGS))
             tables.pop("quick", None)
             self.file = checked(GridFile, tables)
-        except UsageError as error:
-            raise UsageError(f"grid: {error}") from error
-        except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise UsageError(f"grid {grid}: {getattr(error, 'strerror', None) or error}") from error
+        except (OSError, UnicodeDecodeError, CoopError) as error:
+            name = "grid" if isinstance(grid, Mapping) else f"grid {grid}"
+            raise UsageError(f"{name}: {getattr(error, 'strerror', None) or error}") from error
         self.axes = _axes(self.file.vary)
         first = {name: each["low"] if isinstance(each, Mapping) else each[0] for name, each in self.axes.items()}
         self.cells("trial", self.file.methods[0], first)
