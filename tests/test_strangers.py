@@ -30,6 +30,7 @@ from coop.common.process.untrusted import check_links, check_run_name, check_tor
 from coop.common.settings.fields import _read_table
 from coop.common.settings.tables import load_tables, parse_run_config, sealed_toml
 from coop.lockstep.reexecute import reexecute
+from coop.records import parquet_seals
 from coop.records.checkpoints import read_manifest, write_manifest
 from coop.records.locks import RunLock
 from coop.records.run_options import chosen_config
@@ -518,18 +519,18 @@ def test_a_page_is_no_larger_than_a_study(tmp_path: Path, field: str, claimed: i
         pa.large_list(pa.int32())
     )
     table = pa.table({"run": ["a"], "metrics.jsonl/x": lists})
-    table = table.replace_schema_metadata({packed.SEAL: packed.UNSEALED})
+    table = table.replace_schema_metadata({parquet_seals.SEAL: parquet_seals.UNSEALED})
     pq.write_table(
         table, path, compression="zstd", use_dictionary=False, data_page_size=1 << 30, write_statistics=False
     )
     content = path.read_bytes()
-    path.write_bytes(packed.sealed(content))
+    path.write_bytes(parquet_seals.sealed(content))
     PackedStudy(path)
     size = next(size for size, held in pages(content) if held == count)
     now, digits = (size, 5) if field == "size" else (count, 4)
     old, new = varint(now, digits), varint(claimed, digits)
     place = content.index(b"\x15" + old)
-    path.write_bytes(packed.sealed(content[: place + 1] + new + content[place + 1 + len(old) :]))
+    path.write_bytes(parquet_seals.sealed(content[: place + 1] + new + content[place + 1 + len(old) :]))
     with pytest.raises(UsageError, match=r"not a packed study: [\d,]+ values, [\d,]+ bytes; a study has at most"):
         PackedStudy(path)
 
