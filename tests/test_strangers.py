@@ -26,12 +26,19 @@ from coop.common.errors import RunError, UsageError
 from coop.common.imports import hand_over, import_module, permit, remember
 from coop.common.process import untrusted
 from coop.common.process.files import LineFile, measure, write_atomic
-from coop.common.process.untrusted import check_links, check_run_name, check_torch_file, load_array, page_sizes
+from coop.common.process.untrusted import (
+    check_links,
+    check_run_name,
+    check_torch_file,
+    load_array,
+    page_sizes,
+    refuse_links,
+)
 from coop.common.settings.fields import _read_table
 from coop.common.settings.tables import load_tables, parse_run_config, sealed_toml
 from coop.lockstep.reexecute import reexecute
 from coop.records import parquet_seals
-from coop.records.checkpoints import read_manifest, write_manifest
+from coop.records.checkpoints import ASKED, ask, read_manifest, write_manifest
 from coop.records.locks import RunLock
 from coop.records.run_options import chosen_config
 from coop.records.summaries import SUMMARY, read_summary, summary_text
@@ -39,8 +46,9 @@ from coop.studies.report import packed
 from coop.studies.report.packed import PackedStudy
 from coop.studies.report.packing import study_file
 from coop.studies.report.sources import open_source
+from coop.studies.sweep import slurm
 from coop.studies.sweep.folder import CellFolder
-from coop.studies.sweep.grid import parse_grid
+from coop.studies.sweep.grid import GridFile, parse_grid
 from coop.studies.tuning import Space
 
 pytestmark = pytest.mark.timeout(300)
@@ -186,7 +194,26 @@ def test_no_file_is_written_through_a_link(tmp_path: Path) -> None:
     write_atomic(tmp_path / "x", b"theirs")
     with pytest.raises(OSError, match="symbolic links"):
         LineFile(tmp_path / "lines", go_on=False)
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / ASKED).symlink_to(tmp_path / "new")
+    with pytest.raises(OSError, match="symbolic links"):
+        ask(tmp_path)
+    (tmp_path / "array-1.sh").symlink_to(tmp_path / "new")
+    (tmp_path / "array-2.cells").symlink_to(mine)
+    script = slurm._write(slurm.Tasks(GridFile(), tmp_path, None, "none", 1, ""), ["a", "b"])
+    assert script == tmp_path / "array-2.sh"
+    assert script.with_suffix(".cells").read_text() == "a\nb\n"
+    assert not (tmp_path / "new").exists()
     assert mine.read_text() == "precious"
+
+
+def test_no_pipe_is_opened_to_be_written(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "index.html")
+    with pytest.raises(UsageError, match=r"index\.html: neither a file nor a folder; not opened"):
+        refuse_links(tmp_path / "index.html")
+    (tmp_path / "checkpoints").mkdir()
+    os.mkfifo(tmp_path / "checkpoints" / ASKED)
+    ask(tmp_path)
 
 
 EVIL = """

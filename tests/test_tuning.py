@@ -110,7 +110,7 @@ def test_storages_that_are_none_are_refused_in_a_line(tmp_path: Path) -> None:
     assert not (tmp_path / "elsewhere").exists()
     file.unlink()
     os.mkfifo(file)
-    with pytest.raises(UsageError, match=r"optuna\.db: no file$"):
+    with pytest.raises(UsageError, match=r"optuna\.db: neither a file nor a folder"):
         tune_none(folder)
     file.unlink()
     file.write_bytes(b"")

@@ -103,8 +103,6 @@ def _file_in(folder: Path) -> Path:
         make_folder(folder)
     except OSError as error:
         raise UsageError(f"folder {folder}: {error.strerror}") from error
-    if file.exists() and not file.is_file():
-        raise UsageError(f"{file}: no file")
     return file
 
 
