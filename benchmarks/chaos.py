@@ -87,7 +87,7 @@ class ChaosMonkey:
             self._next, self._at_work_since = float("inf"), updates
 
     def _kill(self, name: str) -> bool:
-        alive = [pid for pid, found in _children(self._supervisor) if found == name]
+        alive = [pid for pid, found in children(self._supervisor) if found == name]
         if not alive:
             return False
         os.kill(self._chance.choice(alive), signal.SIGKILL)
@@ -95,7 +95,7 @@ class ChaosMonkey:
         return True
 
 
-def _children(pid: int) -> list[tuple[int, str]]:
+def children(pid: int) -> list[tuple[int, str]]:
     """(process id, command) of the direct children of a process that are roles."""
     found = []
     for entry in Path("/proc").iterdir():

@@ -514,6 +514,28 @@ def test_a_missing_file_and_the_end_of_a_file_are_counted(spec: EnvSpec, tmp_pat
     assert "file 3 is missing" in notices[1]
 
 
+def test_a_journal_of_which_nothing_is_left_behind_a_checkpoint_is_said(spec: EnvSpec, tmp_path: Path) -> None:
+    folder = tmp_path / "journal"
+    journal = Journal(folder, 5, 1, keep=False)
+    core = ReplayCore(AHEAD, spec, journal)
+    for sequence in range(2):
+        _insert(core, spec, sequence)
+    save(core, ReplayCheckpoints(tmp_path, 5, journal), 1)
+    for sequence in range(2, 4):
+        _insert(core, spec, sequence)
+    journal.close()
+    shutil.rmtree(folder)
+    twin = ReplayCore(AHEAD, spec)
+    first, _ = ReplayCheckpoints(tmp_path, 5).restore(twin, 1)
+    number, notices = recover(twin, folder, first, 5)
+    assert number == first == 2
+    assert notices[1:] == [
+        f"{folder}: file 2 is missing, and so is all that followed; the journal is read on behind it"
+    ]
+    fresh = recover(ReplayCore(AHEAD, spec), folder, 1, 5)
+    assert fresh == (1, ["0 transitions and 0 batches from the journal"]), "of a run that begins"
+
+
 def test_a_kill_is_no_damage(spec: EnvSpec, tmp_path: Path) -> None:
     """It leaves a payload without its header, or less."""
     _, at = _journal(spec, tmp_path)

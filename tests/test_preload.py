@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import runpy
 from collections import Counter
 from contextlib import closing
@@ -27,6 +28,7 @@ from coop.common.settings.tables import resolve
 from coop.evaluation.dataset import export_dataset, export_to
 from coop.lockstep.run import LockstepRun
 from coop.records import datasets
+from coop.records.parquet_seals import SEAL
 from coop.records.resumption import Start
 
 pytestmark = pytest.mark.timeout(300)
@@ -324,6 +326,54 @@ def test_another_s_file_is_refused_in_a_line(changed: dict[str, Any], why: str, 
         LockstepRun(config, tmp_path / "run", "test", Start(), log="none")
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "run" / "config.toml").exists()
+
+
+def test_a_changed_bit_of_a_data_set_is_named(data: Path, tmp_path: Path) -> None:
+    content, file, spec = data.read_bytes(), tmp_path / "data.parquet", env_spec(config_of(data).env)
+    last = len(content) - int.from_bytes(content[-8:-4], "little") - 8  # of the pages
+    for at in (*range(10, last, last // 20), last + 50, len(content) - 6):
+        changed = bytearray(content)
+        changed[at] ^= 1
+        file.write_bytes(changed)
+        with pytest.raises(UsageError, match=r"^x: wrong checksum: not what was exported$"):
+            datasets.check_data_set(file, spec, "x")
+    file.write_bytes(changed := content.replace(b"crc32 of the rest", b"crc33 of the rest"))
+    assert changed != content
+    page = bytearray(changed)
+    page[last // 2] ^= 1
+    file.write_bytes(page)
+    with pytest.raises(UsageError, match=r"^x: "):
+        list(datasets.read_rows(file, spec, "x"))
+    pq.write_table(pq.read_table(data).slice(0, 9), file)
+    assert SEAL.encode() in pq.read_schema(file).metadata, "what a user has made of it"
+    assert [len(rows.actions) for rows in datasets.read_rows(file, spec, "x")] == [9]
+
+
+@pytest.mark.parametrize("name", ["data", "data.parquet"])
+def test_an_export_is_on_the_disk_before_its_name_and_spares_other_s_parts(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved(tmp_path / "run", replay=SMALL)
+    synced: set[str] = set()
+    fsync, rename = os.fsync, Path.replace
+
+    def noted(descriptor: int) -> None:
+        synced.add(str(Path(f"/proc/self/fd/{descriptor}").readlink()))
+        fsync(descriptor)
+
+    def renamed(path: Path, target: Path) -> Path:
+        if target == tmp_path / name:
+            assert {str(each) for each in (path, *path.rglob("*"))} <= synced
+        return rename(path, target)
+
+    (tmp_path / f"{name}.part").mkdir()
+    (tmp_path / f"{name}.part" / "mine").write_text("to keep")
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(Path, "replace", renamed)
+    export_to(tmp_path / "run", tmp_path / name)
+    assert str(tmp_path) in synced
+    assert (tmp_path / f"{name}.part" / "mine").read_text() == "to keep"
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([name, f"{name}.part", "run"])
 
 
 def test_a_row_group_that_takes_more_memory_than_allowed_is_refused_unread(

@@ -26,10 +26,19 @@ from coop.common.errors import RunError, UsageError
 from coop.common.imports import hand_over, import_module, permit, remember
 from coop.common.process import untrusted
 from coop.common.process.files import LineFile, measure, write_atomic
-from coop.common.process.untrusted import check_links, check_run_name, check_torch_file, load_array, page_sizes
-from coop.common.settings.tables import sealed_toml
+from coop.common.process.untrusted import (
+    check_links,
+    check_run_name,
+    check_torch_file,
+    load_array,
+    page_sizes,
+    refuse_links,
+)
+from coop.common.settings.fields import _read_table
+from coop.common.settings.tables import load_tables, parse_run_config, sealed_toml
 from coop.lockstep.reexecute import reexecute
-from coop.records.checkpoints import read_manifest, write_manifest
+from coop.records import parquet_seals
+from coop.records.checkpoints import ASKED, ask, read_manifest, write_manifest
 from coop.records.locks import RunLock
 from coop.records.run_options import chosen_config
 from coop.records.summaries import SUMMARY, read_summary, summary_text
@@ -37,8 +46,10 @@ from coop.studies.report import packed
 from coop.studies.report.packed import PackedStudy
 from coop.studies.report.packing import study_file
 from coop.studies.report.sources import open_source
+from coop.studies.sweep import slurm
 from coop.studies.sweep.folder import CellFolder
-from coop.studies.sweep.grid import parse_grid
+from coop.studies.sweep.grid import GridFile, parse_grid
+from coop.studies.tuning import Space
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -183,7 +194,26 @@ def test_no_file_is_written_through_a_link(tmp_path: Path) -> None:
     write_atomic(tmp_path / "x", b"theirs")
     with pytest.raises(OSError, match="symbolic links"):
         LineFile(tmp_path / "lines", go_on=False)
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / ASKED).symlink_to(tmp_path / "new")
+    with pytest.raises(OSError, match="symbolic links"):
+        ask(tmp_path)
+    (tmp_path / "array-1.sh").symlink_to(tmp_path / "new")
+    (tmp_path / "array-2.cells").symlink_to(mine)
+    script = slurm._write(slurm.Tasks(GridFile(), tmp_path, None, "none", 1, ""), ["a", "b"])
+    assert script == tmp_path / "array-2.sh"
+    assert script.with_suffix(".cells").read_text() == "a\nb\n"
+    assert not (tmp_path / "new").exists()
     assert mine.read_text() == "precious"
+
+
+def test_no_pipe_is_opened_to_be_written(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "index.html")
+    with pytest.raises(UsageError, match=r"index\.html: neither a file nor a folder; not opened"):
+        refuse_links(tmp_path / "index.html")
+    (tmp_path / "checkpoints").mkdir()
+    os.mkfifo(tmp_path / "checkpoints" / ASKED)
+    ask(tmp_path)
 
 
 EVIL = """
@@ -377,6 +407,29 @@ def text(word: str) -> bytes:
     return b"X" + len(word).to_bytes(4, "little") + word.encode()
 
 
+WITHOUT_END = {
+    "lists": f"a = {'[' * 20_000}{']' * 20_000}",
+    "digits": f"a = {'9' * 5_000}",
+    "tables": f"{'a.' * 5_000}a = 1",
+}
+
+
+@pytest.mark.parametrize("kind", WITHOUT_END)
+def test_a_text_in_toml_without_end_is_refused_in_a_line(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "one.toml").write_text(text := WITHOUT_END[kind])
+    readers: list[Callable[[], object]] = [
+        lambda: load_tables(None, tmp_path / "one.toml"),
+        lambda: parse_run_config(text, "here"),
+        lambda: parse_grid(text, "here"),
+        lambda: Space(tmp_path / "one.toml"),
+    ]
+    for read in readers:
+        with pytest.raises(UsageError, match=r"(one\.toml|here): [^\n]*(recursion|digits|nests)"):
+            read()
+    with pytest.raises(ValueError, match="is no inline TOML table"):
+        _read_table([f"{{{text}}}"])
+
+
 @pytest.mark.parametrize("claimed", ["bytes", "entry"])
 def test_a_checkpoint_s_sizes_are_those_of_the_file(claimed: str, tmp_path: Path) -> None:
     """Neither the pickle nor the archive's list of entries says how much memory is taken."""
@@ -493,18 +546,18 @@ def test_a_page_is_no_larger_than_a_study(tmp_path: Path, field: str, claimed: i
         pa.large_list(pa.int32())
     )
     table = pa.table({"run": ["a"], "metrics.jsonl/x": lists})
-    table = table.replace_schema_metadata({packed.SEAL: packed.UNSEALED})
+    table = table.replace_schema_metadata({parquet_seals.SEAL: parquet_seals.UNSEALED})
     pq.write_table(
         table, path, compression="zstd", use_dictionary=False, data_page_size=1 << 30, write_statistics=False
     )
     content = path.read_bytes()
-    path.write_bytes(packed.sealed(content))
+    path.write_bytes(parquet_seals.sealed(content))
     PackedStudy(path)
     size = next(size for size, held in pages(content) if held == count)
     now, digits = (size, 5) if field == "size" else (count, 4)
     old, new = varint(now, digits), varint(claimed, digits)
     place = content.index(b"\x15" + old)
-    path.write_bytes(packed.sealed(content[: place + 1] + new + content[place + 1 + len(old) :]))
+    path.write_bytes(parquet_seals.sealed(content[: place + 1] + new + content[place + 1 + len(old) :]))
     with pytest.raises(UsageError, match=r"not a packed study: [\d,]+ values, [\d,]+ bytes; a study has at most"):
         PackedStudy(path)
 

@@ -17,6 +17,7 @@ import pytest
 import torch
 from commands import Command, lines, run_command, wait_for
 
+from benchmarks.chaos import children
 from coop.common.errors import RunError
 from coop.common.metrics import COLUMNS
 from coop.learner.agent import Agent
@@ -54,18 +55,9 @@ def run(name: str, *flags: str) -> subprocess.CompletedProcess[str]:
     return run_command(name, *flags, timeout=90)
 
 
-def children(pid: int) -> dict[str, int]:
-    """The roles among the direct children by their command's name, the last one of each.
-
-    A command that is forked here has a child of its own name, which forks its roles.
-    """
-    found = {}
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError, ValueError):
-            name, _, rest = (entry / "stat").read_text().partition("(")[2].rpartition(")")
-            if int(rest.split()[1]) == pid and name.startswith("coop-") and name != "coop-local":
-                found[name] = int(entry.name)
-    return found
+def roles_of(pid: int) -> dict[str, int]:
+    """The processes of a supervisor's roles by their command's name, the last one of each."""
+    return {name: role for role, name in children(pid)}
 
 
 def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, object]:
@@ -133,7 +125,7 @@ def test_a_learner_reads_frames_in_the_memory_of_the_replay_service(tmp_path: Pa
     with Command("coop-local", *flags, "--replay.journal", "--replay.journal-keep") as local:
 
         def same() -> bool:
-            roles = children(local.pid)
+            roles = roles_of(local.pid)
             learner, replay = (shared(roles.get(f"coop-{role}", 0)) for role in ("learner", "replay"))
             return bool(learner) and learner == replay
 
@@ -221,10 +213,10 @@ def test_ctrl_c_a_killed_actor_and_resume(tmp_path: Path) -> None:
     flags = ("--actors", "1", "--total-steps", "3000", "--run-dir", str(path))
     with Command("coop-local", *flags) as local:
         wait_for("the first metrics", lambda: lines(path / "metrics.jsonl") >= 1)
-        roles = children(local.pid)
+        roles = roles_of(local.pid)
         assert sorted(roles) == ["coop-actor", "coop-learner", "coop-replay"]
         os.kill(roles["coop-actor"], signal.SIGKILL)
-        wait_for("the new actor", lambda: children(local.pid).get("coop-actor", 0) != roles["coop-actor"])
+        wait_for("the new actor", lambda: roles_of(local.pid).get("coop-actor", 0) != roles["coop-actor"])
         os.kill(roles["coop-replay"], signal.SIGSTOP)
         log = path / "logs" / "learner.log"
         wait_for("the frozen one's name", lambda: re.search(SILENT, log.read_text()))

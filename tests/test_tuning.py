@@ -1,5 +1,6 @@
 """Searches by Optuna over real runs, and the tables of all runs of a folder."""
 
+import os
 import runpy
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from commands import Command
 
 import coop
+from coop.common.errors import RunError, UsageError
 from coop.studies.report.packing import pack
 from coop.studies.tuning import Space
 
@@ -76,6 +78,54 @@ def test_bad_trials_fail_and_bad_grids_are_refused(tmp_path: Path) -> None:
             coop.tune(wrong, tmp_path / "b")
     with pytest.raises(coop.UsageError, match="does not exist"):
         coop.load_sweep(tmp_path / "b")
+
+
+REFUSED: Any = {"vary": {"learner": {"learning_rate": [1e-3, -1.0]}}, "fixed": FIXED}  # by each of its trials
+
+
+def tune_none(folder: Path) -> optuna.Study:
+    sampler = optuna.samplers.PartialFixedSampler({"learner.learning_rate": -1.0}, optuna.samplers.RandomSampler(0))
+    return coop.tune(REFUSED, folder, trials=1, workers=1, sampler=sampler)
+
+
+@pytest.mark.parametrize("name", ["a?mode=memory", "a#b%20c", "two\nlines \N{SNOWMAN}"])
+def test_a_search_s_storage_lies_in_its_folder(name: str, tmp_path: Path) -> None:
+    assert [trial.state for trial in tune_none(tmp_path / name).trials] == [STATE.FAIL]
+    assert len(tune_none(tmp_path / name).trials) == 1, "the same search"
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name / "optuna.db").is_file()
+
+
+def test_storages_that_are_none_are_refused_in_a_line(tmp_path: Path) -> None:
+    folder, file = tmp_path / "search", tmp_path / "search" / "optuna.db"
+    folder.mkdir()
+    file.write_bytes(b"of something else" * 999)
+    with pytest.raises(RunError, match=r"^storage .*optuna.db: DatabaseError: file is not a database$"):
+        tune_none(folder)
+    assert file.read_bytes() == b"of something else" * 999
+    file.unlink()
+    file.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UsageError, match=r"optuna\.db: a link, to "):
+        tune_none(folder)
+    assert not (tmp_path / "elsewhere").exists()
+    file.unlink()
+    os.mkfifo(file)
+    with pytest.raises(UsageError, match=r"optuna\.db: neither a file nor a folder"):
+        tune_none(folder)
+    file.unlink()
+    file.write_bytes(b"")
+    with pytest.raises(UsageError, match=r"optuna\.db: File exists$|Not a directory$"):
+        tune_none(file)
+
+
+def test_a_trial_s_folder_is_no_link_to_another_one(tmp_path: Path) -> None:
+    (tmp_path / "search").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "search" / "trial-0000").symlink_to(tmp_path / "elsewhere")
+    study = coop.tune({"fixed": FIXED, "vary": RATES}, tmp_path / "search", trials=1, workers=1)
+    assert [trial.state for trial in study.trials] == [STATE.FAIL]
+    assert "trial-0000: a link, to " in study.trials[0].user_attrs["why"]
+    assert not list((tmp_path / "elsewhere").iterdir())
 
 
 def test_what_a_grid_s_fields_are_chosen_from(tmp_path: Path) -> None:

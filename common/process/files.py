@@ -132,9 +132,14 @@ class LineFile:
         self._file.close()
 
 
+def part_of(path: Path) -> Path:
+    """Where to write what `path` is to be: nobody else's, as others may write the same now, or have such a name."""
+    return path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+
+
 def write_atomic(path: Path, data: bytes) -> FileDigest:
     """Replace a file atomically and durably. Raises OSError, and then leaves the old file untouched."""
-    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")  # others may write the same file now
+    part = part_of(path)
     try:
         with SyncedFile(part) as file:
             file.write(data)
@@ -203,6 +208,12 @@ def sync_file(path: Path) -> int:
         return os.fstat(descriptor).st_size
     finally:
         os.close(descriptor)
+
+
+def sync_all(folder: Path) -> None:
+    """Flush a folder, with all files and folders in it, to the disk; raises OSError."""
+    for path in (*folder.rglob("*"), folder):
+        sync_file(path)
 
 
 def sync_folder(path: Path) -> None:

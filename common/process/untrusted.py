@@ -117,10 +117,15 @@ def _own(folder: Path) -> Iterator[Path]:
 
 
 def refuse_links(*paths: Path) -> None:
-    """Refuse links where files are about to be written in a folder that may be somebody else's; raises UsageError."""
+    """Refuse links, pipes and devices where files are about to be written in a folder that may be somebody else's.
+
+    Raises UsageError.
+    """
     for path in paths:
         if path.is_symlink():
             raise UsageError(f"{path}: a link, to {path.readlink()}; nothing is written through it")
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise UsageError(f"{path}: neither a file nor a folder; not opened")
 
 
 def no_links(path: str, flags: int) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-import tomllib
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -14,7 +13,8 @@ from msgspec import Meta
 from tyro.constructors import PrimitiveConstructorSpec
 
 from coop.common.bounds import MAX_INTEGER, MAX_KWARGS, MAX_STEPS
-from coop.common.settings.reading import Read
+from coop.common.errors import UsageError
+from coop.common.settings.reading import Read, parse_toml
 
 Positive = Annotated[int, Meta(gt=0, le=MAX_INTEGER)]
 Steps = Annotated[int, Meta(gt=0, le=MAX_STEPS)]
@@ -30,8 +30,8 @@ NONE = Read(lambda value: None if isinstance(value, str) and value in ("None", "
 def _read_table(words: Sequence[str]) -> dict[str, Any]:
     """Read an inline TOML table from the command line, such as "{side = 12}"."""
     try:
-        tables = tomllib.loads(f"table = {words[0]}")
-    except tomllib.TOMLDecodeError as error:
+        tables = parse_toml(f"table = {words[0]}")
+    except UsageError as error:
         raise ValueError(f"{words[0]!r} is no inline TOML table: {error}") from None
     if tables.keys() != {"table"} or not isinstance(tables["table"], dict):
         raise ValueError(f"{words[0]!r} is no inline TOML table, such as {{side = 12}}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass
 from functools import cache
@@ -13,6 +14,7 @@ import msgspec
 from coop.common.errors import ALSO_CALLED, UsageError, closest, refusal
 
 T = TypeVar("T")
+MAX_DEPTH = 32  # of tables and lists in each other
 _PROBLEM = re.compile(r"^(?P<problem>.*?)(?: - at .*`\$(?P<path>[^`]*)`)?$", re.DOTALL)  # msgspec's error texts
 _WORDS = {"`": "", "object": "table", "array": "list", "null": "None", "<= 1.7976931348623157e+308": "that is finite"}
 
@@ -22,6 +24,21 @@ class Read:
     """Marks the type of a field: its values are read by a function, which raises ValueError with what is allowed."""
 
     function: Callable[[Any], Any]
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a text in TOML; raises UsageError for another text, or one that nests or counts without end."""
+    try:
+        tables = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # it raises more than its own errors
+        raise UsageError(str(error)) from error
+    level: list[Any] = [tables]
+    for _ in range(MAX_DEPTH):
+        values = (value for each in level for value in (each.values() if isinstance(each, dict) else each))
+        level = [value for value in values if isinstance(value, dict | list)]
+        if not level:
+            return tables
+    raise UsageError(f"nests more than {MAX_DEPTH} tables and lists")
 
 
 def checked(kind: type[T], tables: Any, prefix: str = "") -> T:  # noqa: ANN401 (of a file, or of a user's code)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 import zlib
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, replace
@@ -12,12 +11,12 @@ from typing import Any
 
 import tomli_w
 
-from coop.common.errors import RunError, UsageError, not_among
+from coop.common.errors import CoopError, UsageError, not_among
 from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.settings.overrides import merged, of_method
-from coop.common.settings.reading import checked, fields_of
+from coop.common.settings.reading import checked, fields_of, parse_toml
 from coop.common.settings.rules import check_rules, fitted
 
 CONFIG = "config.toml"
@@ -38,10 +37,8 @@ def load_tables(preset: str | None, path: Path | None) -> dict[str, Any]:
     """
     if path is not None:
         try:
-            return tomllib.loads(
-                read_text(path, MAX_SETTINGS).removeprefix("\ufeff")
-            )  # some editors begin files with a mark
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RunError, RecursionError) as error:
+            return parse_toml(read_text(path, MAX_SETTINGS).removeprefix("\ufeff"))  # a mark that some editors write
+        except (OSError, UnicodeDecodeError, CoopError) as error:
             raise UsageError(f"--config {path}: {error}") from error
     if preset not in preset_names():
         raise UsageError(f"preset = {preset!r}: {not_among(preset_names(), str(preset))}")
@@ -55,7 +52,7 @@ def base_tables(name: str) -> dict[str, Any]:
 
 def _preset(*place: str) -> dict[str, Any]:
     """Read a file under presets/, merged over the one in presets/bases/ that it extends."""
-    tables = tomllib.loads(files("coop.common.settings").joinpath("presets", *place).read_text(encoding="utf-8"))
+    tables = parse_toml(files("coop.common.settings").joinpath("presets", *place).read_text(encoding="utf-8"))
     base = tables.pop("extends", None)
     return tables if base is None else merged(base_tables(base), tables)
 
@@ -167,9 +164,10 @@ def parse_run_config(text: str, place: object, *, needed: bool = False) -> RunCo
     """
     check_toml(text, place, needed=needed)
     try:
-        return resolve(tomllib.loads(text))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        tables = parse_toml(text)
+    except UsageError as error:
         raise UsageError(f"{place}: {error}") from error
+    return resolve(tables)
 
 
 def to_tables(config: RunConfig) -> dict[str, Any]:

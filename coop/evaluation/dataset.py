@@ -9,11 +9,12 @@ from pathlib import Path
 from coop.common.errors import RunError, UsageError
 from coop.common.imports import check_extra
 from coop.common.places import shown
-from coop.common.process.files import make_folder, sync_file, sync_folder
+from coop.common.process.files import make_folder, part_of, sync_file, sync_folder
 from coop.evaluation.buffer import Buffer
 from coop.evaluation.minari import NotWholeError, export_minari
 from coop.evaluation.saved import SavedRun
 from coop.records.datasets import TRANSITIONS
+from coop.records.parquet_seals import SEAL, SIZE, UNSEALED, UNSIZED, seal_file
 
 ROWS_AT_ONCE = 1024  # in memory as Arrow's arrays, and a row group of the file
 GROUP_BYTES = 1 << 26  # of a row group, in which pictures are fewer
@@ -57,12 +58,12 @@ def export_dataset(run_dir: Path, file: Path) -> Buffer:
     if file.exists() or file.is_symlink():
         raise UsageError(f"--dataset {file}: exists already; name a new file")
     buffer = SavedRun(run_dir).buffer()
-    part = file.with_name(f"{file.name}.part")
+    part = part_of(file)
     try:
         make_folder(file.parent)
         try:
-            part.unlink(missing_ok=True)  # of an export that was killed
             _write(buffer, part)
+            seal_file(part)
             sync_file(part)
             part.replace(file)
         finally:
@@ -84,8 +85,9 @@ def _write(buffer: Buffer, path: Path) -> None:
         kind, shape = pa.from_numpy_dtype(array.dtype), list(array.shape[1:])
         stored = pa.list_(kind, math.prod(shape)) if shape else kind
         fields.append(pa.field(name, stored, nullable=False, metadata={"shape": str(shape)}))
-    schema = pa.schema(fields, {"env_id": buffer.spec.env_id, "checkpoint": str(buffer.checkpoint)})
-    with path.open("xb") as file, pq.ParquetWriter(file, schema) as writer:
+    facts = {"env_id": buffer.spec.env_id, "checkpoint": str(buffer.checkpoint)}
+    schema = pa.schema(fields, {**facts, SEAL: UNSEALED, SIZE: UNSIZED})
+    with path.open("xb") as file, pq.ParquetWriter(file, schema, write_page_checksum=True) as writer:
         row_bytes = sum(array[:1].nbytes for array in columns.values())
         at_once = max(1, min(ROWS_AT_ONCE, GROUP_BYTES // max(1, row_bytes)))
         for start in range(0, len(buffer), at_once):

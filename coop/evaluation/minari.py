@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from coop.common.errors import BadMessage, CoopError, RunError
 from coop.common.messaging import wire
 from coop.common.messaging.messages.insert import SegmentReader
-from coop.common.process.files import make_folder, sync_folder
+from coop.common.process.files import make_folder, part_of, sync_all, sync_folder
 from coop.common.transitions import Segment
 from coop.common.types import Array, EnvSpec
 from coop.evaluation.buffer import Buffer
@@ -57,9 +57,8 @@ def export_minari(run_dir: Path, folder: Path) -> str:
     buffer = run.buffer()
     kept = run.config.replay.journal_keep and journal_files(run_dir / "journal")[:1] == [1]
     episodes = _of_journal(run_dir, buffer.spec) if kept else _of_buffer(buffer)
-    part = folder.with_name(f"{folder.name}.part")
+    part = part_of(folder)
     try:
-        shutil.rmtree(part, ignore_errors=True)  # of an export that was killed
         make_folder(part / "data")
         try:
             count, steps = _write(episodes, run, buffer.spec, part / "data")
@@ -67,7 +66,7 @@ def export_minari(run_dir: Path, folder: Path) -> str:
                 raise NotWholeError(
                     "no episode is whole in the table; a run with --replay.journal-keep has all of them"
                 )
-            sync_folder(part)
+            sync_all(part)
             part.replace(folder)
         finally:
             shutil.rmtree(part, ignore_errors=True)

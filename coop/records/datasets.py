@@ -24,6 +24,7 @@ from coop.common.imports import check_extra
 from coop.common.process.untrusted import MAX_SETTINGS, page_sizes, read_text
 from coop.common.transitions import MASKS
 from coop.common.types import Array, EnvSpec
+from coop.records.parquet_seals import has_seal
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -101,27 +102,26 @@ def _rows(path: Path, spec: EnvSpec, source: str) -> Iterator[Rows]:
 def _of_parquet(path: Path, spec: EnvSpec) -> Iterator[Rows]:
     import pyarrow.parquet as pq  # noqa: PLC0415 (an extra)
 
-    with (
-        path.open("rb") as opened,
-        mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as content,
-        pq.ParquetFile(path, pre_buffer=False) as file,
-    ):
-        there = set(file.schema_arrow.names)
-        needed = (*_COLUMNS, *(MASKS if spec.masks else ()))
-        if missing := [name for name in needed if name not in there]:
-            raise ValueError(f"has no column {missing[0]}; needed: {', '.join(needed)}")
-        names = [*needed, *(name for name in _OPTIONAL if name in there)]
-        _check_groups(file, content, names)
-        before: Rows | None = None
-        episode = None  # of the last transition
-        for batch in file.iter_batches(ROWS, columns=names):
-            columns = {name: _values(name, batch.column(name), spec) for name in names}
+    with path.open("rb") as opened, mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        if has_seal(content) is False:
+            raise ValueError("wrong checksum: not what was exported")
+        with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
+            there = set(file.schema_arrow.names)
+            needed = (*_COLUMNS, *(MASKS if spec.masks else ()))
+            if missing := [name for name in needed if name not in there]:
+                raise ValueError(f"has no column {missing[0]}; needed: {', '.join(needed)}")
+            names = [*needed, *(name for name in _OPTIONAL if name in there)]
+            _check_groups(file, content, names)
+            before: Rows | None = None
+            episode = None  # of the last transition
+            for batch in file.iter_batches(ROWS, columns=names):
+                columns = {name: _values(name, batch.column(name), spec) for name in names}
+                if before is not None:
+                    before.ends[-1] |= "episode" in columns and columns["episode"][0] != episode
+                    yield before
+                before, episode = _checked(columns, spec), columns.get("episode", [None])[-1]
             if before is not None:
-                before.ends[-1] |= "episode" in columns and columns["episode"][0] != episode
                 yield before
-            before, episode = _checked(columns, spec), columns.get("episode", [None])[-1]
-        if before is not None:
-            yield before
 
 
 def _check_groups(file: Any, content: mmap.mmap, names: Iterable[str]) -> None:  # noqa: ANN401 (a ParquetFile)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -11,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from coop.common.errors import RunError
+from coop.common.errors import CoopError, RunError
 from coop.common.imports import describe, remember
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.process.console import say
@@ -19,6 +18,7 @@ from coop.common.process.files import FileDigest, make_folder, measure, truncate
 from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import RunConfig, value_of
 from coop.common.settings.overrides import leaves
+from coop.common.settings.reading import parse_toml
 from coop.common.settings.resuming import settings_digest
 from coop.common.settings.tables import CONFIG, run_config_text, to_tables
 from coop.common.types import EpisodeRow
@@ -199,9 +199,9 @@ def _study(folder: Path, config: RunConfig) -> tuple[str, dict[str, Any]]:
     if not (folder / SWEEP).exists():
         return "", {}
     try:
-        varied = tomllib.loads(read_text(folder / SWEEP, MAX_SETTINGS)).get("vary", {})
+        varied = parse_toml(read_text(folder / SWEEP, MAX_SETTINGS)).get("vary", {})
         names = [".".join(place) for place, _ in leaves(varied)]
-    except (OSError, ValueError, RunError, AttributeError, RecursionError):  # a sweep's own command names it
+    except (OSError, ValueError, CoopError, AttributeError):  # a sweep's own command names it
         names = []
     cell = {name: value_of(config, name) for name in dict.fromkeys(("method", "seed", *names))}
     return folder.name, {name: value for name, value in cell.items() if value is not None}

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import time
-import tomllib
 from collections import deque
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coop.common.errors import CoopError, UsageError
+from coop.common.errors import CoopError, RunError, UsageError, first_line
 from coop.common.imports import check_extra
 from coop.common.numbers import RETURN_WINDOW
 from coop.common.places import absolute
 from coop.common.process.files import make_folder
 from coop.common.process.limits import cores
-from coop.common.process.untrusted import MAX_SETTINGS, read_text
+from coop.common.process.untrusted import MAX_SETTINGS, read_text, refuse_links
 from coop.common.settings.overrides import merged, nested
-from coop.common.settings.reading import checked
+from coop.common.settings.reading import checked, parse_toml
 from coop.records.following import EPISODES, Following
 from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import read_summary
@@ -31,6 +32,7 @@ from coop.studies.sweep.local import LocalProcesses
 if TYPE_CHECKING:
     import optuna
 
+STORAGE = "optuna.db"
 TICK = 0.2  # seconds
 REPORTS = 20  # of a run, to the pruner, at equal distances in environment steps
 GRACE = 60.0  # seconds for the runs to save their state
@@ -66,7 +68,8 @@ def tune(
         storage: URL of Optuna's storage; SQLite in the folder if None.
 
     Raises:
-        UsageError: Optuna is not installed, or the grid is invalid.
+        UsageError: Optuna is not installed, the grid is invalid, or the folder can hold no storage.
+        RunError: the storage can't be read or written.
     """
     check_extra("coop.tune", "optuna", "optuna")
     import optuna  # noqa: PLC0415 (an extra, which may be missing)
@@ -75,20 +78,53 @@ def tune(
         raise UsageError(f"trials = {trials}, workers = {workers}: must be at least 1")
     path = absolute(folder, "folder")
     space = Space(grid)
-    make_folder(path)
-    study = optuna.create_study(
-        storage=storage or f"sqlite:///{path / 'optuna.db'}", study_name=path.name, direction="maximize",
-        load_if_exists=True, pruner=pruner,
-    )  # fmt: skip
-    # Another seed after each interruption: the same one would draw the same settings again.
-    study.sampler = sampler or optuna.samplers.TPESampler(seed=seed + len(study.trials))
-    search = _Search(study, space, path, workers or cores())
-    try:
-        while search.advance(trials):
-            time.sleep(TICK)
-    finally:
-        search.executor.stop(GRACE)
+    file = _file_in(path)
+    with _storing(storage or str(file)):
+        study = optuna.create_study(
+            storage=storage or _sqlite(file), study_name=path.name, direction="maximize",
+            load_if_exists=True, pruner=pruner,
+        )  # fmt: skip
+        # Another seed after each interruption: the same one would draw the same settings again.
+        study.sampler = sampler or optuna.samplers.TPESampler(seed=seed + len(study.trials))
+        search = _Search(study, space, path, workers or cores())
+        try:
+            while search.advance(trials):
+                time.sleep(TICK)
+        finally:
+            search.executor.stop(GRACE)
     return study
+
+
+def _file_in(folder: Path) -> Path:
+    """The file of Optuna's storage in a folder, which it creates; raises UsageError where none can be."""
+    file = folder / STORAGE
+    refuse_links(file)
+    try:
+        make_folder(folder)
+    except OSError as error:
+        raise UsageError(f"folder {folder}: {error.strerror}") from error
+    return file
+
+
+def _sqlite(file: Path) -> optuna.storages.RDBStorage:
+    """Optuna's storage in a file: by its path, as a URL with a ? or # in it would be that of another file."""
+    import optuna  # noqa: PLC0415 (an extra)
+
+    connect = partial(sqlite3.connect, file, check_same_thread=False)
+    return optuna.storages.RDBStorage(f"sqlite:///{STORAGE}", engine_kwargs={"creator": connect})
+
+
+@contextmanager
+def _storing(storage: str) -> Iterator[None]:
+    """Within it, what a storage fails of is a RunError in one line."""
+    from optuna.exceptions import StorageInternalError  # noqa: PLC0415 (an extra)
+    from sqlalchemy.exc import SQLAlchemyError  # noqa: PLC0415
+
+    try:
+        yield
+    except (SQLAlchemyError, StorageInternalError) as error:
+        why = next((each for each in (error.__cause__, getattr(error, "orig", None)) if each), error)
+        raise RunError(f"storage {storage}: {first_line(getattr(why, 'orig', None) or why)}") from error
 
 
 class Space:
@@ -97,13 +133,12 @@ class Space:
     def __init__(self, grid: str | Path | Mapping[str, Any]) -> None:
         """Read a grid; raises UsageError, also for settings that no run takes."""
         try:
-            tables = dict(grid) if isinstance(grid, Mapping) else tomllib.loads(read_text(Path(grid), MAX_SETTINGS))
+            tables = dict(grid) if isinstance(grid, Mapping) else parse_toml(read_text(Path(grid), MAX_SETTINGS))
             tables.pop("quick", None)
             self.file = checked(GridFile, tables)
-        except UsageError as error:
-            raise UsageError(f"grid: {error}") from error
-        except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise UsageError(f"grid {grid}: {getattr(error, 'strerror', None) or error}") from error
+        except (OSError, UnicodeDecodeError, CoopError) as error:
+            name = "grid" if isinstance(grid, Mapping) else f"grid {grid}"
+            raise UsageError(f"{name}: {getattr(error, 'strerror', None) or error}") from error
         self.axes = _axes(self.file.vary)
         first = {name: each["low"] if isinstance(each, Mapping) else each[0] for name, each in self.axes.items()}
         self.cells("trial", self.file.methods[0], first)

@@ -49,7 +49,7 @@ def recover(core: ReplayCore, folder: Path, first: int, run_id: int, *, sync: bo
     if numbers and not replaying.ended:
         taken += ", which ends as a kill leaves it"
     notices = [f"{text}; the journal is read on behind it" for text in replaying.lost]
-    if replaying.lost and (lost or not sync):
+    if lost:
         notices.append(f"the journal lacks {lost:,} transitions that had been acknowledged")
     return max([first, *(number + 1 for number in numbers)]), [taken, *notices]
 
@@ -75,6 +75,8 @@ class Replaying:
 
         Yields every draw, which must be read before the next one. Raises as `recover`.
         """
+        if first > 1 and not numbers:  # a checkpoint has begun that file
+            self.lost.append(f"{self._folder}: file {first} is missing, and so is all that followed")
         for expected, number in zip([first, *(each + 1 for each in numbers)], numbers, strict=False):
             if number != expected:
                 missing = f"file {expected} is" if number == expected + 1 else f"files {expected} to {number - 1} are"

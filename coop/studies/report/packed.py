@@ -7,8 +7,6 @@ of numbers in `episodes.csv` and `metrics.jsonl` a list, named like `episodes.cs
 
 from __future__ import annotations
 
-import re
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,12 +19,11 @@ import pyarrow.parquet as pq
 from coop.common.errors import UsageError
 from coop.common.process.untrusted import check_run_name, page_sizes
 from coop.records.checkpoints import EVALUATIONS
+from coop.records.parquet_seals import has_seal
 
 SWEEP, CONFIG, SUMMARY, EPISODES, METRICS = "sweep.toml", "config.toml", "summary.json", "episodes.csv", "metrics.jsonl"
 TEXTS = (CONFIG, SUMMARY, EVALUATIONS)
 MAX_STUDY = 1 << 30  # bytes of a study in memory
-SEAL, UNSEALED = "coop", "crc32 of the rest:00000000"  # an entry of the metadata; with its digits the checksum
-_SEALED = re.compile(rb"crc32 of the rest:[0-9a-f]{8}")
 
 
 class PackedStudy:
@@ -37,7 +34,10 @@ class PackedStudy:
             if path.stat().st_size > MAX_STUDY:
                 raise ValueError(f"{path.stat().st_size:,} bytes; a study has at most {MAX_STUDY:,}")
             content = path.read_bytes()
-            _check_seal(path, content)
+            if (sealed := has_seal(content)) is None:
+                raise ValueError("has no checksum")
+            if not sealed:
+                raise UsageError(f"{path}: wrong checksum: not what was packed")
             self._table = _read_bounded(content)
             self.names = [str(name) for name in self._table["run"].to_pylist()]
         except (OSError, KeyError, ValueError, pa.ArrowException) as error:
@@ -82,26 +82,6 @@ class PackedStudy:
 def decimals(values: Sequence[float]) -> list[float]:
     """Convert 32-bit floats back to the six digits of which they were made."""
     return [float(f"{value:.6g}") for value in values]
-
-
-def sealed(content: bytes) -> bytes:
-    """Put the checksum of a Parquet file whose metadata hold UNSEALED in its place."""
-    start = content.rindex(UNSEALED.encode())
-    return content[:start] + _seal_of(content) + content[start + len(UNSEALED) :]
-
-
-def _check_seal(path: Path, content: bytes) -> None:
-    """Raise UsageError if a packed study is not what was packed."""
-    found = list(_SEALED.finditer(content))
-    if not found:
-        raise ValueError("has no checksum")
-    start, end = found[-1].span()
-    if found[-1][0] != _seal_of(content[:start] + UNSEALED.encode() + content[end:]):
-        raise UsageError(f"{path}: wrong checksum: not what was packed")
-
-
-def _seal_of(unsealed: bytes) -> bytes:
-    return f"{UNSEALED[:-8]}{zlib.crc32(unsealed):08x}".encode()
 
 
 def _read_bounded(content: bytes) -> pa.Table:

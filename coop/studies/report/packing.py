@@ -13,7 +13,8 @@ import pyarrow.parquet as pq
 
 from coop.common.errors import UsageError
 from coop.common.process.files import sync_folder, write_atomic
-from coop.studies.report.packed import EPISODES, METRICS, SEAL, SWEEP, TEXTS, UNSEALED, decimals, sealed
+from coop.records.parquet_seals import SEAL, UNSEALED, sealed
+from coop.studies.report.packed import EPISODES, METRICS, SWEEP, TEXTS, decimals
 from coop.studies.report.sources import FolderSource
 
 SMALLEST = 22  # zstd's level

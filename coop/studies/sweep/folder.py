@@ -10,7 +10,7 @@ from typing import Literal
 from coop.common.errors import RunError, UsageError
 from coop.common.numbers import RETURN_WINDOW
 from coop.common.process.files import make_folder, write_atomic
-from coop.common.process.untrusted import check_links
+from coop.common.process.untrusted import check_links, refuse_links
 from coop.common.settings.tables import identity, run_config_text, sealed_toml
 from coop.records.checkpoints import RECORDS, SWEEP, checked_summary
 from coop.records.locks import LockHeld, RunLock
@@ -48,7 +48,8 @@ class CellFolder:
         self.path = sweep / cell.name
 
     def check(self) -> None:
-        """Raise UsageError if the folder holds a run of another config."""
+        """Raise UsageError if the folder holds a run of another config, or is a link."""
+        refuse_links(self.path)
         check_links(self.path)
         held = self.path / "config.toml"
         if held.exists() and identity(read_run_config(self.path)) != identity(self.cell.config):

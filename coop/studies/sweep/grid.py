@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property
@@ -17,15 +16,15 @@ from msgspec import Meta
 
 from coop.common.bounded import Counter
 from coop.common.envs.make import env_spec
-from coop.common.errors import UsageError, closest, refusal
-from coop.common.process.untrusted import check_run_name
+from coop.common.errors import CoopError, UsageError, closest, refusal
+from coop.common.process.untrusted import MAX_SETTINGS, check_run_name, read_text
 from coop.common.settings.config import RunConfig, check_distributed
 from coop.common.settings.environment import EnvSettings
 from coop.common.settings.fields import Positive
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
-from coop.common.settings.reading import checked
+from coop.common.settings.reading import checked, parse_toml
 from coop.common.settings.starting import env_id_of, starting_tables, stated
 from coop.common.settings.tables import load_tables, resolve, shortened, to_tables, validated
 
@@ -113,7 +112,7 @@ def load_grid(name: str, quick: bool = False) -> Grid:
     """
     try:
         text = _text(name)
-    except (OSError, UnicodeDecodeError, UsageError) as error:
+    except (OSError, UnicodeDecodeError, CoopError) as error:
         raise UsageError(f"grid {name}: {getattr(error, 'strerror', None) or error}") from error
     return parse_grid(text, name, quick)
 
@@ -124,7 +123,7 @@ def parse_grid(text: str, name: str, quick: bool = False, check: bool = True) ->
     check: its cells too, which takes milliseconds each; without it only `choices` is known to be valid.
     """
     try:
-        tables = tomllib.loads(text)
+        tables = parse_toml(text)
         small = tables.pop("quick", None)
         if quick:
             if not isinstance(small, dict):
@@ -133,7 +132,7 @@ def parse_grid(text: str, name: str, quick: bool = False, check: bool = True) ->
         grid = Grid(checked(GridFile, tables))
         _ = grid.cells if check else grid.choices
         return grid
-    except (tomllib.TOMLDecodeError, UsageError) as error:
+    except UsageError as error:
         raise UsageError(f"grid {name}: {error}") from error
 
 
@@ -143,7 +142,7 @@ def _text(name: str) -> str:
     if not name.endswith(".toml"):
         hint = f"give a .toml file or one of {', '.join(shipped_grids())}"
         raise UsageError(refusal("unknown", closest(name, shipped_grids()), hint))
-    return Path(name).read_text(encoding="utf-8-sig")  # some editors begin files with a mark
+    return read_text(Path(name), MAX_SETTINGS).removeprefix("\ufeff")  # a mark that some editors write
 
 
 def _choices(file: GridFile) -> Iterator[Choice]:

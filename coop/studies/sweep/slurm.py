@@ -11,6 +11,7 @@ from itertools import count
 from pathlib import Path
 
 from coop.common.errors import RunError
+from coop.common.process.files import write_atomic
 from coop.common.process.processes import command
 from coop.studies.sweep.grid import GridFile
 
@@ -89,11 +90,20 @@ def _array_size() -> int:
 
 def _write(tasks: Tasks, cells: list[str]) -> Path:
     """Write an array's script and the names of its cells, those of a task in one line, under a new number."""
-    script = next(path for n in count(1) if not (path := tasks.folder / f"array-{n}.sh").exists())
+    script = next(path for n in count(1) if _is_new(path := tasks.folder / f"array-{n}.sh"))
     lines = ["\t".join(cells[n : n + tasks.per_task]) for n in range(0, len(cells), tasks.per_task)]
-    script.with_suffix(".cells").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
-    script.write_text(_script(tasks, script.with_suffix(".cells"), len(lines)), encoding="utf-8")
+    write_atomic(script.with_suffix(".cells"), "".join(f"{line}\n" for line in lines).encode())
+    write_atomic(script, _script(tasks, script.with_suffix(".cells"), len(lines)).encode())
     return script
+
+
+def _is_new(path: Path) -> bool:
+    """Create a file, unless there is one or a link of that name: of several processes one has each number."""
+    try:
+        path.open("x").close()
+    except FileExistsError:
+        return False
+    return True
 
 
 def _submit(script: Path, after: str | None) -> str:
