@@ -30,10 +30,8 @@ from coop.common.networks.masks import allowed
 from coop.common.networks.network import FlatNetwork
 from coop.common.numbers import generator_state, set_generator_state
 from coop.common.process.output import warn
-from coop.common.registry import loaded
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
-from coop.common.settings.methods import METHODS
 from coop.common.transitions import Batch
 from coop.common.types import Array, EnvSpec
 from coop.learner.edl.arrays import chosen, convert_like, namespace

@@ -113,7 +113,7 @@ class MaskCheck:
         elif not isinstance(info, Mapping) or (given := info.get(MASK)) is None:
             raise Unfit(f'gives no info["{MASK}"]', "allowed: in each state, the first one included, or in none")
         found = _as_array(given, "action mask")
-        flags = found.dtype == np.bool_ or (found.dtype.kind in "iu" and not (found & ~1).any())
+        flags = found.dtype == np.bool_ or (found.dtype.kind in "iu" and ((found == 0) | (found == 1)).all())
         if found.shape != (self._actions,) or not flags:
             values = (
                 f"with values to {found.max()} " if found.shape == (self._actions,) and found.dtype.kind in "iu" else ""
