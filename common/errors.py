@@ -11,8 +11,13 @@ CoopError
 
 from __future__ import annotations
 
+import os
+import traceback
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from pathlib import Path
+
+_STANDARD_LIBRARY = os.path.dirname(os.__file__)  # noqa: PTH120 (of a prefix of texts)
 
 
 class CoopError(Exception):
@@ -67,6 +72,16 @@ def first_line(error: BaseException | None) -> str:
     """An exception's type and the first line of its text."""
     lines = text_of(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def place(error: BaseException) -> str:
+    """The last line of users' own code that an exception has come through, " (file:line)"; empty if there is none."""
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        file = frame.f_code.co_filename
+        others = file.startswith((_STANDARD_LIBRARY, "<")) or "site-packages" in file
+        if not others and not str(frame.f_globals.get("__name__")).startswith("coop."):
+            return f" ({Path(file).name}:{line})"
+    return ""
 
 
 ALSO_CALLED = {

@@ -60,9 +60,11 @@ def import_module(module: str, field: str, *, installed: bool = False) -> Module
     """
     if module in sys.modules:
         return sys.modules[module]
-    here = str(working_directory())
+    here = ""
+    with contextlib.suppress(UsageError):  # one that has been deleted has no modules
+        here = str(working_directory())
     # `python -m` has it; a console script lacks it.
-    added = here not in sys.path and not (installed and _handed_over)
+    added = here not in ("", *sys.path) and not (installed and _handed_over)
     if added:
         sys.path.append(here)
     try:

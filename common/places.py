@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import errno
-from contextlib import suppress
+import os
 from pathlib import Path
 
 from coop.common.errors import UsageError
 
 _started_in: Path | None = None
+_deleted: OSError | None = None
 
 
 def remember_working_directory() -> None:
-    """Make this process's working directory the one that `working_directory` tells from now on."""
-    global _started_in  # noqa: PLW0603 (of the process)
-    with suppress(OSError):
+    """Make this process's working directory the one that `working_directory` tells from now on.
+
+    One that has been deleted is left, because some libraries (MKL) end a process there.
+    """
+    global _started_in, _deleted  # noqa: PLW0603 (of the process)
+    try:
         _started_in = Path.cwd()
+    except OSError as error:
+        _deleted = error
+        os.chdir("/")
 
 
 def working_directory() -> Path:
@@ -25,6 +32,8 @@ def working_directory() -> Path:
         UsageError: it has been deleted.
     """
     try:
+        if _deleted is not None:
+            raise _deleted
         return _started_in or Path.cwd()
     except OSError as error:
         raise UsageError("the working directory has been deleted; give absolute paths") from error

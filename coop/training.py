@@ -12,7 +12,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from coop.common.errors import CoopError, RunError, UsageError
+from coop.common.errors import CoopError, RunError, UsageError, place
 from coop.common.imports import describe, permit
 from coop.common.places import absolute
 from coop.common.process.console import say
@@ -124,7 +124,8 @@ class TrainingRun:
             return self.summary
         if isinstance(failure, RunError):
             raise failure
-        raise RunError(str(failure) if isinstance(failure, CoopError) else describe(failure)) from failure
+        text = str(failure) if isinstance(failure, CoopError) else describe(failure) + place(failure)
+        raise RunError(text) from failure
 
     def _run(self) -> None:
         try:

@@ -52,8 +52,7 @@ def main() -> None:
     remember_working_directory()
     end_on_signals(program)
     limit_threads()
-    if os.environ.get("MPLBACKEND", "").startswith("module://"):
-        del os.environ["MPLBACKEND"]  # of the notebook that has started this command, which draws to files only
+    os.environ.pop("MPLBACKEND", None)  # of a notebook, or of no backend at all; a command draws to files only
     with importing():
         run = importlib.import_module(MODULES[program]).main
     with despite_threads():

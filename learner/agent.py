@@ -30,17 +30,16 @@ from coop.common.networks.masks import allowed
 from coop.common.networks.network import FlatNetwork
 from coop.common.numbers import generator_state, set_generator_state
 from coop.common.process.output import warn
-from coop.common.registry import loaded
 from coop.common.settings import schedules
 from coop.common.settings.config import RunConfig
-from coop.common.settings.methods import METHODS
 from coop.common.transitions import Batch
 from coop.common.types import Array, EnvSpec
 from coop.learner.edl.arrays import chosen, convert_like, namespace
 from coop.learner.edl.branches import Branches
 from coop.learner.given import Given
 from coop.learner.losses import LOSSES, Values, output_error, td_errors
-from coop.learner.methods.rule import AUTOGRAD, UpdateRule
+from coop.learner.methods.own_rule import make_rule
+from coop.learner.methods.rule import AUTOGRAD
 from coop.learner.methods.step import Step, slope_of, to_host
 from coop.learner.optimizers import make_optimizer
 from coop.learner.qnetwork import as_float32, make_q_network, on_host
@@ -103,8 +102,7 @@ class Agent:
         self._networks = [make_q_network(config, spec, number, self.device, self._noise) for number in (0, 1)]
         trained = self._networks if config.two_networks else self._networks[:1]
         self.optimizers = [make_optimizer(config.learner, one.theta, one.gradient) for one in trained]
-        rule = loaded(METHODS.get(config.method).rule, f"method {config.method!r}")
-        self.rule: UpdateRule = rule(config, self._noise)
+        self.rule = make_rule(config, self._noise)
         decay = _decay_vector(config.learner.weight_decay, self.networks[0].layout)
         self._weight_decay = None if decay is None else convert_like(decay, self._networks[0].theta)
         if capture is None and self.device.type == "cuda":
@@ -186,9 +184,6 @@ class Agent:
     def _own_errors(self, step: Step, given: Given, values: Any) -> Any:  # noqa: ANN401
         """The TD errors towards the rule's own targets, float32 [batch], in the arrays of `values`."""
         step.targets = self.rule.targets(step)
-        shape = tuple(getattr(step.targets, "shape", ()))
-        if shape != (len(values),):
-            raise UsageError(f"method = {self.config.method!r}: targets of shape {shape}, must be ({len(values)},)")
         return chosen(values, given.columns.actions) - convert_like(step.targets, values)
 
     def _own_error(self, step: Step, given: Given, errors: Any, error: Any, values: Any) -> Any:  # noqa: ANN401

@@ -43,6 +43,9 @@ class Wordless(Exception):
         raise AttributeError("no args")
 
 
+NO_FLAGS = {"ends nan": float("nan"), "ends half": np.array(0.5)}
+
+
 class Odd(gymnasium.Env[Any, Any]):
     """Right in all but what it is asked to do wrong, from step 3 on, or in the reset after step 5."""
 
@@ -93,6 +96,8 @@ class Odd(gymnasium.Env[Any, Any]):
             return self.right, 1.0, False, {}
         if wrong == "ends":
             given[2] = np.array([True, False])
+        if wrong in NO_FLAGS:
+            given[2] = NO_FLAGS[wrong]
         given[0] = observations.get(wrong, self.right)
         given[1] = rewards.get(wrong, 1.0)
         if self.wrong == "endless":
@@ -156,6 +161,8 @@ WRONG: list[tuple[str, dict[str, Any], type[CoopError], str]] = [
     ("reward inf", {}, UsageError, rf"{AT_3} the reward inf"),
     ("reward large", {}, UsageError, rf"{AT_3} the reward 1\.1e\+06; allowed: .* to 1,000,000"),
     ("ends", {}, UsageError, rf"{AT_3} terminated bool\[2\]; allowed: a single bool"),
+    ("ends nan", {}, UsageError, rf"{AT_3} terminated nan; allowed: a single bool"),
+    ("ends half", {}, UsageError, rf"{AT_3} terminated float64\[\]; allowed: a single bool"),
     ("four", {}, UsageError, rf"{AT_3} 4 values; gymnasium's step gives \(observation, reward,"),
     ("step raises", {}, RunError, r"at step 3 raised ValueError: no such move \(test_environment_promises.py:\d+\)$"),
     ("step raises in its words too", {}, RunError, r"at step 3 raised Wordless \(test_environment_promises.py:\d+\)$"),

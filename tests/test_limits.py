@@ -101,17 +101,28 @@ def test_a_table_larger_than_the_job_s_memory(line: str, source: str, tmp_path: 
     assert done.stderr.splitlines()[-1].endswith(source)
 
 
-def test_memory_that_the_system_refuses_is_one_line() -> None:
-    code = """
-import resource
+MAPPED = "libtorch_cpu.so: failed to map segment from shared object"  # what the loader says of too little memory
+
+
+@pytest.mark.parametrize(
+    ("work", "words"),
+    [
+        ("np.zeros(2**33, np.uint8)", " ("),
+        (f"(_ for _ in ()).throw(ImportError({MAPPED!r}))", f" (ImportError: {MAPPED})"),
+        ("(threading.stack_size(2**33), threading.Thread(target=print).start())", " and processes (ulimit -u)"),
+    ],
+)
+def test_memory_that_the_system_refuses_is_one_line(work: str, words: str) -> None:
+    code = f"""
+import resource, threading
 import numpy as np
 from coop.common.process.lifecycle import run_main
 resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32))
-run_main("coop-x", lambda: np.zeros(2**33, np.uint8))
+run_main("coop-x", lambda: {work})
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.startswith("coop-x: error: not enough memory (")
+    assert done.stderr.startswith(f"coop-x: error: not enough memory{words}")
     assert done.stderr.endswith("; ulimit -v allows 4.0 GiB\n")
     assert done.stderr.count("\n") == 1
 

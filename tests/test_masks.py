@@ -74,7 +74,7 @@ def assert_own_masks(transitions: Segment | Batch) -> None:
 
 
 @pytest.mark.parametrize("env_id", [INFO, METHOD])
-@pytest.mark.parametrize("dtype", ["int8", "bool", "int64"])
+@pytest.mark.parametrize("dtype", ["int8", "bool", "int64", "uint64"])
 def test_an_environment_gives_masks_by_info_or_by_a_method(env_id: str, dtype: str) -> None:
     env = make_vector_env(EnvSettings(id=env_id, kwargs={"dtype": dtype}), 2, 0)
     assert env.spec == env_spec(EnvSettings(id=env_id)) == replace_spec(env_id)

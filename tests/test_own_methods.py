@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -13,13 +14,14 @@ from commands import run_command
 from test_agent import SPEC, batches
 
 import coop
-from coop.common.errors import JoinError, UsageError
+from coop.common.errors import CoopError, JoinError, RunError, UsageError
 from coop.common.imports import permit
 from coop.common.messaging import wire
 from coop.common.messaging.messages.control import JoinReply
 from coop.common.settings.tables import resolve
 from coop.common.transitions import Batch
 from coop.learner.agent import Agent
+from coop.learner.methods.own_rule import OwnRule
 from coop.learner.methods.rule import UpdateRule
 from coop.learner.methods.step import to_host
 
@@ -236,14 +238,73 @@ def test_a_rule_gets_numpy_unless_its_own_class_says_otherwise() -> None:
     assert (whole.dtype, half.dtype) == (np.int64, np.float32)
 
 
+class Answering(UpdateRule):
+    """Gives what a test wants of one of its methods."""
+
+    answers: ClassVar[dict[str, Any]] = {}
+
+    def __getattribute__(self, name: str) -> Any:
+        answer = Answering.answers.get(name)
+        return object.__getattribute__(self, name) if answer is None else answer
+
+
+class Costing(Answering):
+    def loss(self, step: Any, q: Any) -> Any:
+        raise NotImplementedError
+
+
+def failing(*arguments: Any) -> Any:
+    raise SystemExit("no licence")
+
+
+@pytest.mark.parametrize(
+    ("rule", "name", "answer", "kind", "words"),
+    [
+        (Answering, "bootstrap", lambda values, _: values, UsageError, r": bootstrap gives float32\[32, 2\], must be"),
+        (
+            Answering,
+            "bootstrap",
+            lambda values, _: values.max(1).tolist(),
+            UsageError,
+            ": bootstrap gives list, must be",
+        ),
+        (
+            Answering,
+            "bootstrap",
+            lambda values, _: values.max(1) * 1j,
+            UsageError,
+            r": bootstrap gives complex64\[32\]",
+        ),
+        (Answering, "bootstrap", failing, RunError, r" raised SystemExit: no licence \(test_own_methods.py:\d+\)$"),
+        (Answering, "metrics", lambda: {"x": "a"}, UsageError, ": metrics gives 'x' as str, must be a number"),
+        (Answering, "metrics", lambda: None, UsageError, ": metrics gives NoneType, must be a table"),
+        (Answering, "state", lambda: {"x": object()}, UsageError, ": state can't be saved"),
+        (Answering, "state", lambda: {"x": lambda: 0}, UsageError, ": state can't be saved"),
+        (Answering, "state", lambda: None, UsageError, ": state gives NoneType, must be a dict"),
+        (Costing, "loss", lambda step, q: q.sum(1), UsageError, r": loss gives a tensor of shape \[32\], must be"),
+        (Costing, "loss", lambda step, q: q.detach().sum(), UsageError, ": loss gives a tensor that does not depend"),
+        (Costing, "loss", lambda step, q: 1.0, UsageError, ": loss gives float, must be a tensor of one"),
+    ],
+)
+def test_what_a_rule_raises_or_gives_wrongly_names_the_method(
+    rule: type[Answering], name: str, answer: Any, kind: type[CoopError], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Answering, "answers", {name: answer})
+    agent = agent_of(f"test_own_methods:{rule.__name__}")
+    run = getattr(agent.rule, name) if name in ("metrics", "state") else partial(agent.update, batches(1)[0])
+    with pytest.raises(kind, match=f"^method = 'test_own_methods:{rule.__name__}'{words}"):
+        run()
+
+
 def test_targets_of_another_shape_are_refused() -> None:
     class Wide(UpdateRule):
         def targets(self, step: Any) -> Any:
             return step.target_q_next
 
     agent = agent_of("dqn")
-    agent.rule = Wide(agent.config, np.random.default_rng(0))
-    with pytest.raises(UsageError, match=r"targets of shape \(32, 2\), must be \(32,\)"):
+    rule: Any = OwnRule(Wide(agent.config, np.random.default_rng(0)), "method = 'wide'")
+    agent.rule = rule
+    with pytest.raises(UsageError, match=r"^method = 'wide': targets gives float32\[32, 2\], must be float32\[32\]"):
         agent.update(batches(1)[0])
 
 

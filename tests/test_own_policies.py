@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from samples import make_segment
 
-from coop.common.errors import UsageError
+from coop.common.errors import RunError, UsageError
 from coop.common.settings.policies import EVICTIONS, SAMPLERS, EvictionPolicy, SamplingPolicy
 from coop.common.types import EnvSpec, EpisodeEnd
 from coop.replay.table.policies import Eviction, Incoming, Sampling
@@ -131,9 +131,10 @@ def test_impossible_rows_are_refused_and_change_nothing(rows: list[int], kept: s
         ([0, 9], 2, "rows 0 to 9 of 4"),
         ([0, 4], 2, "rows 0 to 4 of 4"),
         ([-1, 0], 2, "rows -1 to 0"),
-        ([0], 1, "1 rows, 1 weights, not 2"),
-        ([0, 1], 1, "2 rows, 1 weights, not 2"),
-        ([0], 2, "1 rows, 2 weights, not 2"),
+        ([0], 1, r"1 rows, weights of shape \(1,\), not 2"),
+        ([0, 1], 1, r"2 rows, weights of shape \(1,\), not 2"),
+        ([0], 2, r"1 rows, weights of shape \(2,\), not 2"),
+        ([0.0, 1.0], 2, r"the rows float64\[2\] from 0 to 1, must be whole numbers"),
     ],
 )
 def test_impossible_draws_are_refused(rows: list[int], weights: int, words: str) -> None:
@@ -144,6 +145,83 @@ def test_impossible_draws_are_refused(rows: list[int], weights: int, words: str)
     table = table_of(Wrong)
     table.insert(make_segment(SPEC))
     with pytest.raises(UsageError, match=f"replay.sampling = 'own:Policy': draws {words}"):
+        table.sample(2)
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (None, r"None, must be \(rows, kept\)"),
+        (("ab", 1, 2), r"\('ab', 1, 2\), must be"),
+        ((np.zeros((2, 1), int), slice(0, 2)), r"the rows int64\[2, 1\] from 0 to 0, must be whole numbers"),
+        ((np.array([True, False]), slice(0, 2)), r"the rows bool\[2\]"),
+        (([0], None), "kept None, must be a slice, or ascending positions among 4"),
+        (([0], [7]), "kept list|kept \\[7\\]"),
+        (([0, 1], [2, 1]), "kept"),
+        (([0], [0.0]), "kept"),
+    ],
+)
+def test_answers_of_another_form_are_refused(answer: Any, words: str) -> None:
+    class Wrong(Eviction):
+        def place(self, first: int, count: int) -> Any:
+            return answer
+
+    table = table_of(Wrong)
+    with pytest.raises(UsageError, match=f"^replay.eviction = 'own:Policy': gives {words}"):
+        table.insert(make_segment(SPEC))
+    assert (len(table), table.inserted) == (0, 0)
+
+
+@pytest.mark.parametrize("weights", [[np.nan, 1], [np.inf, 1], [-1, 1], ["a", "b"], None])
+def test_weights_that_are_none_are_refused(weights: Any) -> None:
+    class Wrong(Sampling):
+        def draw(self, count: int, size: int) -> Any:
+            return [0, 1], weights
+
+    table = table_of(Wrong)
+    table.insert(make_segment(SPEC))
+    with pytest.raises(UsageError, match=r"^replay.sampling = 'own:Policy': draws .*weights"):
+        table.sample(2)
+
+
+def test_lists_and_small_types_will_do() -> None:
+    class Listing(Fifo):
+        def place(self, first: int, count: int) -> Any:
+            rows, _ = super().place(first, count)
+            return rows.astype(np.uint8), [True] * count
+
+    class Drawing(Sampling):
+        def draw(self, count: int, size: int) -> Any:
+            return list(range(count)), [1] * count
+
+    table_of(Listing).insert(make_segment(SPEC))
+    table = table_of(Drawing)
+    table.insert(make_segment(SPEC))
+    batch = table.sample(3)
+    assert batch.rewards.tolist() == [0, 1, 2]
+    assert (batch.weights.dtype, batch.weights.tolist()) == (np.float32, [1, 1, 1])
+
+
+def test_a_policy_that_fails_is_named_with_its_place_and_writes_to_no_column() -> None:
+    class Writing(Fifo):
+        def place(self, first: int, count: int) -> Any:
+            self.table.rewards[:] = 7
+            return super().place(first, count)
+
+    class Exiting(Sampling):
+        def draw(self, count: int, size: int) -> Any:
+            raise SystemExit("no licence")
+
+    table = table_of(Writing)
+    with pytest.raises(
+        RunError, match=r"^replay.eviction = 'own:Policy' raised ValueError: .*read-only \(test_own_pol"
+    ):
+        table.insert(make_segment(SPEC))
+    assert (len(table), table.inserted) == (0, 0)
+    table = table_of(Exiting)
+    table.insert(make_segment(SPEC))
+    words = r"^replay.sampling = 'own:Policy' raised SystemExit: no licence \(test_own_policies.py:\d+\)$"
+    with pytest.raises(RunError, match=words):
         table.sample(2)
 
 

@@ -62,6 +62,19 @@ def test_a_working_directory_that_has_been_deleted(line: str, tmp_path: Path) ->
     assert done.stderr == f"{name}: error: the working directory has been deleted; give absolute paths\n"
 
 
+def test_absolute_paths_in_a_working_directory_that_has_been_deleted(tmp_path: Path) -> None:
+    (tmp_path / "gone").mkdir()
+    run, short = tmp_path / "a", "--replay.capacity 100 --replay.learning-starts 40 --total-steps 60"
+    lines = [f"coop-lockstep {short} --run-dir {run}", f"coop-eval {run} --episodes 1 --networks 1"]
+    for line in lines:
+        (tmp_path / "gone").mkdir(exist_ok=True)
+        done = subprocess.run(
+            ["bash", "-c", f"rmdir ../gone && exec {SCRIPTS}/{line}"], cwd=tmp_path / "gone",
+            capture_output=True, text=True, check=False, timeout=100,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("path", ["a" * 300, "file/below", "/".join(["b" * 200] * 25)])
 @pytest.mark.parametrize(
     "line", ["coop-lockstep --run-dir {}", "coop-local --resume --run-dir {}", "coop-eval {}", "coop-report {}"]

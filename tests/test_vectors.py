@@ -65,7 +65,15 @@ class Own(VectorEnv[Any, Any, Any]):
     def step(self, actions: Any) -> Any:
         *others, infos = self._inner.step(actions)
         infos.pop(self._lacks, None)
-        return *others, infos
+        wrong = {
+            "a reward for all": (1, 1.0),
+            "rewards of one": (1, np.ones(1)),
+            "observations of one": (0, others[0][:1]),
+        }
+        if self._lacks in wrong:
+            at, value = wrong[self._lacks]
+            others[at] = value
+        return *others, None if self._lacks == "info" else infos
 
 
 gymnasium.register("test/Drift-v0", entry_point=Drift)
@@ -165,3 +173,21 @@ def test_what_does_not_fit_is_refused_in_a_line() -> None:
         pytest.raises(UsageError, match=r'has metadata\["autoreset_mode"\] = None; allowed: one of gymnasium.vector'),
     ):
         env_spec(EnvSettings(id="test/Own-v0", kwargs={"lacks": "mode"}))
+
+
+@pytest.mark.parametrize(
+    ("lacks", "words"),
+    [
+        (
+            "a reward for all",
+            "at step 1 of emulator 0 raised LookupError: rewards of each of 3 emulators; it gives float",
+        ),
+        ("rewards of one", "at step 1 of emulator 0 raised LookupError: rewards of each of 3 emulators; it gives 1"),
+        ("observations of one", "raised LookupError: observations of each of 3 emulators; it gives 1"),
+        ("info", r'raised LookupError: info\["final_obs"\], which mode SAME_STEP gives'),
+    ],
+)
+def test_values_that_are_not_one_for_each_emulator_are_named(lacks: str, words: str) -> None:
+    same = MODES.index(AutoresetMode.SAME_STEP)
+    with pytest.raises(RunError, match=words):
+        played(EnvSettings(id=f"test/Own-v{same}", kwargs={"lacks": lacks}))

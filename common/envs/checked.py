@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import gymnasium
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 
 from coop.common.bounds import MAX_MAGNITUDE
 from coop.common.errors import RunError, UsageError
-from coop.common.imports import describe
+from coop.common.own_code import described
 from coop.common.process.lifecycle import is_interrupt
 from coop.common.process.output import warn, warn_once
 from coop.common.types import Array
@@ -115,7 +113,7 @@ class MaskCheck:
         elif not isinstance(info, Mapping) or (given := info.get(MASK)) is None:
             raise Unfit(f'gives no info["{MASK}"]', "allowed: in each state, the first one included, or in none")
         found = _as_array(given, "action mask")
-        flags = found.dtype == np.bool_ or (found.dtype.kind in "iu" and not (found & ~1).any())
+        flags = found.dtype == np.bool_ or (found.dtype.kind in "iu" and ((found == 0) | (found == 1)).all())
         if found.shape != (self._actions,) or not flags:
             values = (
                 f"with values to {found.max()} " if found.shape == (self._actions,) and found.dtype.kind in "iu" else ""
@@ -270,7 +268,8 @@ class CheckedEnv:
             isinstance(value, np.generic | np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
         ):
             with suppress(OverflowError):  # of an int beyond all floats
-                return kind(value)
+                if kind is float or value in (0, 1):  # 2 and NaN are true to Python, and mean something else
+                    return kind(value)
         return self._refuse(
             f"gives {what} {_shown(value)}", f"allowed: a single {'number' if kind is float else 'bool'}"
         )
@@ -288,17 +287,14 @@ class CheckedEnv:
 
 
 def raised(error: BaseException) -> str:
-    """What a user's code has raised, in one line, with the last line of that code that it came through.
+    """What an environment's code has raised, see `described`.
 
     It may be anything, such as SystemExit, which must not end a run, or an exception of a library that is no Exception;
     an interrupt by a signal alone is raised again.
     """
     if is_interrupt(error):
         raise error
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if frame.filename != __file__ and "site-packages" not in frame.filename:
-            return f"{describe(error)} ({Path(frame.filename).name}:{frame.lineno})"
-    return describe(error)
+    return described(error)
 
 
 def _shown(value: object) -> str:

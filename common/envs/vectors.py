@@ -66,7 +66,7 @@ class _VectorEmulators:
     def __init__(self, name: str, envs: Vector, mode: AutoresetMode, seeds: Sequence[int]) -> None:
         self.envs, self._mode, self._seeds = envs, mode, list(seeds)
         self._alone = _restarts_alone(envs, mode)
-        self._begun: tuple[Any, Any] = (None, None)
+        self._begun: Any = None
         self._given: Any = None
         self.rows = [Row(self, number) for number in range(len(seeds))]
         inner = envs.unwrapped
@@ -86,9 +86,11 @@ class _VectorEmulators:
         except (TypeError, ValueError, gymnasium.error.Error):
             self._begun = self.envs.reset(seed=self._seeds[0])
 
-    def begun(self, number: int) -> tuple[Any, Any]:
+    def begun(self, number: int) -> Any:  # noqa: ANN401 (whatever there is)
         """What an emulator's reset gives, after `begin`."""
-        return _at(self._begun[0], number), _info(self._begun[1], number)
+        if not isinstance(self._begun, tuple) or len(self._begun) != 2:
+            return self._begun
+        return self._of("observations", self._begun[0], number), _info(self._begun[1], number)
 
     def play(self) -> None:
         """Let all emulators take the actions chosen."""
@@ -101,12 +103,16 @@ class _VectorEmulators:
         if not isinstance(given, tuple) or len(given) != 5:
             return given
         obs, rewards, terminated, truncated, infos = given
-        outcome = rewards[number], terminated[number], truncated[number]
+        outcome = tuple(
+            self._of(what, values, number)
+            for what, values in (("rewards", rewards), ("terminated", terminated), ("truncated", truncated))
+        )
         if self._mode == AutoresetMode.SAME_STEP and self._ended(number):
-            if "final_obs" not in infos:
+            if not isinstance(infos, Mapping) or "final_obs" not in infos:
                 raise LookupError('info["final_obs"], which mode SAME_STEP gives where an episode ends')
-            return infos["final_obs"][number], *outcome, _info(infos.get("final_info", {}), number)
-        return obs[number], *outcome, _info(infos, number)
+            last = self._of('info["final_obs"]', infos["final_obs"], number)
+            return last, *outcome, _info(infos.get("final_info", {}), number)
+        return self._of("observations", obs, number), *outcome, _info(infos, number)
 
     def restart(self, number: int) -> tuple[Any, Any]:
         """Begin an emulator's next episode: what its reset gives."""
@@ -122,6 +128,16 @@ class _VectorEmulators:
         else:
             obs, infos = self.envs.reset()
         return obs[number], _info(infos, number)
+
+    def _of(self, what: str, values: Any, number: int) -> Any:  # noqa: ANN401
+        """An emulator's of the values of all; raises LookupError unless there is one for each."""
+        try:
+            found = str(len(values))
+        except TypeError:
+            found = type(values).__name__
+        if found != str(len(self.rows)):
+            raise LookupError(f"{what} of each of {len(self.rows)} emulators; it gives {found}")
+        return values[number]
 
     def _ended(self, number: int) -> bool:
         return bool(self._given[2][number] or self._given[3][number])
@@ -142,7 +158,7 @@ class Row(gymnasium.Env[Any, Any]):
         self.metadata = envs.metadata
         self.chosen: Any = 0
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:  # noqa: ANN401
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:  # noqa: ANN401
         """Begin the next episode; with a seed, all emulators begin with the first one, each from its own."""
         if seed is None:
             return self._emulators.restart(self._number)

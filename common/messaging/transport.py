@@ -209,8 +209,8 @@ class Node:
 
     def _start(self, name: str, target: Callable[..., None], *args: Any) -> None:  # noqa: ANN401
         thread = threading.Thread(target=target, args=args, name=name, daemon=True)
-        self._threads.append(thread)
         thread.start()
+        self._threads.append(thread)  # only then: `close` waits for them
 
     def _serve(
         self,

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from coop.common.errors import CoopError, PeerLost, first_line
+from coop.common.errors import CoopError, PeerLost, first_line, place, text_of
 from coop.common.process.files import NO_SPACE
 from coop.common.process.limits import memory_limit
 from coop.common.process.output import complain, flush_at_end, on_output_gone, warn
@@ -22,6 +22,12 @@ from coop.common.process.output import complain, flush_at_end, on_output_gone, w
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
 LOOK_EVERY = 0.5  # seconds after which a wait notices a signal that came just before it began
 LEFT = 2.0  # seconds for users' threads to end by themselves
+_OUT_OF_MEMORY = (
+    (RuntimeError, "can't allocate memory"),
+    (ImportError, "failed to map segment"),
+    (ImportError, "Cannot allocate memory"),
+    (RuntimeError, "can't start new thread"),  # or a limit of processes
+)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -192,17 +198,18 @@ def _explained(error: BaseException) -> tuple[str, int]:
         case OSError(filename=str() | bytes() as name, strerror=str() as why):
             return f"{os.fsdecode(name)}: {why}", 1
     if is_out_of_memory(error):
-        return f"not enough memory ({first_line(error)}); {memory_limit()}", 1
+        more = " and processes (ulimit -u)" if "new thread" in text_of(error) else ""
+        return f"not enough memory{more} ({first_line(error)}); {memory_limit()}", 1
     traceback.print_exception(error)
-    return first_line(error), 1
+    return first_line(error) + place(error), 1
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether the system has refused memory; PyTorch says so in words."""
+    """Whether the system has refused memory; PyTorch, and the loader of libraries, say so in words."""
     return (
         isinstance(error, MemoryError)
         or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
-        or (isinstance(error, RuntimeError) and "can't allocate memory" in str(error))
+        or any(isinstance(error, kind) and words in text_of(error) for kind, words in _OUT_OF_MEMORY)
     )
 
 

@@ -82,7 +82,7 @@ class _Raw(io.FileIO):
     """
 
     def __init__(self, descriptor: int, *, lossy: bool) -> None:
-        super().__init__(descriptor, "wb")
+        super().__init__(descriptor, "wb", closefd=False)  # it lives as long as the process
         self.on_gone: Callable[[], None] = lambda: None
         self._gone = False
         self._lossy = lossy

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from coop.common.envs.make import check_filmed
-from coop.common.errors import CoopError, RunError, first_line
+from coop.common.errors import CoopError, RunError, first_line, place
 from coop.common.process.console import say
 from coop.common.process.lifecycle import Stop
 from coop.common.process.limits import use_threads
@@ -175,7 +175,7 @@ def play_lockstep(
         outcome = f"failed: {error}"
         raise
     except (Exception, SystemExit) as error:  # users' code may raise anything
-        outcome = f"failed: {first_line(error)}"
+        outcome = f"failed: {first_line(error)}{place(error)}"
         raise
     finally:
         summary = summarise(trainer, outcome or "interrupted", time.monotonic(), run.step)

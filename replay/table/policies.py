@@ -10,9 +10,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.errors import UsageError
-from coop.common.registry import loaded
-from coop.common.settings.policies import EVICTIONS, SAMPLERS, EvictionPolicy, SamplingPolicy
 from coop.common.transitions import Segment
 from coop.common.types import Array, EnvSpec
 
@@ -152,44 +149,3 @@ class Sampling(ABC):
 
     def prioritise(self, rows: Rows, priorities: Floats) -> None:  # noqa: B027
         """Set the priorities of these rows; called if a policy of the table uses priorities."""
-
-
-def make_policies(eviction: EvictionPolicy, sampling: SamplingPolicy, table: TableView) -> tuple[Eviction, Sampling]:
-    """Make both policies of a table; raises UsageError if one can't be loaded, or needs replacement and has none."""
-    if not (table.replacement or sampling.without_replacement):
-        raise UsageError(f"sampling: {sampling.name!r} draws with replacement only")
-    evicts, draws = (
-        loaded(policy.make, f"{registry.setting} {policy.name!r}")(table)
-        for policy, registry in ((eviction, EVICTIONS), (sampling, SAMPLERS))
-    )
-    return evicts, draws
-
-
-def check_placed(placed: tuple[Rows, slice | Rows], steps: int, size: int, capacity: int, policy: str) -> None:
-    """Raise UsageError for an answer of a policy's `place` or `admit` that breaks its promise; the table is unchanged.
-
-    steps: transitions of the segment. size: rows in use.
-    """
-    rows, kept = placed
-    count = len(np.arange(steps)[kept])
-    fresh = np.sort(rows[rows >= size])
-    if len(rows) != count:
-        problem = f"{len(rows)} rows for {count} transitions"
-    elif len(rows) and not 0 <= rows.min() <= rows.max() < capacity:
-        problem = f"rows from {rows.min()} to {rows.max()}, must be from 0 to {capacity - 1}"
-    elif len(np.unique(rows)) < len(rows):
-        problem = "a row twice"
-    elif not np.array_equal(fresh, np.arange(size, size + len(fresh))):
-        problem = f"rows {fresh.tolist()} with {size} in use: unused rows are filled in order"
-    else:
-        return
-    raise UsageError(f"replay.eviction = {policy!r}: gives {problem}")
-
-
-def check_drawn(drawn: tuple[Rows, NDArray[np.float32]], count: int, size: int, policy: str) -> None:
-    """Raise UsageError for an answer of a policy's `draw` that breaks its promise."""
-    rows, weights = drawn
-    if np.shape(rows) != (count,) or np.shape(weights) != (count,):
-        raise UsageError(f"replay.sampling = {policy!r}: draws {len(rows)} rows, {len(weights)} weights, not {count}")
-    if not 0 <= rows.min() <= rows.max() < size:
-        raise UsageError(f"replay.sampling = {policy!r}: draws rows {rows.min()} to {rows.max()} of {size} in use")

@@ -17,15 +17,8 @@ from coop.common.types import Array, EnvSpec
 from coop.replay.table.columns import Columns
 from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
 from coop.replay.table.numbering import EPISODES, EpisodeNumbers
-from coop.replay.table.policies import (
-    IMPORTANCE_EXPONENT,
-    PRIORITY_EXPONENT,
-    Incoming,
-    TableView,
-    check_drawn,
-    check_placed,
-    make_policies,
-)
+from coop.replay.table.own_policies import OwnEviction, make_policies
+from coop.replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, Incoming, TableView
 from coop.replay.table.streams import StreamTails
 
 REUSE_BUCKETS = 16
@@ -111,7 +104,7 @@ class Table:
         self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
         self._held = 0
         self._episodes = EpisodeNumbers(capacity) if evicts.episodes or draws.episodes else None
-        arrays = seen.ids, seen.reuse, seen.named["rewards"], seen.named["terminated"], seen.priorities
+        named = (seen.named[name] for name in ("rewards", "terminated", "actions"))
         numbers = np.empty(0, np.int64) if self._episodes is None else self._episodes.of_rows
         exponents = priority_exponent, importance_exponent
         table = weakref.proxy(self)  # no cycle: a table that is dropped frees its memory at once
@@ -120,11 +113,15 @@ class Table:
             found: Array = table._observations(rows, following)
             return found
 
-        actions = seen.named["actions"]
-        view = TableView(rng, *arrays, *exponents, replacement, actions, numbers, read, lambda: len(table))
+        ids, reuse, rewards, terminated, actions, priorities, episodes = map(
+            _read_only, (seen.ids, seen.reuse, *named, seen.priorities, numbers)
+        )
+        view = TableView(
+            rng, ids, reuse, rewards, terminated, priorities, *exponents, replacement, actions, episodes, read,
+            lambda: len(table),
+        )  # fmt: skip
         self._eviction, self._sampling = make_policies(evicts, draws, view)
-        # Users' own policies see what comes, and what they answer is checked.
-        self._checked = [not type(each).__module__.startswith("coop.") for each in (self._eviction, self._sampling)]
+        self._sees = isinstance(self._eviction, OwnEviction) or self._episodes is not None
         self._tails = StreamTails(self._frames, spec.stack)
         self._sampled = self._left_out = 0
         self._reuse_evicted = np.zeros(REUSE_BUCKETS, np.int64)
@@ -175,7 +172,7 @@ class Table:
         """Insert a valid segment that is no duplicate; the eviction policy chooses the transitions to evict."""
         size = len(self)
         first = self.numbered
-        if self._checked[0] or self._episodes is not None:
+        if self._sees:
             rows, kept = self._admitted(segment)
         else:
             rows, kept = self._eviction.place(first, segment.steps)
@@ -216,8 +213,6 @@ class Table:
         episodes = self._episodes
         numbers = np.zeros(segment.steps, np.int64) if episodes is None else episodes.number(segment)
         rows, kept = self._eviction.admit(Incoming(segment, self.spec, self.numbered, numbers))
-        if self._checked[0]:
-            check_placed((rows, kept), segment.steps, len(self), self.capacity, str(self._settings["eviction"]))
         if episodes is not None:
             episodes.write(rows, numbers[kept])
         return rows, kept
@@ -255,8 +250,6 @@ class Table:
         if size == 0:
             raise ValueError("an empty table has nothing to sample")
         rows, weights = self._sampling.draw(batch_size, size)
-        if self._checked[1]:
-            check_drawn((rows, weights), batch_size, size, str(self._settings["sampling"]))
         # Transition by transition, so that neighbouring frames are read one after another.
         distinct, index = self._frames.unique(self._columns.slots.take(rows, axis=0).astype(np.intp))
         np.add.at(self._columns.reuse, rows, np.int32(1))
@@ -363,6 +356,12 @@ class Table:
         self._columns.priorities[rows] = priorities
         self._eviction.prioritise(rows)
         self._sampling.prioritise(rows, priorities)
+
+
+def _read_only(array: Array) -> Array:
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _reuse_histogram(reuse: NDArray[np.int32]) -> NDArray[np.intp]:
