@@ -225,6 +225,21 @@ def test_a_policy_that_fails_is_named_with_its_place_and_writes_to_no_column() -
         table.sample(2)
 
 
+def test_a_policy_that_fails_at_new_priorities_is_named() -> None:
+    class Dividing(Sampling):
+        priorities = True
+
+        def draw(self, count: int, size: int) -> Any:
+            return np.arange(count), np.ones(count, np.float32)
+
+        def prioritise(self, rows: Any, priorities: Any) -> None:
+            raise ZeroDivisionError("nothing")
+
+    table = table_of(Dividing)
+    with pytest.raises(RunError, match=r"^replay.sampling = 'own:Policy' raised ZeroDivisionError: nothing"):
+        table.insert(make_segment(SPEC))
+
+
 def test_best_returns_keeps_the_best_episodes() -> None:
     """Episodes of returns 9, 1 and 6, of three transitions each; the next three find room where the return is 1."""
     from best_returns import BestReturns  # noqa: PLC0415

@@ -51,7 +51,8 @@ class OwnEviction(Eviction):
 
     def prioritise(self, rows: Rows) -> None:
         """See `Eviction`."""
-        self._policy.prioritise(rows)
+        with own_code(self._setting):
+            self._policy.prioritise(rows)
 
     def _placed(self, answer: Any, steps: int, size: int, capacity: int) -> tuple[Rows, slice | Rows]:  # noqa: ANN401
         """The answer, once it is seen to be one; steps: transitions of the segment. size: rows in use."""
@@ -107,7 +108,8 @@ class OwnSampling(Sampling):
 
     def prioritise(self, rows: Rows, priorities: Floats) -> None:
         """See `Sampling`."""
-        self._policy.prioritise(rows, priorities)
+        with own_code(self._setting):
+            self._policy.prioritise(rows, priorities)
 
     def _refuse(self, what: str) -> NoReturn:
         raise UsageError(f"{self._setting}: draws {what}")
