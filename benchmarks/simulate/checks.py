@@ -129,6 +129,9 @@ class Checks:
             return
         learner = self.cluster.learner
         assert learner is not None
+        leaving = self.strangers.process(incarnation)
+        if leaving is None or leaving.stop.failed or leaving.stop.reason.startswith("failed"):
+            return  # another run's processes have refused it, or its learner
         if learner.stop.is_set() or self._trainer.outcome() or not self._trainer.agent.updates:
             return
         self.hold(
@@ -301,10 +304,12 @@ class Checks:
         self.hold("acknowledged", acked <= given, f"{process.name} counts {acked} acknowledged, but {given} were")
         if not weights.ready:
             return
-        heard = process.state.pop("roles", ())
-        roles = (acting for run, acting in map(_acting, heard) if run == process.nodes[0].run)
-        told = [process.state.get("role"), *roles]
-        process.state["role"] = told[-1]
+        heard = [_acting(raw) for raw in process.state.pop("roles", ())]
+        own = [acting for run, acting in heard if run == process.nodes[0].run]
+        told = [*process.state.get("role", [None]), *own]
+        # Only the newest broadcast waits to be read: one of another run may have taken the place of its own learner's.
+        missed = len(own) < len(heard) or (process.state.get("missed", False) and not own)
+        process.state["missed"], process.state["role"] = missed, told if missed else told[-1:]
         self.hold("role", policy.acting in told, f"{process.name} acts with network {policy.acting + 1}")
         for number, each in enumerate(policy.networks):
             held = weights._held[number]
@@ -317,7 +322,7 @@ class Checks:
         others = (link.other(node) for link in node.links)
         linked = [other for other in others if other.role == "learner" and not self.strangers.foreign(other.process)]
         weather = network.weather
-        if now - calm < STALE or network.cuts or weather.lost or weather.delay > 0.01 or not linked:
+        if missed or now - calm < STALE or network.cuts or weather.lost or weather.delay > 0.01 or not linked:
             process.state.pop("calm", None)
             return
         if learner is None or learner.frozen or not learner.alive:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.simulate.world import Process
+from coop.common.messaging.runs import name_of
 from coop.common.messaging.wire import Message
 from coop.records.run_ids import has_run_id, read_run_id
 
@@ -28,6 +29,10 @@ class Strangers:
         if stranger:
             self._learners.append(process)
 
+    def process(self, incarnation: int) -> Process | None:
+        """The process of an incarnation."""
+        return self._known.get(incarnation)
+
     def took(self, process: Process, folder: Path) -> None:
         """A learner has got the lock of its folder."""
         other = self._holders.get(folder)
@@ -46,9 +51,12 @@ class Strangers:
         return run is not None and any(each.state.get("run") == run for each in self._learners)
 
     def answers(self, node: Any, key: str, message: Message) -> None:  # noqa: ANN401
-        """A process answers a question: one who has joined a run is answered in that run alone."""
+        """A process answers a question: one that was asked in a run is answered in that run alone.
+
+        It may have been asked before the asker had joined one, and come late; then nobody takes the answer.
+        """
         asker = self._known.get(message.fields.get("incarnation", message.fields.get("learner")))
-        if asker is not None:
+        if asker is not None and message.run != name_of(message.run):
             self._together(asker, node.process, f"{node.process.name} answers {asker.name}, {key}")
 
     def heard(self, node: Any, source: Any, key: str) -> None:  # noqa: ANN401
