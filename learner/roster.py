@@ -186,11 +186,14 @@ class MemberTracker:
             if incarnation in self._joined:  # of others nothing is kept, whoever announces them
                 self._leaving.add(incarnation)
 
-    def token(self, incarnation: int, there: bool, now: float) -> None:
-        """Note that a process's liveliness token has appeared or disappeared."""
+    def token(self, role: str, incarnation: int, there: bool, now: float) -> None:
+        """Note that a process's liveliness token has appeared or disappeared; of another role than its own it is none.
+
+        Access control keeps actors from the tokens of other roles, but not from their incarnations in one of theirs.
+        """
         with self._lock:
             name = self._joined.get(incarnation)
-            if name is None:
+            if name is None or name.role != role:
                 return
             if there and incarnation in self._away:
                 self._away.discard(incarnation)

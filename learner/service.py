@@ -135,10 +135,10 @@ class LearnerService:
         status = self._reporter.publish(now)
         self._console.progress(status.updates, status.waiting, lambda: progress_line(msgspec.structs.asdict(status)))
 
-    def _on_presence_change(self, incarnation: int, there: bool) -> None:
+    def _on_presence_change(self, role: str, incarnation: int, there: bool) -> None:
         """Report at once that a member has come or gone: the loop may be waiting for it."""
         now = self._node.now()
-        self._join_service.members.token(incarnation, there, now)
+        self._join_service.members.token(role, incarnation, there, now)
         self._reporter.publish_members(now)
 
     def _saving_for_departure(self) -> Conversation[None]:

@@ -57,6 +57,15 @@ def test_numbers_with_nouns() -> None:
     ]
 
 
+def test_what_others_wrote_forges_no_line(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console()
+    members = MemberTracker(console.event)
+    members.add(Join("actor", 2, [], origin=Origin("act\n12:00:00 complete\x1b[2J\u202e", 8)), "actor 0")
+    printed = capsys.readouterr().out
+    assert printed[8:] == " actor 0 on act?12:00:00 complete?[2J? (pid 8) joined\n"
+    assert console.recent()[0][1] == printed[:-1]
+
+
 def test_members_come_and_go() -> None:
     events: list[str] = []
     members = MemberTracker(events.append)
@@ -66,7 +75,7 @@ def test_members_come_and_go() -> None:
         events.clear()
         return new
 
-    members.token(1, True, 0.0)
+    members.token("replay", 1, True, 0.0)
     service = Join("replay", 1, ["tcp/rep:1"], origin=Origin("rep", 7))
     actor = Join("actor", 2, [], origin=Origin("act", 8))
     members.add(service, "replay service")
@@ -76,24 +85,26 @@ def test_members_come_and_go() -> None:
         "replay service on rep (pid 7) joined; it listens on tcp/rep:1",
         "actor 0 on act (pid 8) joined",
     ]
-    members.token(2, False, 1.0)
-    members.token(99, False, 1.0)  # one that never joined
+    members.token("actor", 1, False, 1.0)  # as a holder of an actor's certificate may declare
+    members.token("route", 2, False, 1.0)
+    members.token("actor", 2, False, 1.0)
+    members.token("actor", 99, False, 1.0)  # one that never joined
     assert new_events() == ["actor 0 on act (pid 8) does not answer"]
     assert members.missing(1.0) == ["actor 0 on act (pid 8)"]
-    members.token(2, True, 2.0)
+    members.token("actor", 2, True, 2.0)
     assert new_events() == ["actor 0 on act (pid 8) is back"]
     assert members.missing(2.0) == []
-    members.token(1, False, 3.0)
-    members.token(2, False, 3.0)
+    members.token("replay", 1, False, 3.0)
+    members.token("actor", 2, False, 3.0)
     new_events()
     members.add(replace(actor, incarnation=3, origin=Origin("act", 9)), "actor 1")
     assert members.missing(3.0) == ["replay service on rep (pid 7)"], "another one has taken the actor's place"
     assert members.missing(3.0 + FORGOTTEN) == []
     new_events()
-    members.token(2, True, 4.0)
+    members.token("actor", 2, True, 4.0)
     assert new_events() == ["actor 0 on act (pid 8) is back"], "although another one had taken its place"
     members.leaving(2)
-    members.token(2, False, 4.0)
+    members.token("actor", 2, False, 4.0)
     assert new_events() == ["actor 0 on act (pid 8) left"]
     members.add(replace(actor, index=0), "actor 0")
     assert new_events() == ["actor 0 on act (pid 8) is back"]

@@ -27,11 +27,12 @@ from coop.common.process.files import FileDigest, measure, sealed, unsealed
 from coop.common.types import EnvSpec
 from coop.evaluation.evaluate import evaluate_checkpoint
 from coop.evaluation.export import export
+from coop.lockstep.run import LockstepRun
 from coop.records import checkpoints, resumption
 from coop.records.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, write_manifest
 from coop.records.locks import _place
-from coop.records.reading import read_csv, read_jsonl, read_lines
-from coop.records.resumption import survey
+from coop.records.reading import read_csv, read_jsonl, read_lines, read_run_config
+from coop.records.resumption import Start, survey
 from coop.replay.core import ReplayCore, RetryLater
 from coop.replay.persistence.checkpoints import ReplayCheckpoints
 from coop.replay.persistence.journal import HEADER_BYTES, SEGMENT, Header, Journal
@@ -272,6 +273,14 @@ def test_overwriting_moves_the_run_aside(run: Path) -> None:
     assert json.loads((run / "summary.json").read_text())["seed"] == 3
     both = run_command("coop-lockstep", "--overwrite", "--resume", "--run-dir", run)
     assert (both.returncode, "give one of them" in both.stderr) == (2, True)
+
+
+def test_a_run_that_another_process_has_played_meanwhile_is_left_alone(run: Path) -> None:
+    """Between a command's first look at a folder and its lock on it."""
+    before = contents(run)
+    with pytest.raises(UsageError, match="holds a run already"):
+        LockstepRun(read_run_config(run), run, "test", Start(), log="none")
+    assert contents(run) == before
 
 
 def test_overwriting_leaves_a_folder_without_a_run_as_it_is(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_another_learner(theirs: JoinReply, words: str | None) -> None:
 
 def test_presence(nodes: tuple[Node, Node], endpoint: str) -> None:
     learner, _ = nodes
-    changes: list[tuple[int, bool]] = []
+    changes: list[tuple[str, int, bool]] = []
     learner.presence.on_change(lambda *change: changes.append(change))
 
     def wait_for(reached: Callable[[], bool]) -> None:
@@ -154,7 +154,7 @@ def test_presence(nodes: tuple[Node, Node], endpoint: str) -> None:
         there = time.monotonic()
     wait_for(lambda: learner.presence.counts() == {"learner": 1, "actor": 1})
     assert 0 < learner.presence.absence("replay") < time.monotonic() - there
-    wait_for(lambda: [there for who, there in changes if who == 0xAB] == [True, False])
+    wait_for(lambda: [there for role, who, there in changes if (role, who) == ("replay", 0xAB)] == [True, False])
 
 
 def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch) -> None:

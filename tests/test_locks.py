@@ -1,11 +1,13 @@
 """Locks of folders on file systems that several kernels may share, and in containers that look alike."""
 
+import fcntl
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import sysconfig
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -19,6 +21,8 @@ from coop.records import locks
 from coop.records.locks import RunLock
 
 pytestmark = pytest.mark.timeout(300)  # eight sweeps on a busy machine
+
+APART = ["unshare", "--pid", "--fork", "--kill-child", "--mount-proc"]  # as in a container
 
 # A process on another host: its kernel is another one, and it does not see the locks of this one.
 HOST = """
@@ -167,7 +171,7 @@ GRID = 'methods = ["dqn", "coop"]\nseeds = [0, 1]\n[fixed]\ntotal_steps = 60\n'
 
 def test_sweeps_in_containers_that_look_alike_run_each_cell_once(tmp_path: Path) -> None:
     """As Kubernetes starts them: process 1 of its own namespace, each with the same host name, on one volume."""
-    unshare = ["unshare", "--pid", "--fork", "--kill-child", "--mount-proc", "--uts"]
+    unshare = [*APART, "--uts"]
     if (
         shutil.which("unshare") is None
         or subprocess.run([*unshare, "true"], capture_output=True, check=False).returncode
@@ -193,3 +197,27 @@ def test_sweeps_in_containers_that_look_alike_run_each_cell_once(tmp_path: Path)
     assert sum(log.count("complete: 60 steps") for log in logs) == 4  # one process may play several cells
     assert not list((tmp_path / "d").glob("sweep.toml.*"))
     until(lambda: not list((tmp_path / "d").glob("*.part")))
+
+
+def test_who_looks_from_another_container_sees_who_holds_a_folder(tmp_path: Path) -> None:
+    if shutil.which("unshare") is None or subprocess.run([*APART, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("unshare: not permitted here")
+    look = "import sys, pathlib; from coop.records.locks import holder; print(holder(pathlib.Path(sys.argv[1])))"
+    line = [*APART, sys.executable, "-c", look, str(tmp_path)]
+    lock = RunLock(tmp_path, "coop-learner", ("learner",)).sign()
+    seen = subprocess.run(line, capture_output=True, text=True, check=True).stdout
+    assert seen.startswith("('coop-learner on ") and seen.endswith("True)\n"), seen
+    killed = (tmp_path / ".learner.lock").read_bytes()
+    lock.release()
+    (tmp_path / ".learner.lock").write_bytes(killed)
+    assert subprocess.run(line, capture_output=True, text=True, check=True).stdout.endswith("False)\n")
+
+
+def test_who_looks_keeps_nobody_out(tmp_path: Path) -> None:
+    RunLock(tmp_path, "coop-learner", ("learner",)).sign().release()
+    with Path(tmp_path / ".learner.lock").open("rb") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        timer = threading.Timer(locks.LOOK, lambda: fcntl.flock(looking, fcntl.LOCK_UN))
+        timer.start()
+        RunLock(tmp_path, "coop-learner", ("learner",)).release()
+        timer.join()

@@ -89,14 +89,14 @@ def test_members_are_listed_with_their_states() -> None:
     first = Member("actor 0", "actor", "act", 8, "playing", 55.0)
     second = Member("actor 1", "actor", "act", 9, "waiting", 1.0, "because")
     assert members.listed(0.0, 9) == [service, first, second]
-    members.token(2, False, 1.0)
+    members.token("actor", 2, False, 1.0)
     members.leaving(3)
-    members.token(3, False, 1.0)
+    members.token("actor", 3, False, 1.0)
     lost = Member("actor 0", "actor", "act", 8, "lost")
     assert members.listed(1.0, 9) == [lost, service]
     assert members.listed(1.0, 1) == [lost]
     assert members.listed(1.0 + FORGOTTEN, 9) == [service]
-    members.token(2, True, 2.0)
+    members.token("actor", 2, True, 2.0)
     assert members.listed(2.0, 9) == [service, first]
     members.add(Join("actor", 99, [], origin=Origin("act", 10)), "actor 2")
     assert members.listed(2.0, 9)[2] == Member("actor 2", "actor", "act", 10, "playing"), "nothing from before its join"

@@ -29,7 +29,7 @@ class Presence:
         self._there: dict[str, set[str]] = {}  # incarnations by role
         self._gone: dict[str, float] = {}  # by role, when its last member disappeared
         self._lock = threading.Lock()
-        self._on_change: Callable[[int, bool], None] = lambda incarnation, there: None
+        self._on_change: Callable[[str, int, bool], None] = lambda role, incarnation, there: None
         self._began = now()
 
     def watch(
@@ -55,8 +55,8 @@ class Presence:
                 f"{prefix}/{role}/*", faults.guarded("watching who is there", on_token), history=True
             )
 
-    def on_change(self, call: Callable[[int, bool], None]) -> None:
-        """Call `call(incarnation, there)`, in one of Zenoh's threads, whenever a member appears or disappears."""
+    def on_change(self, call: Callable[[str, int, bool], None]) -> None:
+        """Call `call(role, incarnation, there)`, in one of Zenoh's threads, whenever a member appears or disappears."""
         self._on_change = call
 
     def counts(self) -> dict[str, int]:
@@ -86,4 +86,4 @@ class Presence:
             else:
                 incarnations.discard(incarnation)
                 self._gone[role] = self._now()
-        self._on_change(number, there)
+        self._on_change(role, number, there)

@@ -267,8 +267,7 @@ class Node:
                 return
             reported.add(error.field)
             last = "; further ones are only counted" if len(reported) == MOST_REFUSALS else ""
-        text = str(error)[:LONGEST_REFUSAL].encode("unicode_escape").decode()  # it holds what the sender wrote
-        say(stamped(f"refused a message at {place}: {text}{last}"))
+        say(stamped(f"refused a message at {place}: {str(error)[:LONGEST_REFUSAL]}{last}"))
 
     def publish(self, key: str, payload: bytearray) -> None:
         """Broadcast a value of which only the latest matters; never blocks."""

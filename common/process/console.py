@@ -112,8 +112,13 @@ def say(text: str, end: str = "\n") -> None:
 
 
 def stamped(text: str) -> str:
-    """A line preceded by the time of day."""
-    return f"{time.strftime('%H:%M:%S')} {text}"
+    """A printable line preceded by the time of day."""
+    return f"{time.strftime('%H:%M:%S')} {printable(text)}"
+
+
+def printable(text: str) -> str:
+    """A text without control characters, which other machines could use to change the terminal or to forge lines."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def counted(number: int, noun: str) -> str:

@@ -14,6 +14,7 @@ from typing import Self
 from rich.console import Console, RenderableType
 from rich.live import Live
 
+from coop.common.process.console import printable
 from coop.common.process.files import NO_SPACE
 from coop.common.process.output import out
 
@@ -117,8 +118,3 @@ class _Lines(io.TextIOBase):
 
     def fileno(self) -> int:
         return self._file
-
-
-def printable(text: str) -> str:
-    """A text without control characters, which other machines could use to change the terminal."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)

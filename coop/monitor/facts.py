@@ -6,8 +6,7 @@ from typing import Any
 
 from coop.common.messaging.messages.status import LearnerStatus, Member, Wait
 from coop.common.metrics import METRICS
-from coop.common.process.console import averaged_over, counted
-from coop.monitor.display import printable
+from coop.common.process.console import averaged_over, counted, printable
 
 SILENT_AFTER = 3.0  # seconds without a status, after which displays say so
 

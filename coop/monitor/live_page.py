@@ -12,9 +12,8 @@ from typing import Any
 from coop.common.messaging.messages.status import LearnerStatus
 from coop.common.metrics import METRICS, SPEED
 from coop.common.numbers import strict_json
-from coop.common.process.console import connected
+from coop.common.process.console import connected, printable
 from coop.monitor.curves import Point, Thinned
-from coop.monitor.display import printable
 from coop.monitor.facts import SILENT_AFTER, detail, facts, place, progress, settings, silence, times, values
 from coop.monitor.web import Document, WebServer
 

@@ -11,8 +11,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from coop.common.messaging.messages.status import LearnerStatus
-from coop.common.process.console import connected
-from coop.monitor.display import printable
+from coop.common.process.console import connected, printable
 from coop.monitor.facts import SILENT_AFTER, detail, facts, place, progress, settings, silence, times
 
 FIGURES_WIDTH = 80  # columns of the figures where members and events stand beside them

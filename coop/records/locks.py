@@ -31,6 +31,7 @@ from coop.common.process.untrusted import check_links
 HOLDER_BYTES = 512  # more than any holder's line
 BEAT = 2.0  # seconds between an owner's touches
 LEASE = 15.0  # seconds without a touch after which an owner is dead; more than a network file system's caches hold
+LOOK, LOOKS = 0.02, 5  # seconds after which who looks whether a lock is held has let go of it; times that it is tried
 SETTLE = 1.0  # seconds in which the claims of several hosts overwrite each other; the last one holds
 # File systems that only one kernel mounts at a time, so that all processes that see a file see its locks.
 LOCAL = frozenset({"bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "jfs", "ramfs", "tmpfs", "xfs", "zfs"})
@@ -73,13 +74,19 @@ class FileLock:
 
     def _flock(self) -> bool:
         """Lock the file; False where the file system has no such locks, so that the lease alone decides."""
-        try:
-            fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if not self.leased or error.errno not in _NO_LOCKS:
-                raise
-            return False
-        return True
+        for left in reversed(range(LOOKS)):
+            try:
+                fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return True
+            except BlockingIOError:
+                if not left:
+                    raise
+                time.sleep(LOOK)
+            except OSError as error:
+                if not self.leased or error.errno not in _NO_LOCKS:
+                    raise
+                return False
+        raise AssertionError
 
     def _claim(self, holder: str, *, alone: bool) -> None:
         """Write this owner into the file, once no other owner can be alive. alone: on this kernel none is."""
@@ -315,19 +322,32 @@ def _now() -> float:
 
 
 def holder(folder: Path, role: str = "learner") -> tuple[str, bool]:
-    """Who works in a run's folder, seen without touching its lock: "coop-local on head (pid 7)", and whether it does.
+    """Who works in a run's folder: "coop-local on head (pid 7)", and whether it does.
 
-    Empty where nobody has signed the lock, or the last one released it; False where the last one has been killed.
+    Empty where nobody has signed the lock, or the last one released it; False where the last one has been killed. Asks
+    the lock itself: lists of its owners, as /proc/locks, leave out those of other containers.
     """
     path = folder / f".{role}.lock"
     line = _read(path)[0]
     if not line:
         return "", False
     try:
-        if not _is_local(folder):
-            return line, time.time() - _touched(path) / 1e9 < LEASE
-        inode = f":{path.stat().st_ino} "
-        locks = Path("/proc/locks").read_text(encoding="utf-8").splitlines()
-        return line, any(inode in lock and " FLOCK " in lock for lock in locks)
+        return line, _is_held(path) or (not _is_local(folder) and time.time() - _touched(path) / 1e9 < LEASE)
     except OSError:
         return line, True  # as it says
+
+
+def _is_held(path: Path) -> bool:
+    """Whether a process of this kernel holds the lock on a file."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_UN)  # not by closing it: a process forked meanwhile has it open
+    except BlockingIOError:
+        return True
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+    finally:
+        os.close(descriptor)
+    return False

@@ -198,6 +198,12 @@ class Start:
         """True if a run that is there is to be continued."""
         return self.resume or self.resume_from is not None
 
+    def check_free(self, run_dir: Path) -> None:
+        """Raise UsageError if a run is in the directory that this one neither goes on with nor moves aside."""
+        if holds_run(run_dir) and not (self.goes_on or self.overwrite):
+            how = "give another folder, go on with --resume (resume=True in Python), or move it aside with --overwrite"
+            raise UsageError(f"run directory {run_dir}: holds a run already; {how}")
+
     def prepare(
         self,
         run_dir: Path,
@@ -216,6 +222,7 @@ class Start:
             UsageError: a run is there that can't be gone on with.
             RunError: the directory can't be written.
         """
+        self.check_free(run_dir)  # again: another process may have had the locks since
         notices = []
         try:
             if self.goes_on:

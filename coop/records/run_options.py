@@ -31,7 +31,7 @@ from coop.common.settings.starting import settings_line, source_of, starting_tab
 from coop.common.settings.tables import CONFIG, load_tables, preset_names, resolve, shortened, validated
 from coop.records.checkpoints import LEARNER, RECORDS, checkpoint_numbers
 from coop.records.reading import read_run_config
-from coop.records.resumption import Start, holds_run
+from coop.records.resumption import Start
 from coop.records.run_ids import has_run_id, read_run_id
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 
@@ -111,9 +111,7 @@ class RunOptions(RunConfig):
         game = re.sub(r"[^A-Za-z0-9]+", "-", self.env.id).lower()
         named = f"{game}-{self.method.replace(':', '.')}-s{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
         path = self.run_dir or absolute(Path("runs") / named)
-        if holds_run(path) and not self.overwrite:
-            how = "give another folder, go on with --resume (resume=True in Python), or move it aside with --overwrite"
-            raise UsageError(f"run directory {path}: holds a run already; {how}")
+        self.start.check_free(path)
         return path
 
     def _resumed(self) -> Path:
