@@ -135,13 +135,14 @@ class Space:
 
     def __init__(self, grid: str | Path | Mapping[str, Any]) -> None:
         """Read a grid; raises UsageError, also for settings that no run takes."""
-        path = None if isinstance(grid, Mapping) else absolute(grid, "grid")
+        if not isinstance(grid, Mapping):
+            path = absolute(grid, "grid")
         try:
-            tables = dict(grid) if path is None else parse_toml(read_text(path, MAX_SETTINGS))  # type: ignore[arg-type]
+            tables = dict(grid) if isinstance(grid, Mapping) else parse_toml(read_text(path, MAX_SETTINGS))
             tables.pop("quick", None)
             self.file = checked(GridFile, tables)
         except (OSError, UnicodeDecodeError, CoopError) as error:
-            name = "grid" if path is None else f"grid {grid}"
+            name = "grid" if isinstance(grid, Mapping) else f"grid {grid}"
             raise UsageError(f"{name}: {getattr(error, 'strerror', None) or error}") from error
         self.axes = _axes(self.file.vary)
         first = {name: each["low"] if isinstance(each, Mapping) else each[0] for name, each in self.axes.items()}
