@@ -50,13 +50,15 @@ def absolute(path: str | Path, name: str = "path") -> Path:
     """A user's path as it was meant when this command was started. name: of the argument, for the error.
 
     Raises:
-        UsageError: it is empty, or none that a file system takes, or as `working_directory`.
+        UsageError: it is none, empty, or one that no file system takes, or as `working_directory`.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise UsageError(f"{name} = {path!r}: must be a path, as text or a Path")
     try:
         given = user_path(path)
         meant = given if given.is_absolute() else working_directory() / given
         meant.lstat()
-    except (ValueError, RuntimeError) as error:  # the last for a home that nobody has
+    except (TypeError, ValueError, RuntimeError) as error:  # the last for a home that nobody has
         raise UsageError(f"{name} = {str(path)!r}: {error}") from None
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):

@@ -12,6 +12,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+from coop.common.arguments import check_seconds, check_whole, texts
 from coop.common.errors import CoopError, RunError, UsageError, place
 from coop.common.imports import describe, permit
 from coop.common.places import absolute
@@ -103,6 +104,7 @@ class TrainingRun:
             UsageError: the run has no table, or has ended without a checkpoint.
             RunError: it saved none within `timeout` seconds, for instance because it waits before its first update.
         """
+        check_seconds("timeout", timeout)
         if self.running and not self.config.streaming:
             ask_and_wait(self.directory, timeout, lambda: self.running)
         return load(self.directory).buffer()
@@ -118,6 +120,8 @@ class TrainingRun:
         Raises:
             RunError: the run has failed or diverged.
         """
+        if timeout is not None:
+            check_seconds("timeout", timeout)
         self._thread.join(timeout)
         failure = self._failure
         if failure is None:
@@ -193,8 +197,9 @@ def train(
         RunError: `run_dir` is in use.
     """
     callbacks = Callbacks({"on_metrics": on_metrics, "on_episode": on_episode, "on_evaluation": on_evaluation})
-    named, names = [*allow_import, *_named({"method": method, **settings})], chosen_sinks(log)
+    named, names = [*texts("allow_import", allow_import), *_named({"method": method, **settings})], chosen_sinks(log)
     permit(named)
+    check_whole("actors", actors, 0)
     replay = settings.get("replay", {})
     if actors == 0 and isinstance(replay, Mapping) and replay.get("preload"):
         settings["replay"] = {**replay, "offline": True}

@@ -37,7 +37,20 @@ class Closing(CartPoleEnv):
         sys.stdout = sys.stderr = None
         os.close(1)
 
+class Tidy(CartPoleEnv):
+    def __init__(self, late=False):
+        super().__init__()
+        self.late = late
+        if not late:
+            os.closerange(3, 200)
+
+    def step(self, action):
+        if self.late:
+            os.closerange(3, 200)
+        return super().step(action)
+
 gymnasium.register("Closing-v0", entry_point=Closing)
+gymnasium.register("Tidy-v0", entry_point=Tidy)
 """
 
 
@@ -105,6 +118,19 @@ def test_closed_descriptors_of_a_lockstep_run(tmp_path: Path) -> None:
     assert how_it_ended(tmp_path / "run") == "complete"
     printed = shell("coop-eval run --episodes 1 --networks 1 >&- 2>&-", tmp_path)
     assert printed.returncode == 0
+
+
+def test_an_environment_that_closes_the_descriptors_that_it_has_not_opened(tmp_path: Path) -> None:
+    """As what daemonizes itself does: a run that can go on does, and says how it ends; otherwise a line says why."""
+    (tmp_path / "closing_envs.py").write_text(ENVS)
+    lockstep = f"coop-lockstep --env.id closing_envs:Tidy-v0 {SHORT}"
+    early = shell(f"{lockstep} --run-dir early", tmp_path)
+    assert early.returncode == 0, early.stderr
+    assert early.stdout.splitlines()[-1].startswith("complete: 300 steps")
+    late = shell(f"{lockstep} --env.kwargs '{{late = true}}' --run-dir late", tmp_path)
+    assert late.returncode == 1
+    assert "Traceback" not in late.stderr
+    assert "a file that this process had open has been closed" in late.stderr.splitlines()[-1]
 
 
 def test_a_topology_whose_environment_closes_its_output(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from commands import run_command
 
 import coop
@@ -150,3 +151,19 @@ def test_a_command_s_own_words_are_those_of_its_last_start(tmp_path: Path) -> No
     assert child.has_said("error")
     assert not child.has_said("an earlier one")
     assert child.own_words().startswith("3 coop-x: error: ")
+
+
+def test_defaults_of_torch_that_users_code_has_set_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    def main() -> None:
+        torch.set_default_device("meta")
+        torch.nn.Linear(2, 2).to("cpu")
+
+    try:
+        with pytest.raises(SystemExit) as end:
+            run_main("coop-lockstep", main)
+    finally:
+        torch.set_default_device(None)
+    said = capsys.readouterr().err
+    assert end.value.code == 1
+    assert said.count("\n") == 1
+    assert "torch's default device to meta" in said

@@ -172,7 +172,7 @@ def test_what_a_grid_s_fields_are_chosen_from(tmp_path: Path) -> None:
     with pytest.raises(coop.UsageError, match=r"nowhere\.toml: No such file"):
         coop.tune(tmp_path / "nowhere.toml", tmp_path)
     for counts in ({"trials": 0}, {"workers": 0}):
-        with pytest.raises(coop.UsageError, match="must be at least 1"):
+        with pytest.raises(coop.UsageError, match="must be a whole number from 1 on"):
             coop.tune(grid, tmp_path / "none", **counts)
     assert not (tmp_path / "none").exists()
 

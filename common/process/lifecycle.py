@@ -193,15 +193,39 @@ def _explained(error: BaseException) -> tuple[str, int]:
         case SystemExit():
             code = "" if error.code is None else repr(error.code)
             return f"sys.exit({code}) was called {_where(error)}; only this program ends its processes", 1
-        case OSError(errno=number) if number in NO_SPACE:
-            return f"{error.filename or 'output'}: {error.strerror}", 1
-        case OSError(filename=str() | bytes() as name, strerror=str() as why):
-            return f"{os.fsdecode(name)}: {why}", 1
+        case OSError() if line := _of_a_file(error):
+            return line, 1
     if is_out_of_memory(error):
         more = " and processes (ulimit -u)" if "new thread" in text_of(error) else ""
         return f"not enough memory{more} ({first_line(error)}); {memory_limit()}", 1
+    if changed := _torch_defaults():
+        return (
+            f"{first_line(error)}; users' code has set {changed}, which this program's own networks need as it was",
+            1,
+        )
     traceback.print_exception(error)
     return first_line(error) + place(error), 1
+
+
+def _torch_defaults() -> str:
+    """What somebody has set of PyTorch's defaults, which this program leaves alone; empty if nothing."""
+    if (torch := sys.modules.get("torch")) is None:
+        return ""
+    device, dtype = torch.get_default_device().type, torch.get_default_dtype()
+    found = {"device": "" if device == "cpu" else device, "dtype": "" if dtype == torch.float32 else str(dtype)}
+    return " and ".join(f"torch's default {name} to {value}" for name, value in found.items() if value)
+
+
+def _of_a_file(error: OSError) -> str:
+    """The line of a failure that a file explains; empty for another one."""
+    match error:
+        case OSError(errno=number) if number in NO_SPACE:
+            return f"{error.filename or 'output'}: {error.strerror}"
+        case OSError(filename=str() | bytes() as name, strerror=str() as why):
+            return f"{os.fsdecode(name)}: {why}"
+        case OSError(errno=errno.EBADF):
+            return f"a file that this process had open has been closed ({error}); does users' code close descriptors?"
+    return ""
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -12,9 +12,13 @@ import os
 import select
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TextIO
 
 FIRST_FREE = 3  # the descriptors below are the standard files
+# From where a stream's own descriptor is taken: users' code that closes descriptors by their numbers seldom goes so
+# far, and no file that is opened later gets this number. `select` takes those below 1024.
+FAR = 960
 # A reader or a terminal that has gone, and a descriptor that somebody has closed.
 GONE = (errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO, errno.ECONNRESET, errno.ESTALE, errno.ENOTCONN)
 
@@ -106,11 +110,18 @@ class _Raw(io.FileIO):
         return size
 
 
+def _copy(number: int) -> int:
+    """A copy of a descriptor, out of the way if this process may have so many."""
+    with suppress(OSError):
+        return fcntl.fcntl(number, fcntl.F_DUPFD_CLOEXEC, FAR)
+    return fcntl.fcntl(number, fcntl.F_DUPFD_CLOEXEC, FIRST_FREE)
+
+
 class _Text(io.TextIOWrapper):
     """A standard stream on a descriptor of its own; letters that the terminal lacks are written as escapes."""
 
     def __init__(self, number: int, present: TextIO | None) -> None:
-        self.raw = _Raw(fcntl.fcntl(number, fcntl.F_DUPFD_CLOEXEC, FIRST_FREE), lossy=number == 2)
+        self.raw = _Raw(_copy(number), lossy=number == 2)
         super().__init__(
             io.BufferedWriter(self.raw),
             encoding=getattr(present, "encoding", None) or "utf-8",

@@ -36,9 +36,9 @@ def leaves(tables: Mapping[str, Any], at: _FieldPath = ()) -> Iterator[tuple[_Fi
     """Yield the values of nested tables with their paths."""
     for key, value in tables.items():
         if isinstance(value, Mapping):
-            yield from leaves(value, (*at, key))
+            yield from leaves(value, (*at, str(key)))
         else:
-            yield (*at, key), value
+            yield (*at, str(key)), value
 
 
 def nested(path: _FieldPath, value: Any) -> dict[str, Any]:  # noqa: ANN401 (a value of any field)
@@ -68,7 +68,8 @@ def of_method(tables: Mapping[str, Any], method: str | None) -> dict[str, Any]:
     overrides = {name: _without(over, own.get(name, {})) for name, over in overrides.items()}
     stated = _without(tables, {"methods", *map(table_of, own)})
     chosen = stated.get("method", RunConfig.method) if method is None else method
-    mine = merged({**stated, "method": chosen}, overrides.get(chosen, {}))
+    known = chosen if isinstance(chosen, str) else ""  # what is no name is refused with the other fields
+    mine = merged({**stated, "method": chosen}, overrides.get(known, {}))
     touched = {path for over in overrides.values() for path, _ in leaves(over)}
     others = {name: table for name, table in own.items() if name != chosen}
     for other in names:
@@ -76,7 +77,7 @@ def of_method(tables: Mapping[str, Any], method: str | None) -> dict[str, Any]:
         for path in sorted(touched) if other != chosen else ():
             if (value := _value(theirs, path)) != _value(mine, path):
                 others = merged(others, nested((other, *path), "None" if value is None else value))
-    return {**mine, **own.get(chosen, {}), "methods": others}
+    return {**mine, **own.get(known, {}), "methods": others}
 
 
 def _own_table(method: str, tables: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:

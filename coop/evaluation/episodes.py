@@ -53,7 +53,11 @@ def play(env: VectorEnv, act: Acting, episodes: int, stopped: Callable[[], bool]
 
 def chosen(act: Acting, obs: Array, spec: EnvSpec, mask: NDArray[np.bool_] | None) -> NDArray[np.int32]:
     """The actions, int32 [envs], of a policy; raises UsageError if they are none, or not allowed."""
-    given = np.asarray(act(obs) if mask is None else act(obs, mask))
+    answer = act(obs) if mask is None else act(obs, mask)
+    try:
+        given = np.asarray(answer)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"policy: gives what is no array: {error}") from error
     if given.size == len(obs) and given.dtype.kind in "iu":
         actions = given.reshape(len(obs))
         if actions.min() >= 0 and actions.max() < spec.num_actions:

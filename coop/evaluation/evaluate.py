@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from coop.common.arguments import check_whole
 from coop.common.bounds import MAX_EVALUATED, MAX_INTEGER, MAX_STREAMS
 from coop.common.envs.make import make_vector_env
 from coop.common.errors import RunError, UsageError
@@ -90,9 +91,9 @@ def evaluate(
     """
     if not callable(policy):
         raise UsageError(f"policy: {type(policy).__name__} is no function of observations")
-    _check_whole("episodes", episodes, 1, MAX_EVALUATED)
-    _check_whole("seed", seed, 0, MAX_INTEGER)
-    _check_whole("at_once", at_once, 1, MAX_STREAMS)
+    check_whole("episodes", episodes, 1, MAX_EVALUATED)
+    check_whole("seed", seed, 0, MAX_INTEGER)
+    check_whole("at_once", at_once, 1, MAX_STREAMS)
     if isinstance(epsilon, bool) or not isinstance(epsilon, int | float | np.number) or not 0 <= epsilon <= 1:
         raise UsageError(f"epsilon = {epsilon!r}: must be from 0 to 1")
     if not isinstance(env, str | Mapping | None):
@@ -103,13 +104,6 @@ def evaluate(
     changes = {"id": env} if isinstance(env, str) else dict(env or {})
     settings = resolve({"env": {**(asdict(own) if own else {}), **changes}}).env
     return Evaluation(_returns(policy, settings, episodes, seed, epsilon, at_once))
-
-
-def _check_whole(name: str, value: object, least: int, most: int) -> None:
-    """Raise UsageError unless an argument is a whole number within bounds."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not (whole and least <= value <= most):  # type: ignore[operator]
-        raise UsageError(f"{name} = {value!r}: must be a whole number from {least} to {most:,}")
 
 
 def evaluate_checkpoint(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from coop.common.bounds import MAX_VIDEO
 from coop.common.envs.make import make_filmed_env
 from coop.common.errors import RunError, UsageError
+from coop.common.places import absolute
 from coop.common.settings.environment import EnvSettings
 from coop.evaluation.episodes import Acting, chosen
 from coop.evaluation.notebook import image_html
@@ -85,9 +86,9 @@ class Clip:
         return cls(gif, film.steps, film.episode_return, film.over)
 
     def save(self, path: str | Path) -> None:
-        """Write the GIF to a file; raises RunError."""
+        """Write the GIF to a file; raises UsageError for no path, RunError if it can't be written."""
         try:
-            Path(path).write_bytes(self.gif)
+            absolute(path).write_bytes(self.gif)
         except OSError as error:
             raise RunError(f"{path}: {error.strerror or error}") from error
 

@@ -13,6 +13,8 @@ import pandas as pd
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from coop.common.arguments import check_seconds, check_whole, texts
+from coop.common.bounds import MAX_INTEGER
 from coop.common.envs.make import env_spec
 from coop.common.errors import UsageError
 from coop.common.imports import hand_over, permit
@@ -134,7 +136,7 @@ class SavedRun:
         """allow_import: modules that may be imported even if they lie in the run's folder or beside it."""
         self.path = path
         hand_over(path)
-        permit(allow_import)
+        permit(texts("allow_import", allow_import))
         if not (path / "config.toml").is_file():
             raise UsageError(f"{path}: holds no run")
         check_links(path)
@@ -198,6 +200,7 @@ class SavedRun:
             UsageError: the run keeps no table, or has no checkpoint here that holds one.
             RunError: the run saved no checkpoint in that time.
         """
+        check_seconds("timeout", timeout)
         if live and not self.config.streaming:
             ask_and_wait(self.path, timeout, lambda: holder(self.path)[1])
         return read_buffer(self.path, self.config)
@@ -211,7 +214,7 @@ class SavedRun:
         Raises:
             UsageError: the run has no checkpoint, or there is no such network.
         """
-        if network not in ("mean", 1, 2):
+        if isinstance(network, bool | float) or network not in ("mean", 1, 2):
             raise UsageError(f"network = {network!r}: allowed: 'mean', 1, 2")
         checkpoint = self.checkpoint()
         first, second = checkpoint.networks
@@ -225,6 +228,7 @@ class SavedRun:
         Raises:
             UsageError: as `policy`, or the environment can't be filmed.
         """
+        check_whole("seed", seed, 0, MAX_INTEGER)
         policy = self.policy(network)
         return Clip.of(Film(policy, self.config.env, seed))
 

@@ -133,7 +133,8 @@ class FileLock:
         """Leave the lock to the child processes that have inherited it."""
         _heart.drop(self)
         if not self.inherited:
-            os.close(self.descriptor)
+            with contextlib.suppress(OSError):  # users' code has closed it
+                os.close(self.descriptor)
 
     def release(self) -> None:
         """Release the lock, unless this process has only inherited it; the file is as it was if it was not signed."""

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from coop.common.arguments import check_whole
 from coop.common.errors import CoopError, RunError, UsageError, first_line
 from coop.common.imports import check_extra
 from coop.common.numbers import RETURN_WINDOW
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 STORAGE = "optuna.db"
 TICK = 0.2  # seconds
+MOST_SEED = 2**31  # of the sampler, to which the number of trials is added; numpy takes 32 bits
 REPORTS = 20  # of a run, to the pruner, at equal distances in environment steps
 GRACE = 60.0  # seconds for the runs to save their state
 RANGE = {"low", "high", "log", "step"}
@@ -74,8 +76,9 @@ def tune(
     check_extra("coop.tune", "optuna", "optuna")
     import optuna  # noqa: PLC0415 (an extra, which may be missing)
 
-    if trials < 1 or (workers is not None and workers < 1):
-        raise UsageError(f"trials = {trials}, workers = {workers}: must be at least 1")
+    check_whole("trials", trials, 1)
+    check_whole("workers", cores() if workers is None else workers, 1)
+    check_whole("seed", seed, 0, MOST_SEED)
     path = absolute(folder, "folder")
     space = Space(grid)
     file = _file_in(path)
@@ -132,8 +135,10 @@ class Space:
 
     def __init__(self, grid: str | Path | Mapping[str, Any]) -> None:
         """Read a grid; raises UsageError, also for settings that no run takes."""
+        if not isinstance(grid, Mapping):
+            path = absolute(grid, "grid")
         try:
-            tables = dict(grid) if isinstance(grid, Mapping) else parse_toml(read_text(Path(grid), MAX_SETTINGS))
+            tables = dict(grid) if isinstance(grid, Mapping) else parse_toml(read_text(path, MAX_SETTINGS))
             tables.pop("quick", None)
             self.file = checked(GridFile, tables)
         except (OSError, UnicodeDecodeError, CoopError) as error:

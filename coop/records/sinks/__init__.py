@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
+from coop.common.arguments import texts
 from coop.common.errors import CoopError, UsageError, first_line
 from coop.common.imports import check_extra
 from coop.common.messaging.messages.evaluate import EvaluationRow
@@ -144,9 +145,9 @@ def chosen_sinks(log: str | Iterable[str]) -> tuple[str, ...]:
     """The names in a list, or in a text with commas; "none" alone for no sink.
 
     Raises:
-        UsageError: there is no sink of a name, or its library is not installed.
+        UsageError: it is neither, or there is no sink of a name, or its library is not installed.
     """
-    names = [name.strip() for name in (log.split(",") if isinstance(log, str) else log)]
+    names = [name.strip() for name in (log.split(",") if isinstance(log, str) else texts("log", log))]
     if names == ["none"]:
         return ()
     for name in names:

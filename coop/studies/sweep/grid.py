@@ -117,6 +117,14 @@ def load_grid(name: str, quick: bool = False) -> Grid:
     return parse_grid(text, name, quick)
 
 
+def grid_text(tables: Mapping[str, Any]) -> str:
+    """The TOML of a grid's contents; raises UsageError for what TOML can't say."""
+    try:
+        return tomli_w.dumps(tables)
+    except (TypeError, ValueError, AttributeError) as error:  # the last for a key that is no text
+        raise UsageError(f"grid: {error}") from error
+
+
 def parse_grid(text: str, name: str, quick: bool = False, check: bool = True) -> Grid:
     """Read and expand a grid's TOML; name: for error messages. Raises UsageError as `load_grid`.
 

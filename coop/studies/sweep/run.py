@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import tomli_w
 
+from coop.common.arguments import check_whole
 from coop.common.errors import UsageError
 from coop.common.places import absolute
 from coop.common.process.limits import cores
@@ -19,7 +19,7 @@ from coop.evaluation.notebook import table_html
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.records.summaries import read_summary
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
-from coop.studies.sweep.grid import load_grid, parse_grid
+from coop.studies.sweep.grid import grid_text, load_grid, parse_grid
 from coop.studies.sweep.local import LocalProcesses
 from coop.studies.sweep.runner import Runner
 from coop.studies.sweep.stacking import stacks_of
@@ -69,15 +69,14 @@ def sweep(
     Raises:
         UsageError: the grid or a setting is invalid, or the folder holds other runs.
     """
-    if jobs is not None and jobs < 1:
-        raise UsageError(f"jobs = {jobs}: must be at least 1")
-    if stack is not None and stack < 1:
-        raise UsageError(f"stack = {stack}: must be at least 1")
+    for name, value in (("jobs", jobs), ("stack", stack)):
+        if value is not None:
+            check_whole(name, value, 1)
     names = ",".join(chosen_sinks(log)) or "none"
     if isinstance(grid, Mapping):
         if folder is None:
             raise UsageError("folder: a grid without a name needs one")
-        checked, path = parse_grid(tomli_w.dumps(grid), str(folder), quick), absolute(folder, "folder")
+        checked, path = parse_grid(grid_text(grid), str(folder), quick), absolute(folder, "folder")
     else:
         checked = load_grid(str(grid), quick)
         path = absolute(default_folder(grid, quick) if folder is None else folder, "folder")
