@@ -92,7 +92,9 @@ def test_a_terminal_that_goes_ends_a_topology_with_a_closing_checkpoint(tmp_path
 
 def test_a_terminal_that_goes_without_a_signal_ends_a_sweep(tmp_path: Path) -> None:
     """As one that is not the session's own, of a container or a connection that is lost."""
-    fixed = "total_steps = 1000000\n[fixed.replay]\ncapacity = 100\nlearning_starts = 40\n[fixed.network]\nhidden = [8]\n"
+    fixed = (
+        "total_steps = 1000000\n[fixed.replay]\ncapacity = 100\nlearning_starts = 40\n[fixed.network]\nhidden = [8]\n"
+    )
     (tmp_path / "g.toml").write_text(f'methods = ["dqn"]\nseeds = [0]\n[fixed]\n{fixed}')
     side, terminal = pty.openpty()
     line = [str(SCRIPTS / "coop-sweep"), "g.toml", "--dir", "d", "--jobs", "1", "--log", "none"]

@@ -10,8 +10,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from coop.common.process.console import counted, stamped
-from coop.monitor.display import LiveDisplay, printable
+from coop.common.process.console import counted, printable, stamped
+from coop.monitor.display import LiveDisplay
 from coop.monitor.facts import clock
 from coop.monitor.live_page import ServedPage
 from coop.studies.watch.sweep import Shown, SweepFolder
