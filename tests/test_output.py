@@ -103,6 +103,26 @@ def test_a_terminal_that_goes_ends_a_topology_with_a_closing_checkpoint(tmp_path
         assert "Traceback" not in log.read_text()
 
 
+def test_a_terminal_that_goes_without_a_signal_ends_a_sweep(tmp_path: Path) -> None:
+    """As one that is not the session's own, of a container or a connection that is lost."""
+    fixed = (
+        "total_steps = 1000000\n[fixed.replay]\ncapacity = 100\nlearning_starts = 40\n[fixed.network]\nhidden = [8]\n"
+    )
+    (tmp_path / "g.toml").write_text(f'methods = ["dqn"]\nseeds = [0]\n[fixed]\n{fixed}')
+    side, terminal = pty.openpty()
+    line = [str(SCRIPTS / "coop-sweep"), "g.toml", "--dir", "d", "--jobs", "1", "--log", "none"]
+    variables = VARIABLES | {"TERM": "xterm"}
+    with subprocess.Popen(line, cwd=tmp_path, env=variables, stdout=terminal, start_new_session=True) as process:
+        os.close(terminal)
+        try:
+            read_until(side, tmp_path / "d" / "dqn-seed=0" / "episodes.csv")
+            os.close(side)
+            assert process.wait(120) == 128 + signal.SIGPIPE
+        finally:
+            process.terminate()
+    assert how_it_ended(tmp_path / "d" / "dqn-seed=0") == "interrupted"
+
+
 def test_under_nohup_a_run_outlives_its_terminal(tmp_path: Path) -> None:
     line = f"coop-local {SMALL} --total-steps 1500 --run-dir run"
     with on_a_terminal(line, tmp_path, nohup=True) as (process, side):

@@ -31,7 +31,8 @@ class LiveDisplay(ABC):
     """
 
     def __init__(self, plain_every: float, refreshes: float, *, screen: bool = False) -> None:
-        self._console = Console(file=out())
+        # Decided once: rich writes nothing to what was a terminal and is none any more, and nobody would notice that.
+        self._console = Console(file=out(), force_terminal=Console(file=out()).is_terminal)
         self._draws = self._console.is_terminal and not self._console.is_dumb_terminal
         self._live = Live(
             console=self._console, auto_refresh=False, transient=True, screen=screen, redirect_stderr=not screen
