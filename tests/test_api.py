@@ -1,5 +1,6 @@
 """The Python API: training in the background, saved runs and their policies, evaluation, sweeps, registered methods."""
 
+import shutil
 import subprocess
 import sys
 import threading
@@ -240,6 +241,12 @@ def test_a_sweep(tmp_path: Path) -> None:
     assert set(done.runs["exit"]) == {"complete"}
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("summary.json")}
     assert len(before) == 4
+    (cell, *_) = sorted(path.name for path in tmp_path.glob("*seed*"))
+    shutil.copytree(tmp_path / cell, tmp_path / "a copy")  # the user's own, as are notes in any form
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "config.toml").write_text("[")
+    assert cell in set(coop.load_sweep(tmp_path).episodes["run"])
+    assert set(coop.load_sweep(tmp_path).episodes["run"]).isdisjoint({"a copy", "notes"})
     assert coop.sweep(grid, tmp_path).runs.equals(done.runs)
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("summary.json")}
     with pytest.raises(coop.UsageError, match="give another --dir"):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coop.common.errors import RunError, UsageError
-from coop.common.process.output import warn
+from coop.common.process.output import warn, warn_once
 from coop.common.process.untrusted import MAX_SETTINGS, check_run_name, read_bytes, read_text
 from coop.common.settings.config import RunConfig
 from coop.common.settings.tables import CONFIG, parse_run_config
@@ -40,9 +40,15 @@ TAIL = 16_384  # bytes at the end of a CSV record, enough for 100 lines of episo
 
 
 def run_names(folder: Path) -> list[str]:
-    """The names of the runs in a folder, in order, without hidden folders; raises UsageError as `check_run_name`."""
-    found = (path.parent.name for path in folder.glob(f"*/{CONFIG}"))
-    return sorted(check_run_name(name, str(folder)) for name in found if not name.startswith("."))
+    """The names of the runs in a folder, in order, without hidden folders; names that are none are warned of once."""
+    found = []
+    for name in sorted(path.parent.name for path in folder.glob(f"*/{CONFIG}")):
+        try:
+            if not name.startswith("."):
+                found.append(check_run_name(name, str(folder)))
+        except UsageError as error:
+            warn_once(f"{error}; left out")
+    return found
 
 
 def check_records(run_dir: Path) -> None:

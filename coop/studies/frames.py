@@ -11,6 +11,7 @@ import pandas as pd
 from coop.common.errors import UsageError
 from coop.common.imports import check_extra
 from coop.common.places import absolute
+from coop.common.process.output import warn
 from coop.common.settings.config import value_of
 from coop.common.settings.overrides import leaves
 from coop.common.settings.tables import identity, parse_run_config
@@ -32,6 +33,8 @@ class SweepFrames:
 def load_sweep(folder: str | Path) -> SweepFrames:
     """Read the runs of a sweep, of any folder of runs, or of a packed study; runs that go on are included.
 
+    A folder whose config can't be read is left out with a warning.
+
     Raises:
         UsageError: there is no run, or pyarrow (extra `report`) is not installed.
         RunError: a record can't be read.
@@ -39,13 +42,19 @@ def load_sweep(folder: str | Path) -> SweepFrames:
     check_extra("coop.load_sweep", "report", "pyarrow")
     from coop.studies.report.packed import CONFIG, EPISODES, METRICS  # noqa: PLC0415 (needs the extra)
     from coop.studies.report.sources import open_source  # noqa: PLC0415
+    from coop.studies.report.study import runs_of  # noqa: PLC0415
 
     path = absolute(folder, "folder")
     if not path.exists():
         raise UsageError(f"folder {path}: does not exist")
     source = open_source(path)
-    texts = {name: source.text(name, CONFIG) for name in source.names}
-    configs = {name: parse_run_config(text, f"{path}/{name}/{CONFIG}") for name, text in texts.items() if text}
+    configs = {}
+    for name in runs_of(source, path)[1]:
+        try:
+            if text := source.text(name, CONFIG):
+                configs[name] = parse_run_config(text, f"{path}/{name}/{CONFIG}")
+        except UsageError as error:
+            warn(f"{error}; left out")
     if not configs:
         raise UsageError(f"{path}: holds no run")
     flat = [{".".join(place): value for place, value in leaves(identity(config))} for config in configs.values()]

@@ -22,7 +22,7 @@ from coop.records.reading import returns_by_step
 from coop.records.summaries import parse_summary
 from coop.studies.report.packed import CONFIG, EPISODES, METRICS, SUMMARY, SWEEP
 from coop.studies.report.sources import RunSource, open_source
-from coop.studies.sweep.grid import parse_grid, starting
+from coop.studies.sweep.grid import Grid, parse_grid, starting
 
 Floats = NDArray[np.float64]
 Setting = tuple[Any, ...]  # a value for each axis
@@ -193,8 +193,7 @@ def load_study(path: Path) -> Study:
         RunError: no run in it is finished, or a file is torn.
     """
     source = open_source(path)
-    grid = None if source.sweep is None else parse_grid(source.sweep, f"{path}/{SWEEP}", check=False)
-    names = source.names if grid is None else [choice.name for choice in grid.choices]
+    grid, names = runs_of(source, path)
     if not names:
         raise UsageError(f"{path}: holds no run and no {SWEEP}")
     runs, missing, diverged = [], {}, {}
@@ -219,6 +218,14 @@ def load_study(path: Path) -> Study:
     preset = resolve(starting(grid.file) if grid else load_tables(PRESET, None))
     reference = tuple(_nearest(value_of(preset, axis), {value_of(run.config, axis) for run in runs}) for axis in axes)
     return Study(grid.file.title if grid else "", tuple(runs), missing, diverged, axes, reference)
+
+
+def runs_of(source: RunSource, path: Path) -> tuple[Grid | None, list[str]]:
+    """The grid of a sweep, if it is one, and the names of its runs: a sweep's cells, whatever else is in its folder."""
+    if source.sweep is None:
+        return None, source.names
+    grid = parse_grid(source.sweep, f"{path}/{SWEEP}", check=False)
+    return grid, [choice.name for choice in grid.choices]
 
 
 def _state(source: RunSource, run: str) -> str:
