@@ -149,8 +149,8 @@ def cell(run: Path) -> CellFolder:
     """The run as the cell of a sweep."""
     (one,) = parse_grid('methods = ["dqn"]\nseeds = [0]\n', "g.toml").cells
     folder = CellFolder(run.parent, one)
-    if not folder.path.is_symlink():
-        folder.path.symlink_to(run)
+    if run.exists():
+        run.rename(folder.path)
     return folder
 
 
