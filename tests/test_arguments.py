@@ -21,7 +21,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> coop.SavedRun:
     return coop.load(path)
 
 
-@pytest.mark.parametrize("wrong", [None, 5, b"a", [], WRONG], ids=str)
+@pytest.mark.parametrize("wrong", [None, 5, b"a", [], WRONG], ids=["None", "number", "bytes", "list", "object"])
 @pytest.mark.parametrize(
     ("name", "call"),
     [
