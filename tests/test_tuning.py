@@ -181,18 +181,18 @@ def test_workers_run_at_once_and_two_processes_share_a_search(tmp_path: Path) ->
     """The second process waits for the trials of the first one; either may see first that one has ended."""
     grid = {"fixed": {**FIXED, "total_steps": 1_500}, "vary": RATES}
     url = f"sqlite:///{tmp_path / 'mine.db'}"
-    call = f"coop.tune({grid!r}, {str(tmp_path / 'a')!r}, trials=3, workers=2, storage={url!r})"
+    call = f"coop.tune({grid!r}, {str(tmp_path / 'a')!r}, trials=2, workers=2, storage={url!r})"
     with subprocess.Popen([sys.executable, "-c", f"import coop; {call}"]) as other:
         try:
             while not (tmp_path / "a" / "trial-0001" / "episodes.csv").exists():
                 assert other.poll() is None
                 time.sleep(0.1)
-            study = coop.tune(grid, tmp_path / "a", trials=3, workers=2, storage=url)
+            study = coop.tune(grid, tmp_path / "a", trials=2, workers=2, storage=url)
             assert other.wait(200) == 0
         finally:
             other.kill()
     assert {trial.state for trial in study.trials} == {STATE.COMPLETE}
-    assert len(study.trials) >= 3, "more where both ask at the same moment"
+    assert len(study.trials) >= 2, "more where both ask at the same moment"
     first, second = study.trials[:2]
     assert second.datetime_start < first.datetime_complete  # type: ignore[operator]
     assert not (tmp_path / "a" / "optuna.db").exists()
