@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Collection
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +11,10 @@ import numpy as np
 
 from benchmarks.simulate.roles import STEPS
 from benchmarks.simulate.sealed import Checkpoints
-from benchmarks.simulate.strangers import Strangers
+from benchmarks.simulate.strangers import Strangers, acting_of
 from benchmarks.simulate.world import Process, Violation
 from coop.common.messaging import wire
 from coop.common.messaging.messages.evaluate import EvaluationRow
-from coop.common.messaging.messages.weights import Role
 from coop.common.transitions import Batch, Drawn, DrawRequest, Segment
 from coop.learner.trainer import Effects, Trainer
 from coop.replay.core import ReplayCore, Reply
@@ -304,7 +302,7 @@ class Checks:
         self.hold("acknowledged", acked <= given, f"{process.name} counts {acked} acknowledged, but {given} were")
         if not weights.ready:
             return
-        heard = [_acting(raw) for raw in process.state.pop("roles", ())]
+        heard = [acting_of(raw) for raw in process.state.pop("roles", ())]
         own = [acting for run, acting in heard if run == process.nodes[0].run]
         told = [*process.state.get("role", [None]), *own]
         # Only the newest broadcast waits to be read: one of another run may have taken the place of its own learner's.
@@ -392,13 +390,6 @@ def _lacks_draws(core: ReplayCore) -> bool:
     """
     journal = core.recorder
     return isinstance(journal, Journal) and (journal._failed is not None or bool(journal._late))
-
-
-@lru_cache(64)
-def _acting(role: bytes) -> tuple[str, int]:
-    """Whose role it is, and the network that acts, from 0 on."""
-    message = wire.decode(role)
-    return message.run, Role.decode(message).acting - 1
 
 
 def _digest(agent: Any) -> bytes:  # noqa: ANN401

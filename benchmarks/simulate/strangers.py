@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.simulate.world import Process
+from coop.common.messaging import wire
+from coop.common.messaging.messages.weights import Role
 from coop.common.messaging.runs import name_of
 from coop.common.messaging.wire import Message
 from coop.records.run_ids import has_run_id, read_run_id
@@ -67,3 +70,10 @@ class Strangers:
         if self._learners:
             mine, theirs = one.state.get("run"), other.state.get("run")
             self._checks.hold("one run", mine is None or theirs is None or mine == theirs, f"{words}: another run")
+
+
+@lru_cache(64)
+def acting_of(role: bytes) -> tuple[str, int]:
+    """Whose role it is, and the network that acts, from 0 on."""
+    message = wire.decode(role)
+    return message.run, Role.decode(message).acting - 1
