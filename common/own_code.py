@@ -14,6 +14,12 @@ def described(error: BaseException) -> str:
     return describe(error) + place(error)
 
 
+def brief(value: object) -> str:
+    """What a user's code has given, in one line: its text or, if that is long, its type."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 40 else type(value).__name__
+
+
 @contextmanager
 def own_code(name: str) -> Iterator[None]:
     """Within it a user's own code runs: what it raises becomes a RunError. name: its setting, with the value.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coop.common.bounds import MAX_MAGNITUDE
 from coop.common.errors import RunError, UsageError
-from coop.common.own_code import described
+from coop.common.own_code import brief, described
 from coop.common.process.lifecycle import is_interrupt
 from coop.common.process.output import warn, warn_once
 from coop.common.types import Array
@@ -303,8 +303,7 @@ def _shown(value: object) -> str:
         return f"{value.dtype}{list(value.shape)}"
     if isinstance(value, tuple):
         return f"{len(value)} values"
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 40 else type(value).__name__
+    return brief(value)
 
 
 def _as_array(given: object, what: str = "observation") -> Array:

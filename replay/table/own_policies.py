@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coop.common.errors import UsageError
-from coop.common.own_code import own_code
+from coop.common.own_code import brief, own_code
 from coop.common.registry import Registry, loaded
 from coop.common.settings.policies import EVICTIONS, SAMPLERS, EvictionPolicy, Policy, SamplingPolicy
 from coop.replay.table.policies import Eviction, Floats, Incoming, Rows, Sampling, TableView
@@ -35,8 +35,8 @@ def make_policies(eviction: EvictionPolicy, sampling: SamplingPolicy, table: Tab
 class OwnEviction(Eviction):
     """A user's own eviction policy, which sees the transitions that come.
 
-    Its methods raise RunError for an exception of the policy's code, and UsageError for an answer that breaks its
-    promise; the table is unchanged then.
+    Its methods raise RunError for an exception of the policy's code, and `admit` UsageError for an answer that breaks
+    its promise; where `admit` fails, the table is unchanged.
     """
 
     def __init__(self, policy: Eviction, setting: str) -> None:
@@ -153,5 +153,4 @@ def _shown(value: object) -> str:
     if isinstance(value, np.ndarray):
         ends = f" from {value.min():g} to {value.max():g}" if value.size and value.dtype.kind in "biuf" else ""
         return f"{value.dtype}{list(value.shape)}{ends}"
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 40 else type(value).__name__
+    return brief(value)
