@@ -39,7 +39,7 @@ from coop.common.errors import CoopError
 from coop.common.process.processes import ChildProcess, command
 
 LIMIT = 120  # seconds for a command, on a busy machine
-LIMITS = {"coop-local": 600}  # whose processes wait for each other
+LIMITS = {"coop-local": 600, "coop-sweep": 600}  # whose processes wait for each other
 PAGE = 4096
 SHOWN = 200  # mutations between two lines of progress
 RUN = ("--total-steps=260", "--replay.capacity=100", "--replay.learning-starts=40", "--network.hidden=8")
@@ -243,19 +243,22 @@ def read(base: Path, reader: Reader, change: Callable[[Path], None] = lambda cop
     arguments = [each.format(work / "copy", out=work / "out", base=base) for each in reader.arguments]
     out = io.StringIO()
     status: int | None = 0
+    limit = alarm(LIMITS.get(reader.name, LIMIT))
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out), alarm(LIMITS.get(reader.name, LIMIT)):
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out), limit as late:
             start(reader.name, arguments)
     except SystemExit as left:
         status = left.code if isinstance(left.code, int) else 1
     except Hang:
-        status = -1
+        pass
     except CoopError as error:  # of the Python API
         out.write(f"error: {error}")
         status = 2
     except BaseException:
         out.write(traceback.format_exc())
         status = None
+    if late:  # the command may have taken Hang for its own failure
+        status = -1
     printed = steady(out.getvalue())
     repeated = " ".join(re.findall(reader.same, printed)) if reader.same else printed
     result = hashlib.sha256(repeated.encode() if not reader.result else b"")
@@ -336,17 +339,19 @@ def restore(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def alarm(seconds: int) -> Iterator[None]:
-    """Raise Hang after a time; restore the signals' handlers, which commands set."""
+def alarm(seconds: int) -> Iterator[list[Hang]]:
+    """Raise Hang after a time, and put it into the list; restore the signals' handlers, which commands set."""
+    raised: list[Hang] = []
 
     def handle(number: int, frame: Any) -> None:  # noqa: ANN401 (a frame)
-        raise Hang
+        raised.append(Hang())
+        raise raised[-1]
 
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     signal.signal(signal.SIGALRM, handle)
     signal.alarm(seconds)
     try:
-        yield
+        yield raised
     finally:
         signal.alarm(0)
         for number, handler in handlers.items():
