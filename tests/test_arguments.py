@@ -74,6 +74,15 @@ def test_paths(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("path", ["a" * 300, "loop/a"])
+def test_paths_that_no_file_system_takes(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    for name, call in (("run_dir", coop.load), ("folder", lambda path: coop.tune(GRID, path))):
+        with pytest.raises(coop.UsageError, match=f"^{name} = '{path}': (File name too long|Too many levels of )"):
+            call(path)
+
+
 @pytest.mark.parametrize(
     ("call", "said"),
     [
