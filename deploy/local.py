@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -194,15 +195,15 @@ def _supervise(
     topology: Topology, options: LocalOptions, config: RunConfig, directory: Path, stop: Stop, page: Page | None
 ) -> None:
     """Run the processes to the end of the run."""
-    topology.start()
     evaluations = Evaluations(directory)
-    status = RunStatus(
-        config.run, topology.endpoint, new_incarnation(), options.zenoh_config, evaluations=evaluations.points
-    )
     title = f"{config.env.id}, {config.method}, seed {config.seed}: {shown(directory)}"
     interrupted = False
     try:
-        with Display(status, page) as display:
+        topology.start()
+        status = RunStatus(
+            config.run, topology.endpoint, new_incarnation(), options.zenoh_config, evaluations=evaluations.points
+        )
+        with closing(status), Display(status, page) as display:
             display.say(title)
             while not topology.check(display):
                 display.update()
@@ -214,8 +215,6 @@ def _supervise(
     except BaseException:
         topology.abort()
         raise
-    finally:
-        status.close()
     if topology.learner.was_interrupted():
         topology.abort()
         say(f"{topology.learner.last_line()}; coop-local --resume --run-dir {shown(directory)} goes on")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import coop
+from coop.common.arguments import check_seconds, check_whole, texts
 
 WRONG: Any = object()
 GRID = {"fixed": {"total_steps": 40}, "seeds": [0]}
@@ -19,6 +22,31 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> coop.SavedRun:
     path = tmp_path_factory.mktemp("runs") / "a"
     coop.train(run_dir=path, total_steps=40).wait()
     return coop.load(path)
+
+
+@pytest.mark.parametrize("wrong", [True, np.True_, 0, 6, np.int64(6), 2.0, "2", None])
+def test_whole_numbers(wrong: Any) -> None:
+    for right in (1, 5, np.int64(5), np.uint8(1)):
+        check_whole("n", right, 1, 5)
+    check_whole("n", 10**30, 1)
+    with pytest.raises(coop.UsageError, match=f"^n = {re.escape(repr(wrong))}: must be a whole number from 1 to 5$"):
+        check_whole("n", wrong, 1, 5)
+
+
+@pytest.mark.parametrize("wrong", [True, -0.5, float("nan"), float("-inf"), "2", None, 1j])
+def test_seconds(wrong: Any) -> None:
+    for right in (0, 2.5, np.float32(0.5), float("inf")):
+        check_seconds("wait", right)
+    with pytest.raises(coop.UsageError, match=f"^wait = {re.escape(repr(wrong))}: must be a number of seconds from 0"):
+        check_seconds("wait", wrong)
+
+
+@pytest.mark.parametrize("wrong", ["envs", b"envs", {"envs": 1}, 5, None])
+def test_lists_of_names(wrong: Any) -> None:
+    for right in (["a", "b"], ("a", "b"), {"a": 1, "b": 2}.keys(), iter("ab")):
+        assert texts("names", right) == ["a", "b"]
+    with pytest.raises(coop.UsageError, match=f"^names = {re.escape(repr(wrong))}: must be a list of names$"):
+        texts("names", wrong)
 
 
 @pytest.mark.parametrize("wrong", [None, 5, b"a", [], WRONG], ids=["None", "number", "bytes", "list", "object"])
@@ -46,6 +74,15 @@ def test_paths(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("path", ["a" * 300, "loop/a"])
+def test_paths_that_no_file_system_takes(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    for name, call in (("run_dir", coop.load), ("folder", lambda path: coop.tune(GRID, path))):
+        with pytest.raises(coop.UsageError, match=f"^{name} = '{path}': (File name too long|Too many levels of )"):
+            call(path)
+
+
 @pytest.mark.parametrize(
     ("call", "said"),
     [
@@ -60,6 +97,7 @@ def test_paths(
         (lambda path: coop.tune(GRID, path, trials=None), "trials = None: must be a whole number from 1 on"),
         (lambda path: coop.tune(GRID, path, workers="1"), "workers = '1': must be a whole number from 1 on"),
         (lambda path: coop.tune(GRID, path, seed=-1), "seed = -1: must be a whole number from 0"),
+        (lambda path: coop.sweep(GRID, path, stack="2"), "stack = '2': must be a whole number from 1 on"),
         (lambda path: coop.sweep(GRID, path, jobs="2"), "jobs = '2': must be a whole number from 1 on"),
         (lambda path: coop.sweep({5: {}}, path), "grid: .*5"),
         (lambda path: coop.sweep({"fixed": {"seed": WRONG}}, path), "grid: .*object"),
@@ -80,6 +118,13 @@ def test_what_starts_runs(call: Callable[[Path], object], said: str, tmp_path: P
         (lambda run: run.film(seed="x"), "seed = 'x': must be a whole number"),
         (lambda run: run.buffer(live=True, timeout=None), "timeout = None: must be a number of seconds"),
         (lambda run: run.buffer(timeout=float("nan")), "timeout = nan: must be a number of seconds"),
+        (lambda run: coop.evaluate(run.policy(), episodes="1"), "episodes = '1': must be a whole number"),
+        (lambda run: coop.evaluate(run.policy(), seed=None), "seed = None: must be a whole number"),
+        (lambda run: coop.evaluate(run.policy(), at_once=0), "at_once = 0: must be a whole number"),
+        (lambda run: coop.evaluate(run.policy(), epsilon=True), "epsilon = True: must be from 0 to 1"),
+        (lambda run: coop.evaluate(run.policy(), epsilon="0"), "epsilon = '0': must be from 0 to 1"),
+        (lambda run: coop.evaluate(run.policy(), env=5), "env = 5: must be an id"),
+        (lambda run: coop.evaluate(None), "policy: NoneType is no function"),  # type: ignore[arg-type]
         (lambda run: coop.evaluate(lambda obs: [0, [1]], env=run.config.env.id), "policy: gives what is no array"),
     ],
 )

@@ -127,6 +127,32 @@ run_main("coop-x", lambda: {work})
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("work", "words"),
+    [
+        ('ChildProcess("replay", [sys.executable], Path(os.devnull)).start', "replay: "),
+        ("lambda: zenoh.open(zenoh.Config())", ""),
+    ],
+)
+def test_processes_that_the_system_refuses_are_one_line(work: str, words: str) -> None:
+    code = f"""
+import os, resource, sys
+from pathlib import Path
+import zenoh
+from coop.common.process.lifecycle import run_main
+from coop.common.process.processes import ChildProcess
+if os.getuid() == 0:
+    os.setuid(65534)  # root has as many as it likes
+resource.setrlimit(resource.RLIMIT_NPROC, (0, 0))
+run_main("coop-x", {work})
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f"coop-x: error: {words}not enough memory and processes (ulimit -u) (")
+
+
 @contextlib.contextmanager
 def control_group(size: int) -> Iterator[Path]:
     """A real control group with so many bytes of memory, without swap."""

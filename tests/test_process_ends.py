@@ -1,6 +1,8 @@
 """Processes that end by themselves: what will come again ends the run at once, with the reason and its status."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -82,6 +84,29 @@ def test_a_run_goes_on_without_its_evaluator(folder: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert json.loads((folder / "run" / "summary.json").read_text())["exit"] == "complete"
     assert done.stdout.count("the run goes on without it") == 1
+
+
+STARTS = """
+import os
+from coop.deploy.local import main
+
+try:
+    main()
+finally:
+    try:
+        print("left:", os.waitpid(-1, os.WNOHANG))
+    except ChildProcessError:
+        print("none is left")
+"""
+
+
+def test_a_role_that_can_not_start_ends_those_before_it(tmp_path: Path) -> None:
+    (tmp_path / "a" / "logs" / "actor-1.log").mkdir(parents=True)
+    line = [sys.executable, "-c", STARTS, *SMALL, "--run-dir", "a"]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=200)
+    assert done.stdout.splitlines()[-1] == "none is left"
+    assert (done.returncode, done.stderr) == (1, f"coop-local: error: {tmp_path}/a/logs/actor-1.log: Is a directory\n")
+    assert (tmp_path / "a" / "logs" / "learner.log").exists(), "it had been started"
 
 
 def test_sys_exit_in_a_lockstep_run_is_a_failure(folder: Path) -> None:

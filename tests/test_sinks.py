@@ -3,11 +3,14 @@
 import dataclasses
 import json
 import os
+import re
+import signal
 import socket
 import struct
+import sys
 import threading
 import urllib.request
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,19 +30,19 @@ from test_screen import STATUS
 import coop
 from coop.common.errors import UsageError
 from coop.common.imports import check_extra
+from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.messaging.messages.status import LearnerStatus
-from coop.common.process.lifecycle import Stop
+from coop.common.process.lifecycle import Signalled, Stop
 from coop.common.process.processes import free_endpoint
-from coop.common.registry import Registry
-from coop.common.types import EpisodeRow
 from coop.learner.summary import summarise
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start, holds_run
 from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
-from coop.records.sinks import Kept, RecordedRun, Sink, chosen_sinks
+from coop.records.sinks import ChosenSinks, RecordedRun, Sink, chosen_sinks
 from coop.records.sinks.mlflow import MlflowSink
+from coop.records.summaries import read_summary
 from website.assemble import assembled
 
 GRID = {
@@ -324,38 +327,52 @@ def test_tensorboards_hparams_show_settings_and_metrics(tmp_path: Path) -> None:
     assert {"charts/episodic_return", "losses/td_loss"} <= {each.name.tag for each in shown.metric_infos}
 
 
-class Broken(Sink):
-    """Takes one episode, and fails at the next."""
+def broken(method: str) -> type[Sink]:
+    """A user's sink, one of whose methods would end the process."""
 
-    name = "broken"
+    def fail(self: Sink, *given: object) -> None:
+        sys.exit("no luck\nat all")
 
-    def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
-        if settings["seed"] == 7:
-            raise ValueError("no luck\nat all")
-        self.taken = 0
-
-    def episode(self, row: EpisodeRow) -> None:
-        self.taken += 1
-        if self.taken >= 2:
-            raise ConnectionError("the server is gone")
+    return type(method, (Sink,), {method: property(fail) if method == "problem" else fail})
 
 
-def test_a_sink_that_fails_does_not_end_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("coop.records.sinks.SINKS", Registry("log", "coop.sinks", type, {"broken": Broken}))
+broken_in_init, broken_in_begin = broken("__init__"), broken("begin")
+broken_in_episode, broken_in_metrics, broken_in_problem = broken("episode"), broken("metrics"), broken("problem")
+broken_in_evaluation, broken_in_film = broken("evaluation"), broken("film")
+broken_in_conclude, broken_in_close = broken("conclude"), broken("close")
+
+
+def test_a_sink_that_fails_does_not_end_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    later = ("episode", "metrics", "problem", "evaluation", "film", "conclude", "close")
     run = Lockstep(base_config(["--method", "coop"]))
-    with RunDirectory(tmp_path / "run", run.config, log="broken") as directory:
+    names = [f"{__name__}:broken_in_{method}" for method in later]
+    with RunDirectory(tmp_path / "run", run.config, log=names) as directory:
         play(run, directory)
-        lines = capsys.readouterr().out
-        assert (
-            lines == f"{tmp_path}/run: --log broken: ConnectionError: the server is gone; the run goes on without it\n"
-        )
-        assert len((tmp_path / "run" / "episodes.csv").read_text().splitlines()) > 3
+        directory.evaluation(EvaluationRow(run.step, 0, 1, 1, 5.0, 0.0, 0.0, 1.0))
+        directory.film(b"", run.step)
+        directory.conclude(summarise(run.trainer, "complete", 0.0, 0), "run")
     run.env.close()
-    with pytest.raises(UsageError, match=r"^--log broken: ValueError: no luck$"):
-        RunDirectory(tmp_path / "other", dataclasses.replace(run.config, seed=7), log="broken")
+    lines = capsys.readouterr().out.splitlines()
+    raised = r"SystemExit: no luck \(test_sinks\.py:\d+\); the run goes on without it"
+    assert len(lines) == len(names)
+    for name in names:
+        assert [line for line in lines if re.fullmatch(f"{re.escape(str(tmp_path))}/run: --log {name}: {raised}", line)]
+    assert len((tmp_path / "run" / "episodes.csv").read_text().splitlines()) > 3
+    assert read_summary(tmp_path / "run")["exit"] == "complete"
+    for name in ("init", "begin"):
+        with pytest.raises(UsageError, match=rf"^--log {__name__}:broken_in_{name}: SystemExit: no luck \(test_sinks"):
+            RunDirectory(tmp_path / "other", run.config, log=f"{__name__}:broken_in_{name}")
     assert not holds_run(tmp_path / "other")
+
+
+def test_a_signal_in_a_sink_ends_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def arrives(sink: Sink) -> None:
+        raise Signalled(signal.SIGTERM)
+
+    sinks = ChosenSinks(RecordedRun(tmp_path, 7, ""), [f"{__name__}:broken_in_close"])
+    with pytest.raises(Signalled):
+        sinks.tell(arrives)
+    assert not capsys.readouterr().out
 
 
 def test_sinks_are_refused_by_name(tmp_path: Path) -> None:

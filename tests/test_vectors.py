@@ -60,10 +60,15 @@ class Own(VectorEnv[Any, Any, Any]):
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         assert self._mode == AutoresetMode.DISABLED or not options
-        return self._inner.reset(seed=seed, options=options)
+        if self._lacks == "seeds" and isinstance(seed, list):
+            raise TypeError("one seed is needed")
+        begun = self._inner.reset(seed=seed, options=options)
+        return begun[0] if self._lacks == "reset's info" else begun
 
     def step(self, actions: Any) -> Any:
         *others, infos = self._inner.step(actions)
+        if self._lacks == "step's info":
+            return tuple(others)
         infos.pop(self._lacks, None)
         wrong = {
             "a reward for all": (1, 1.0),
@@ -175,6 +180,11 @@ def test_what_does_not_fit_is_refused_in_a_line() -> None:
         env_spec(EnvSettings(id="test/Own-v0", kwargs={"lacks": "mode"}))
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_one_that_takes_one_seed_for_all(mode: AutoresetMode) -> None:
+    played(EnvSettings(id=f"test/Own-v{MODES.index(mode)}", kwargs={"lacks": "seeds"}), steps=5)
+
+
 @pytest.mark.parametrize(
     ("lacks", "words"),
     [
@@ -191,3 +201,15 @@ def test_values_that_are_not_one_for_each_emulator_are_named(lacks: str, words: 
     same = MODES.index(AutoresetMode.SAME_STEP)
     with pytest.raises(RunError, match=words):
         played(EnvSettings(id=f"test/Own-v{same}", kwargs={"lacks": lacks}))
+
+
+@pytest.mark.parametrize(
+    ("lacks", "words"),
+    [
+        ("reset's info", r"at the first reset of emulator 0 gives float32\[3, 3\]; gymnasium's reset"),
+        ("step's info", "at step 1 of emulator 0 gives 4 values; gymnasium's step"),
+    ],
+)
+def test_answers_that_are_none_of_gymnasium_s_are_named(lacks: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        played(EnvSettings(id="test/Own-v1", kwargs={"lacks": lacks}))

@@ -26,7 +26,11 @@ _OUT_OF_MEMORY = (
     (RuntimeError, "can't allocate memory"),
     (ImportError, "failed to map segment"),
     (ImportError, "Cannot allocate memory"),
-    (RuntimeError, "can't start new thread"),  # or a limit of processes
+)
+_OUT_OF_PROCESSES = (  # or of memory
+    (RuntimeError, "can't start new thread"),
+    (BlockingIOError, "Resource temporarily unavailable"),  # of a fork
+    (BaseException, "can't spawn worker thread"),  # Zenoh's, which is no Exception
 )
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -195,9 +199,8 @@ def _explained(error: BaseException) -> tuple[str, int]:
             return f"sys.exit({code}) was called {_where(error)}; only this program ends its processes", 1
         case OSError() if line := _of_a_file(error):
             return line, 1
-    if is_out_of_memory(error):
-        more = " and processes (ulimit -u)" if "new thread" in text_of(error) else ""
-        return f"not enough memory{more} ({first_line(error)}); {memory_limit()}", 1
+    if line := out_of_memory(error):
+        return line, 1
     if changed := _torch_defaults():
         return (
             f"{first_line(error)}; users' code has set {changed}, which this program's own networks need as it was",
@@ -228,13 +231,21 @@ def _of_a_file(error: OSError) -> str:
     return ""
 
 
-def is_out_of_memory(error: BaseException) -> bool:
-    """Whether the system has refused memory; PyTorch, and the loader of libraries, say so in words."""
-    return (
-        isinstance(error, MemoryError)
-        or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
-        or any(isinstance(error, kind) and words in text_of(error) for kind, words in _OUT_OF_MEMORY)
-    )
+def out_of_memory(error: BaseException) -> str:
+    """The line of an error by which the system has refused memory or a process; empty for another one.
+
+    PyTorch, and the loader of libraries, say so in words.
+    """
+    processes = _says(error, _OUT_OF_PROCESSES)
+    refused = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+    if not (processes or refused or _says(error, _OUT_OF_MEMORY)):
+        return ""
+    more = " and processes (ulimit -u)" if processes else ""
+    return f"not enough memory{more} ({first_line(error)}); {memory_limit()}"
+
+
+def _says(error: BaseException, phrases: tuple[tuple[type[BaseException], str], ...]) -> bool:
+    return any(isinstance(error, kind) and words in text_of(error) for kind, words in phrases)
 
 
 def _where(error: BaseException) -> str:

@@ -14,8 +14,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+from coop.common.errors import RunError
 from coop.common.places import working_directory
-from coop.common.process.lifecycle import SIGNALS, SUPERVISED, status_after
+from coop.common.process.lifecycle import SIGNALS, SUPERVISED, out_of_memory, status_after
 from coop.common.process.limits import memory_kills, memory_limit
 from coop.common.process.output import keep_standard_files
 
@@ -57,9 +58,17 @@ class ChildProcess:
         self._memory_kills = 0  # before this start
 
     def start(self) -> None:
-        """Start or restart it."""
+        """Start or restart it. Raises RunError if the system refuses a process, OSError for its log."""
         keep_standard_files()
         self._memory_kills = memory_kills()
+        try:
+            self._start()
+        except OSError as error:
+            if line := out_of_memory(error):
+                raise RunError(f"{self.name}: {line}") from error
+            raise
+
+    def _start(self) -> None:
         with self._log.open("ab") as log:
             self._begin = log.tell()
             self._process = subprocess.Popen(

@@ -7,18 +7,19 @@ a class of an installed package, which its entry point in the group `coop.sinks`
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 from coop.common.arguments import texts
-from coop.common.errors import CoopError, UsageError, first_line
+from coop.common.errors import CoopError, UsageError, first_line, place
 from coop.common.imports import check_extra
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.metrics import TAGS
 from coop.common.process.console import say
+from coop.common.process.lifecycle import is_interrupt
 from coop.common.registry import Registry
 from coop.common.types import EpisodeRow
 
@@ -52,7 +53,7 @@ class Kept(NamedTuple):
 class Sink:
     """Takes what a run records, in the thread of the run, which waits for it. By itself it takes nothing.
 
-    An exception of a sink that `--log` names ends the sink, not the run.
+    Whatever a sink that `--log` names raises ends the sink, not the run.
 
     Attributes:
         name: by which `--log` chooses it.
@@ -73,7 +74,10 @@ class Sink:
         return ""
 
     def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
-        """Take the settings by name, before anything else; kept: what the run goes on from, None if it begins."""
+        """Take the settings by name, before anything else; whatever it raises refuses the run.
+
+        kept: what the run goes on from, None if it begins.
+        """
 
     def episode(self, row: EpisodeRow) -> None:
         """Take a finished episode."""
@@ -165,46 +169,58 @@ class ChosenSinks:
     def __init__(self, run: RecordedRun, names: Iterable[str]) -> None:
         """Open them; raises UsageError if one refuses."""
         self._run = run
-        self._sinks: list[Sink] = []
+        self._sinks: dict[str, Sink] = {}
         for name in names:
-            try:
-                self._sinks.append(SINKS.get(name)(run))
-            except Exception as error:
-                self.close()
-                raise _refused(name, error) from error
+            with self._refusing(name):
+                self._sinks[name] = SINKS.get(name)(run)
 
     def begin(self, settings: Mapping[str, Any], kept: Kept | None) -> None:
         """See `Sink`; raises UsageError if one refuses."""
-        for sink in self._sinks:
-            try:
+        for name, sink in self._sinks.items():
+            with self._refusing(name):
                 sink.begin(settings, kept)
-            except Exception as error:
-                self.close()
-                raise _refused(sink.name, error) from error
 
     @property
     def problem(self) -> str:
         """Why one of them keeps lines; empty if none does."""
-        return next((sink.problem for sink in self._sinks if sink.problem), "")
+        found: list[str] = []
+        self.tell(lambda sink: found.append(str(sink.problem)))
+        return next(filter(None, found), "")
 
     def tell(self, call: Callable[[Sink], None]) -> None:
         """Call each of them."""
-        for sink in list(self._sinks):
+        for name, sink in list(self._sinks.items()):
             try:
                 call(sink)
             except CoopError:  # this process may not write any more
                 raise
-            except Exception as error:
-                say(f"{self._run.path}: --log {sink.name}: {first_line(error)}; the run goes on without it")
-                self._sinks.remove(sink)
-                with suppress(Exception):
+            except BaseException as error:
+                say(f"{self._run.path}: --log {name}: {_raised(error)}; the run goes on without it")
+                del self._sinks[name]
+                try:
                     sink.close()
+                except BaseException as another:
+                    _raised(another)
 
     def close(self) -> None:
         """Close all of them."""
         self.tell(lambda sink: sink.close())
         self._sinks.clear()
 
+    @contextmanager
+    def _refusing(self, name: str) -> Iterator[None]:
+        """Within it, whatever a sink raises closes all of them and is a UsageError."""
+        try:
+            yield
+        except BaseException as error:
+            self.close()
+            if isinstance(error, CoopError):
+                raise
+            raise UsageError(f"--log {name}: {_raised(error)}") from error
 
-def _refused(name: str, error: Exception) -> CoopError:
-    return error if isinstance(error, CoopError) else UsageError(f"--log {name}: {first_line(error)}")
+
+def _raised(error: BaseException) -> str:
+    """What a sink has raised, which may be SystemExit too; a signal's interrupt is raised again."""
+    if is_interrupt(error):
+        raise error
+    return first_line(error) + place(error)
