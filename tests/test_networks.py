@@ -55,7 +55,8 @@ def test_a_network_of_ones_own_is_flat_and_acts(name: str) -> None:
     ("name", "text"),
     [
         ("missing", "module 'custom_networks' has no 'missing'"),
-        ("failing", "RuntimeError: no such game"),
+        ("failing", "RuntimeError: no such game (custom_networks.py:202)"),
+        ("leaving", "SystemExit: no such game (custom_networks.py:206)"),
         ("number", "gives int; it must give a torch.nn.Module"),
         ("scalar", "its output is float32 [4, 1] for inputs [4, 4]; it must be float32 [4, 3]"),
         ("normalised", "layer '1' is a BatchNorm1d, in which the samples of a batch meet"),

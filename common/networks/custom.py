@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import UsageError
-from coop.common.imports import describe, import_object
+from coop.common.imports import import_object
+from coop.common.own_code import described
 from coop.common.types import EnvSpec
 
 
@@ -27,8 +28,10 @@ def custom_network(kind: str, spec: EnvSpec, inputs: Tensor) -> nn.Module:
         module = make(spec)
         with torch.no_grad():
             problem = next(_problems(module, spec, inputs), None)
-    except Exception as error:  # a user's code may raise anything
-        problem = describe(error)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a user's code may raise anything, such as SystemExit
+        problem = described(error)
     if problem is not None:
         raise UsageError(f"network.kind = {kind!r}: {problem}")
     return module  # type: ignore[no-any-return]
