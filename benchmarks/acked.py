@@ -19,7 +19,7 @@ from pathlib import Path
 
 from journal import Service, settings
 from made_up import ATARI
-from power import mounted, options
+from power import mounted, options, snapshot
 
 from coop.replay.core import ReplayCore
 from coop.replay.persistence.recovery import recover
@@ -59,9 +59,8 @@ def cut(journal: str, folder: Path, cuts: int, rng: random.Random) -> list[tuple
             time.sleep(0.1)
         for number in range(cuts):
             time.sleep(rng.uniform(0.1, 0.8))
-            image, acked = folder / f"cut{number}.img", service.acked
-            subprocess.run(["cp", "--sparse=always", str(disk), str(image)], check=True)
-            copies.append((image, acked))
+            image = folder / f"cut{number}.img"
+            copies.append((image, snapshot(disk, image, service.pid, lambda: service.acked)))
         done.set()
         writer.join()
     found = []

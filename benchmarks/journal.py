@@ -90,8 +90,13 @@ class Service:
         """Transitions acknowledged so far."""
         return self._client.acked
 
+    @property
+    def pid(self) -> int:
+        """The process of the replay service."""
+        return self._process.pid
+
     def _processor_time(self) -> float:
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / TICKS
 
     def _save(self) -> None:

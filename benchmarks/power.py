@@ -1,9 +1,9 @@
 """Cuts the power of runs: `python benchmarks/power.py --cuts 100`; needs root, for loop mounts.
 
 A run, a run over processes with a journal, and a sweep write to an ext4 file system of their own. Its image is copied
-at random moments while they go on: what had not reached the disk is not in the copy. Each copy is mounted, which
-replays the file system's journal, and the run is resumed on it. The table says of each kind how many could be
-resumed, whether a cell of a sweep counts as finished although its files are not, and how many steps were lost.
+at random moments: what had not reached the disk is not in the copy. Each copy is mounted, which replays the file
+system's journal, and the run is resumed on it. The table says of each kind how many could be resumed, whether a cell of
+a sweep counts as finished although its files are not, and how many steps were lost.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from coop.common.process.processes import command
 
@@ -31,6 +32,8 @@ GRID = 'preset = "cartpole"\nmethods = ["dqn"]\nseeds = {seeds}\n[fixed]\ntotal_
 LONG = ("--preset=cartpole", "--total-steps=2000000", f"--checkpoint-every={EVERY}", "--network.hidden=8")
 MIB = 96
 RESUMED = 40.0  # seconds to go on, on a busy machine
+
+T = TypeVar("T")
 
 
 def main() -> None:
@@ -80,8 +83,7 @@ def cut(kind: str, folder: Path, cuts: int, rng: random.Random) -> tuple[list[st
             for number in range(few):
                 time.sleep(rng.uniform(0.2, 2.5))
                 image = folder / f"cut{number}.img"
-                subprocess.run(["cp", "--sparse=always", str(disk), str(image)], check=True)
-                images.append((image, steps(kind, at)))
+                images.append((image, snapshot(disk, image, process.pid, lambda: steps(kind, at))))
         for image, before in images:
             with mounted(image, folder / "c"):
                 problem, after, wrong = resume(kind, folder / "c", folder)
@@ -92,6 +94,38 @@ def cut(kind: str, folder: Path, cuts: int, rng: random.Random) -> tuple[list[st
                 losses.append(max(0, before - after))
         done += few
     return problems, losses, false
+
+
+def snapshot(disk: Path, image: Path, pid: int, look: Callable[[], T]) -> T:
+    """Copy a disk as it is at one moment; return what was to be seen then.
+
+    The process that writes to it and its descendants are stopped meanwhile: of a disk that changes while it is copied,
+    the parts would be of different moments, which no power cut leaves.
+    """
+    with frozen(pid):
+        seen = look()
+        while True:
+            subprocess.run(["cp", "--sparse=always", str(disk), str(image)], check=True)
+            if subprocess.run(["cmp", "--silent", str(disk), str(image)], check=False).returncode == 0:
+                return seen  # the kernel wrote nothing either
+
+
+@contextlib.contextmanager
+def frozen(pid: int) -> Iterator[None]:
+    """Stop a process and its descendants; let them go on at the end."""
+    stopped, family = [], [pid]
+    while family:
+        with contextlib.suppress(OSError):
+            os.kill(member := family.pop(), signal.SIGSTOP)
+            stopped.append(member)
+            for started in Path(f"/proc/{member}/task").glob("*/children"):
+                family += map(int, started.read_text().split())
+    try:
+        yield
+    finally:
+        for member in stopped:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(member, signal.SIGCONT)
 
 
 @contextlib.contextmanager
@@ -200,15 +234,14 @@ def resume_sweep(at: Path, folder: Path) -> tuple[str, int, int]:
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
     assert process.stdout is not None
-    process.stdout.readline()  # the settings
-    line = process.stdout.readline()
+    lines = [process.stdout.readline() for _ in range(2)]  # the first one: the settings
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    found = re.search(r"(\d+) of them finished before", line)
+    found = re.search(r"(\d+) of them finished before", lines[1])
     if found is None:
-        return f"sweep: {line}", 0, 0
+        return f"sweep: {' '.join(lines)}", 0, 0
     whole = 0
     for summary in at.glob("sweep/*/summary.json"):
         with contextlib.suppress(ValueError, KeyError, OSError):
