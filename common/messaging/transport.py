@@ -49,6 +49,10 @@ class NoAnswer(RunError):
     """No process answered a query in time; the caller decides whether to ask again."""
 
 
+class Unreadable(NoAnswer):
+    """What answered speaks another language: a program that is none of this run's."""
+
+
 class Refused(RunError):
     """The peer rejected the message as invalid or could not fulfil the request, and gave the reason."""
 
@@ -369,6 +373,7 @@ def _answer(reply: zenoh.Reply, run: str) -> Message:
     except BadMessage as error:
         if error.field == "protocol":  # asking again would not help
             raise Refused(str(error)) from error
-        text = f"an answer that can't be read: {error}" if reply.ok is not None else raw.decode(errors="replace")
-        raise NoAnswer(text) from error
+        if reply.ok is not None:
+            raise Unreadable(f"an answer that can't be read: {error}") from error
+        raise NoAnswer(raw.decode(errors="replace")) from error
     raise Refused(problem)
