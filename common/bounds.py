@@ -19,6 +19,7 @@ MAX_SIDE = 65_536  # values of a frame along one dimension
 MAX_ACTIONS = 100_000
 
 MAX_PAYLOAD = 1 << 28  # bytes of a message; a session accepts no larger one from a peer
+MAX_QUESTION = 1 << 20  # bytes of one that carries no segment, batch, network or video
 MAX_LAYERS = 64  # hidden layers of a network
 MAX_STEPS = 10**12  # environment steps of a run
 MAX_COUNT = 2**40  # steps of an actor, segments of a stream, episodes: a little above MAX_STEPS

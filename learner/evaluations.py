@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from queue import Empty, SimpleQueue
 
+from coop.common.bounds import MAX_QUESTION, MAX_VIDEO
 from coop.common.errors import RunError
 from coop.common.messaging.keys import evaluations_key
 from coop.common.messaging.messages.answers import Ack
@@ -25,7 +26,7 @@ class EvaluationInbox:
         self._env_step = env_step
         self._results: SimpleQueue[EvaluationRow | Video] = SimpleQueue()
         self._next: dict[int, int] = {}  # number of the result that follows, by incarnation
-        node.serve(evaluations_key(node), self._answer)
+        node.serve(evaluations_key(node), self._answer, most=MAX_QUESTION + MAX_VIDEO)
 
     def take(self) -> Iterator[EvaluationRow | Video]:
         """Yield the results and videos that have arrived since the last call."""

@@ -98,7 +98,7 @@ class JoinService:
     def connected(self) -> dict[str, int]:
         """Number of connected processes by role; a replay service that was not admitted does not count."""
         counts = {**dict.fromkeys(ROLES, 0), **self._node.presence.counts()}
-        return {**counts, "replay": int(self._roster.serving in self._replays_there())}
+        return {**counts, "replay": int(self._roster.serving in self._there("replay"))}
 
     def _answer(self, key: str, message: Message) -> bytearray:
         if message.kind == Leave.kind:
@@ -118,6 +118,8 @@ class JoinService:
         names = {"actor": f"actor {index}", "evaluator": "evaluator"}
         if request.role in names or request.endpoints:
             self.members.add(request, names.get(request.role, "replay service"))
+            if (there := self.members.forget(self._there)) is not None:
+                self._roster.forget(there)
         reply = JoinReply(
             self._config,
             self._spec,
@@ -133,12 +135,14 @@ class JoinService:
 
     def _admit(self, request: Join) -> int:
         """Admit a replay service, and send actors to it; return its number. Raises as `Roster.replay`."""
-        index = self._roster.replay(request, self._node.now(), self._replays_there())
+        index = self._roster.replay(request, self._node.now(), self._there("replay"))
         self._replay_endpoints, self._replay = request.endpoints, request.origin
         return index
 
-    def _replays_there(self) -> set[int]:
-        return {int(incarnation, 16) for incarnation in self._node.presence.members("replay")}
+    def _there(self, *roles: str) -> set[int]:
+        """The incarnations of connected processes, of these roles if any are named."""
+        members = self._node.presence.members
+        return {int(incarnation, 16) for role in roles or ROLES for incarnation in members(role)}
 
     def _leave(self, key: str, incarnation: int) -> bytearray:
         if incarnation == self._roster.serving:

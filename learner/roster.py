@@ -15,13 +15,14 @@ from pathlib import Path
 from coop.common.errors import BadMessage, RunError
 from coop.common.messaging.members import ROLES, Origin
 from coop.common.messaging.messages.control import Join
-from coop.common.messaging.messages.status import ActorStatus, Member
+from coop.common.messaging.messages.status import MAX_MISSING, ActorStatus, Member
 from coop.common.messaging.timing import FORGOTTEN, LEASE
 from coop.common.process.files import sealed, unsealed, write_atomic
 from coop.common.process.untrusted import MAX_SETTINGS, read_bytes
 from coop.records.run_ids import check_owner
 
 ROSTER = "roster.json"
+MOST_KEPT = 4096  # members that are remembered before those that are gone are forgotten
 RESERVE = 8  # a roster of n actors saves n / 8 numbers in advance, which a restarted learner leaves out
 
 
@@ -123,6 +124,11 @@ class Roster:
             self._confirmed = now
             return self._entries.replays - 1
 
+    def forget(self, there: Collection[int]) -> None:
+        """Forget the actors' numbers but those of these incarnations; an actor that has one names it itself."""
+        with self._lock:
+            self._actors = {who: number for who, number in self._actors.items() if who in there}
+
     def dismiss(self, incarnation: int) -> None:
         """Note that a replay service has stopped acknowledging: another one may follow as soon as it is gone."""
         with self._lock:
@@ -166,6 +172,7 @@ class MemberTracker:
         self._leaving: set[int] = set()
         self._away: set[int] = set()
         self._lost: dict[int, float] = {}  # members away that no other has replaced, and since when
+        self._most = MOST_KEPT
 
     def add(self, request: Join, name: str) -> None:
         """Note a join: the first of a process, or one after the learner's restart."""
@@ -179,6 +186,24 @@ class MemberTracker:
                 del self._lost[replaced]
             listens = f"; it listens on {', '.join(request.endpoints)}" if request.endpoints else ""
             self._event(f"{self._joined[who]} {'joined' if request.index < 0 else 'is back'}{listens}")
+
+    def forget(self, present: Callable[[], Collection[int]]) -> Collection[int] | None:
+        """Forget those whose tokens are gone, once there are too many members; return the others then.
+
+        present: returns the incarnations whose tokens exist.
+        """
+        with self._lock:
+            if len(self._joined) <= self._most:
+                return None
+            there = present()
+            for who in self._joined.keys() - there:
+                del self._joined[who]
+                self._actors.pop(who, None)
+                self._lost.pop(who, None)
+            self._leaving &= self._joined.keys()
+            self._away &= self._joined.keys()
+            self._most = max(MOST_KEPT, 2 * len(self._joined))
+            return there
 
     def leaving(self, incarnation: int) -> None:
         """Note that a process is about to end properly."""
@@ -216,9 +241,9 @@ class MemberTracker:
                 self._actors[incarnation] = status
 
     def missing(self, now: float) -> list[str]:
-        """Names of the lost members that no other of their role has replaced."""
+        """Names of the lost members that no other of their role has replaced, at most `MAX_MISSING`."""
         with self._lock:
-            return [str(self._joined[who]) for who in self._missing(now)]
+            return [str(self._joined[who]) for who in self._missing(now)[:MAX_MISSING]]
 
     def listed(self, now: float, most: int) -> list[Member]:
         """The missing members, the replay service and the other roles, each in the order in which they joined.

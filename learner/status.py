@@ -31,6 +31,7 @@ from coop.learner.trainer import Trainer
 
 SPEED_OVER = 2.0  # seconds
 TIME_LEFT_OVER = 30.0  # seconds whose speed gives the time left
+MEMBERS_EVERY = 0.1  # seconds between statuses for the sake of members alone
 SHORTEST_WAIT = 0.05  # share of the time below which nobody counts as waiting
 
 
@@ -49,6 +50,7 @@ class StatusReporter:
         self._join_service = join_service
         self._console = console
         self.status: LearnerStatus | None = None
+        self._members_due = 0.0
         self._origin = Origin.here()
         self._steps_per_s, self._updates_per_s = Rate(SPEED_OVER), Rate(SPEED_OVER)
         self._slow_steps_per_s, self._slow_updates_per_s = Rate(TIME_LEFT_OVER), Rate(TIME_LEFT_OVER)
@@ -97,8 +99,12 @@ class StatusReporter:
         return self.status
 
     def publish_members(self, now: float) -> None:
-        """Publish the last status again, with the present members; may be called by another thread."""
-        if self.status is not None:
+        """Publish the last status again, with the present members; may be called by another thread.
+
+        Not at each call, if there are many: the next status of `publish` has what is left out.
+        """
+        if self.status is not None and now >= self._members_due:
+            self._members_due = now + MEMBERS_EVERY
             self._node.publish_status(msgspec.structs.replace(self.status, **self._members(now)))
 
     def _members(self, now: float) -> dict[str, Any]:

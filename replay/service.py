@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from coop.common.bounds import MAX_PAYLOAD
 from coop.common.errors import BadMessage, CoopError, RunError
 from coop.common.messaging.conversation import Conversation
 from coop.common.messaging.keys import replay_key
@@ -73,8 +74,9 @@ class ReplayService:
     def start(self) -> None:
         """Begin to answer requests."""
         node = self._node
-        node.serve(replay_key(node, "insert"), self._insert, self._flush if self._synced else None, self._changed)
-        node.serve(replay_key(node, "sample"), self._sample, changed=self._changed)
+        flush = self._flush if self._synced else None
+        node.serve(replay_key(node, "insert"), self._insert, flush, self._changed, MAX_PAYLOAD)
+        node.serve(replay_key(node, "sample"), self._sample, changed=self._changed, most=MAX_PAYLOAD)
         node.serve(replay_key(node, "stats"), self._stats)
         node.serve(replay_key(node, "limits"), self._limits)
         node.serve(replay_key(node, "snapshot"), self._snapshot, changed=self._changed)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zenoh
 from msgspec.structs import replace
 from samples import await_service, make_segment
 
@@ -193,6 +194,23 @@ def test_who_joins_and_leaves_is_told(nodes: tuple[Node, Node], spec: EnvSpec, m
         "replay service on rep (pid 7) joined; it listens on tcp/rep:1",
         "replay service on rep (pid 8) joined; it listens on tcp/rep:1",
     ]
+
+
+def test_who_hears_nonsense_leaves_at_once(nodes: tuple[Node, Node]) -> None:
+    learner, actor = nodes
+    key = join_key(actor, "actor")
+
+    def nonsense(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, b"nonsense")
+
+    learner.session.declare_queryable(key, nonsense, complete=True)
+    await_service(actor, key)
+    with pytest.raises(JoinError, match="no learner of run 'test' found"):
+        join(actor, Stop(), Join("actor", 3, []), (), 0.3)
+    began = time.monotonic()
+    leave_run(actor, Join("actor", 3, []))
+    assert time.monotonic() - began < 5, "of the time for a learner that is busy"
 
 
 def test_the_limiter_changes_while_the_run_goes_on(nodes: tuple[Node, Node], spec: EnvSpec, tmp_path: Path) -> None:

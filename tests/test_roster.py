@@ -8,9 +8,10 @@ import coop.learner.roster
 from coop.common.errors import BadMessage, RunError
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.control import Join
+from coop.common.messaging.messages.status import MAX_MISSING
 from coop.common.messaging.timing import LEASE
 from coop.common.process.files import write_atomic
-from coop.learner.roster import AlreadyServed, Roster
+from coop.learner.roster import AlreadyServed, MemberTracker, Roster
 
 
 def actor(incarnation: int, index: int = -1) -> Join:
@@ -98,3 +99,28 @@ def test_a_roster_that_can_t_be_kept_or_read(tmp_path: Path) -> None:
         with pytest.raises(RunError, match=r"roster\.json: wrong checksum"):
             Roster(tmp_path)
         assert file.read_text() == damaged
+
+
+def test_members_that_are_gone_are_not_remembered_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of actors that join and are killed, or only ask, neither memory nor a status keeps all."""
+    monkeypatch.setattr(coop.learner.roster, "MOST_KEPT", 1100)
+    events: list[str] = []
+    roster, members = Roster(tmp_path), MemberTracker(events.append)
+    there = {0, 1}
+    for incarnation in range(3000):
+        request = actor(incarnation)
+        members.add(request, f"actor {roster.actor(request)}")
+        members.token("actor", incarnation, True, 0.0)
+        if incarnation not in there:
+            members.token("actor", incarnation, False, 0.0)
+            members.leaving(incarnation)
+        if (kept := members.forget(lambda: there)) is not None:
+            roster.forget(kept)
+    assert len(members._joined) <= 1100 >= len(roster._actors)
+    assert len(members._lost) <= 1100 >= len(members._away)
+    assert len(members.missing(0.0)) <= MAX_MISSING
+    assert [member.name for member in members.listed(100.0, 8)][:2] == ["actor 0", "actor 1"], "those that are there"
+    assert [roster.actor(actor(who)) for who in (0, 1, 20_000)] == [0, 1, 3000]
+    members.token("actor", 1, False, 100.0)
+    assert events[-1].endswith("does not answer")
+    assert (tmp_path / coop.learner.roster.ROSTER).stat().st_size < 200

@@ -1,5 +1,6 @@
 """Searches by Optuna over real runs, and the tables of all runs of a folder."""
 
+import importlib
 import os
 import runpy
 import subprocess
@@ -11,9 +12,11 @@ from typing import Any
 import optuna
 import pytest
 from commands import Command
+from sqlalchemy import event
 
 import coop
 from coop.common.errors import RunError, UsageError
+from coop.studies import tuning
 from coop.studies.report.packing import pack
 from coop.studies.tuning import Space
 
@@ -201,6 +204,22 @@ def test_workers_run_at_once_and_two_processes_share_a_search(tmp_path: Path) ->
         assert summary is not None
         assert trial.value == pytest.approx(summary["return_mean_100"])
         assert (summary["exit"], summary["env_steps"]) == ("complete", 1_500)
+
+
+@pytest.mark.parametrize("url", [False, True])
+def test_a_storage_that_another_process_makes_meanwhile(url: bool, tmp_path: Path) -> None:
+    """Once it is seen which tables lack, and before they are made, another process makes them."""
+    file = tmp_path / "optuna.db"
+    tables = importlib.import_module("optuna.storages._rdb.models").BaseModel.metadata
+
+    @event.listens_for(tables, "before_create", once=True)
+    def another(*_: object, **__: object) -> None:
+        made = "import optuna, sys; optuna.create_study(storage=sys.argv[1], study_name='mine', direction='maximize')"
+        subprocess.run([sys.executable, "-c", made, f"sqlite:///{file}"], check=True)
+
+    study = tuning._study(f"sqlite:///{file}" if url else file, "mine", None)
+    assert study.study_name == "mine"
+    assert [each.study_name for each in optuna.get_all_study_summaries(f"sqlite:///{file}")] == ["mine"]
 
 
 class Second(optuna.pruners.BasePruner):

@@ -13,6 +13,7 @@ from typing import Any
 from benchmarks.simulate.network import Link, Network
 from benchmarks.simulate.server import Server
 from benchmarks.simulate.world import Activity, Process, Violation
+from coop.common.bounds import MAX_QUESTION
 from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.conversation import Conversation
@@ -224,8 +225,9 @@ class SimNode:
         answer: Callable[[Message], bytearray | Conversation[bytearray]],
         flush: Callable[[], bytearray | None] | None = None,
         changed: threading.Condition | None = None,
+        most: int = MAX_QUESTION,
     ) -> None:
-        """See `Node`."""
+        """See `Node`; no message here is long."""
         self._servers[key] = Server(self, key, answer, flush)
         if changed is not None:
             changed.notify_all = self._changed  # type: ignore[method-assign]

@@ -21,7 +21,7 @@ from coop.common.messaging.timing import (
     LEAVE_WITHIN,
     RETRY_PAUSE,
 )
-from coop.common.messaging.transport import NoAnswer, Node, Refused
+from coop.common.messaging.transport import NoAnswer, Node, Refused, Unreadable
 from coop.common.process.console import PeerMonitor, StallDetector
 from coop.common.process.lifecycle import Stop
 from coop.common.settings.tables import first_difference, identity
@@ -126,6 +126,8 @@ def leaving(node: Node, request: Join) -> Conversation[None]:
             message = yield from asking(node, join_key(node, request.role), payload, JOIN_ANSWER)
             if message.kind != Retry.kind:
                 return
+        except Unreadable:
+            return
         except NoAnswer:
             if not node.presence.members("learner"):
                 return

@@ -13,13 +13,16 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import partial
 from types import TracebackType
 from typing import Any, Self, TypeAlias
 
 import zenoh
 
+from coop.common.bounds import MAX_PAYLOAD, MAX_QUESTION
 from coop.common.errors import BadMessage, CoopError, RunError
 from coop.common.messaging import wire
+from coop.common.messaging.backlog import QUEUE, Backlog, relieve
 from coop.common.messaging.conversation import Conversation, Task, drive_held, start
 from coop.common.messaging.faults import Faults
 from coop.common.messaging.keys import run_key, stop_key
@@ -36,7 +39,6 @@ from coop.common.process.lifecycle import Stop
 
 MOST_REFUSALS = 8  # lines that say what is wrong with messages of one key
 LONGEST_REFUSAL = 200  # characters
-QUEUE = 1 << 14  # queries that wait for an answer: one more blocks Zenoh's thread, which receives everything else
 
 
 _Waiting: TypeAlias = "queue.SimpleQueue[tuple[Any, bytearray] | None]"
@@ -45,6 +47,10 @@ _Waiting: TypeAlias = "queue.SimpleQueue[tuple[Any, bytearray] | None]"
 
 class NoAnswer(RunError):
     """No process answered a query in time; the caller decides whether to ask again."""
+
+
+class Unreadable(NoAnswer):
+    """What answered speaks another language: a program that is none of this run's."""
 
 
 class Refused(RunError):
@@ -133,7 +139,8 @@ class Node:
         self._refusals: dict[str, set[str]] = {}  # fields named in lines so far, by key
         self._name = f"{role}/{incarnation:x}"
         self._threads: list[threading.Thread] = []
-        self._closing = False
+        self._closing = threading.Event()
+        self._backlogs: list[Backlog] = []
         self._status = session.declare_publisher(self.key("metrics", self._name))
         self.presence = Presence()
         self.presence.watch(session, self.key("alive"), self.faults, self.count_bad)
@@ -181,16 +188,19 @@ class Node:
         answer: Callable[[Message], bytearray | Conversation[bytearray]],
         flush: Callable[[], bytearray | None] | None = None,
         changed: threading.Condition | None = None,
+        most: int = MAX_QUESTION,
     ) -> None:
         """Answer the queries on `key`, one after another, in a new thread, until the session closes.
 
         flush: called in another thread before replies leave, once for all that wait then; returns what leaves in place
             of each, or None if they may leave.
         changed: answers are conversations, which wait for changes of what this guards, and hold it otherwise.
+        most: bytes of a message.
 
-        A message that cannot be decoded, names another run, or makes `answer` raise BadMessage gets an error reply, is
-        counted, and changes nothing. Any other CoopError of `answer` also becomes an error reply, and so does any
-        other exception, which is a bug and is noted in `faults`.
+        A message that is too long, cannot be decoded, names another run, or makes `answer` raise BadMessage gets an
+        error reply, is counted, and changes nothing. Any other CoopError of `answer` also becomes an error reply, and
+        so does any other exception, which is a bug and is noted in `faults`. Of the messages that wait, those that
+        would be too many, or take too much memory, are counted too and get no reply, see `Backlog`.
         """
         queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(QUEUE), complete=True)
         waiting: _Waiting | None = None
@@ -205,7 +215,10 @@ class Node:
             assert changed is not None
             return drive_held(given, changed)
 
-        self._start(f"serve {key}", self._serve, queryable, key, answered, waiting)
+        if not self._backlogs:
+            self._start("relieve", relieve, self._backlogs, self._closing)
+        self._backlogs.append(backlog := Backlog(queryable, partial(self.count_bad, key)))
+        self._start(f"serve {key}", self._serve, backlog, key, answered, waiting, most)
 
     def _start(self, name: str, target: Callable[..., None], *args: Any) -> None:  # noqa: ANN401
         thread = threading.Thread(target=target, args=args, name=name, daemon=True)
@@ -214,18 +227,19 @@ class Node:
 
     def _serve(
         self,
-        queryable: Any,  # noqa: ANN401 (zenoh's have no public name)
+        backlog: Backlog,
         key: str,
         answer: Callable[[Message], bytearray],
         waiting: _Waiting | None,
+        most: int,
     ) -> None:
-        while not self._closing:
+        while not self._closing.is_set():
             try:
-                query = queryable.recv()
+                query = backlog.next()
             except zenoh.ZError:  # the session was closed
                 break
             try:
-                answered = answer(self.read(query.payload))
+                answered = answer(self.read(query.payload, most))
             except Exception as error:
                 if isinstance(error, BadMessage):
                     self.count_bad(key, error)
@@ -251,8 +265,10 @@ class Node:
             for query, answered in group:
                 _reply(key, query, answered if instead is None else instead)
 
-    def read(self, payload: zenoh.ZBytes | None) -> Message:
-        """Decode a payload of this run; raises BadMessage."""
+    def read(self, payload: zenoh.ZBytes | None, most: int = MAX_PAYLOAD) -> Message:
+        """Decode a payload of this run, of at most so many bytes; raises BadMessage."""
+        if payload is not None and len(payload) > most:  # it is not copied, so any number of them costs nothing
+            raise BadMessage("payload", f"{len(payload)} bytes; allowed here: at most {most}")
         return check_run(wire.decode(b"" if payload is None else payload.to_bytes()), self.run)
 
     def count_bad(self, place: str, error: BadMessage) -> None:
@@ -279,7 +295,8 @@ class Node:
 
     def publish_status(self, status: Status) -> None:
         """Publish this process's status for displays."""
-        self._status.put(status.encode(self.run))
+        with contextlib.suppress(zenoh.ZError):  # the session is being closed, as other threads publish theirs too
+            self._status.put(status.encode(self.run))
 
     def latest(self, key: str) -> Latest:
         """Subscribe to a key of which only the latest value matters."""
@@ -298,7 +315,7 @@ class Node:
 
         def received(sample: zenoh.Sample) -> None:
             try:
-                call(str(sample.key_expr), self.read(sample.payload))
+                call(str(sample.key_expr), self.read(sample.payload, MAX_QUESTION))
             except BadMessage as error:
                 self.count_bad(key, error)
 
@@ -306,7 +323,7 @@ class Node:
 
     def close(self) -> None:
         """Close the session and wait for the serving threads."""
-        self._closing = True
+        self._closing.set()
         close(self.session)
         for thread in self._threads:
             thread.join()
@@ -356,6 +373,7 @@ def _answer(reply: zenoh.Reply, run: str) -> Message:
     except BadMessage as error:
         if error.field == "protocol":  # asking again would not help
             raise Refused(str(error)) from error
-        text = f"an answer that can't be read: {error}" if reply.ok is not None else raw.decode(errors="replace")
-        raise NoAnswer(text) from error
+        if reply.ok is not None:
+            raise Unreadable(f"an answer that can't be read: {error}") from error
+        raise NoAnswer(raw.decode(errors="replace")) from error
     raise Refused(problem)

@@ -204,6 +204,8 @@ def decode(payload: bytes) -> Message:
         name, dtype, shape, offset, _ = next(each for each in table.places if each.nbytes and each.end == table.size)
         where = f"{dtype.name}{list(shape)} at {offset}"
         raise BadMessage(f"arrays.{name}", f"{where} reaches beyond the payload's {len(payload)} bytes")
+    if len(payload) > start + _aligned(table.size):
+        raise BadMessage("payload", f"{len(payload)} bytes; its arrays end after {start + table.size}")
     arrays = {
         name: np.ndarray(shape, dtype, payload, start + offset) if end > offset else np.empty(shape, dtype)
         for name, dtype, shape, offset, end in table.places

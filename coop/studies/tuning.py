@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 STORAGE = "optuna.db"
 TICK = 0.2  # seconds
+TRIES = 25  # to make a storage's tables while others do
 MOST_SEED = 2**31  # of the sampler, to which the number of trials is added; numpy takes 32 bits
 REPORTS = 20  # of a run, to the pruner, at equal distances in environment steps
 GRACE = 60.0  # seconds for the runs to save their state
@@ -83,10 +84,7 @@ def tune(
     space = Space(grid)
     file = _file_in(path)
     with _storing(storage or str(file)):
-        study = optuna.create_study(
-            storage=storage or _sqlite(file), study_name=path.name, direction="maximize",
-            load_if_exists=True, pruner=pruner,
-        )  # fmt: skip
+        study = _study(storage or file, path.name, pruner)
         # Another seed after each interruption: the same one would draw the same settings again.
         study.sampler = sampler or optuna.samplers.TPESampler(seed=seed + len(study.trials))
         search = _Search(study, space, path, workers or cores())
@@ -107,6 +105,27 @@ def _file_in(folder: Path) -> Path:
     except OSError as error:
         raise UsageError(f"folder {folder}: {error.strerror}") from error
     return file
+
+
+def _study(storage: str | Path, name: str, pruner: optuna.pruners.BasePruner | None) -> optuna.Study:
+    """The study of this name, which it creates in a storage, by its URL or file, that may be new as well.
+
+    Of several processes that make a storage's tables at once, Optuna fails in all but one.
+    """
+    import optuna  # noqa: PLC0415 (an extra)
+    from sqlalchemy.exc import IntegrityError, SQLAlchemyError  # noqa: PLC0415
+
+    for left in reversed(range(TRIES)):
+        try:
+            return optuna.create_study(
+                storage=_sqlite(storage) if isinstance(storage, Path) else storage, study_name=name,
+                direction="maximize", load_if_exists=True, pruner=pruner,
+            )  # fmt: skip
+        except SQLAlchemyError as error:
+            if not left or not (isinstance(error, IntegrityError) or "already exists" in str(error)):
+                raise
+            time.sleep(TICK)
+    raise AssertionError
 
 
 def _sqlite(file: Path) -> optuna.storages.RDBStorage:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from coop.common.bounds import MAX_MAGNITUDE, MAX_SEGMENT_STEPS
+from coop.common.bounds import MAX_MAGNITUDE, MAX_N_STEP, MAX_SEGMENT_STEPS
 from coop.common.errors import BadMessage
 from coop.common.messaging import wire
 from coop.common.messaging.messages.body import Layout, check_kind, to_struct
@@ -66,6 +66,8 @@ class SegmentReader:
         steps, frames = lengths["steps"], lengths["frames"]
         if not 1 <= steps <= MAX_SEGMENT_STEPS:
             raise BadMessage("arrays.actions", f"{steps} steps; allowed: 1 to {MAX_SEGMENT_STEPS}")
+        if frames > (most := (self._spec.stack + 1) * (steps + 2 * MAX_N_STEP)):  # with those of steps that wait
+            raise BadMessage("arrays.frames", f"{frames} frames of {steps} steps; at most {most}")
         check_indices(message.arrays, frames)
         check_values(self._spec, message.arrays)
         segment = to_struct(message, Segment, self._layout)

@@ -21,6 +21,7 @@ from coop.common.metrics import MEASURED
 
 KIND = "status"
 MAX_MEMBERS = 256  # listed in one status
+MAX_MISSING = 1024  # named in one status
 
 Counts = Annotated[list[Counter], Meta(max_length=64)]
 Returns = Annotated[list[Real], Meta(max_length=MAX_POINTS)]
@@ -160,7 +161,7 @@ class LearnerStatus(Status, frozen=True):
     waiting: Text
     connected: dict[Name, Counter]
     warning: Text
-    missing: Annotated[list[Text], Meta(max_length=1024)]
+    missing: Annotated[list[Text], Meta(max_length=MAX_MISSING)]
     events: Annotated[list[tuple[int, Text]], Meta(max_length=64)]
     origin: Text
     env: Name = ""
