@@ -35,7 +35,11 @@ from coop.records.summaries import Summary, read_summary
 pytest.importorskip("numba")
 
 OF_TIME = ("time", "updates_per_s", "env_steps_per_s")
-SMALL: dict[str, Any] = {"replay": {"capacity": 100, "learning_starts": 50}, "total_steps": 2000}
+SMALL: dict[str, Any] = {
+    "replay": {"capacity": 100, "learning_starts": 50},
+    "network": {"hidden": [32, 32, 32]},
+    "total_steps": 2000,
+}
 
 
 def config_of(method: str, *changes: dict[str, Any]) -> RunConfig:
@@ -89,7 +93,7 @@ def assert_same(one: Lockstep, other: Lockstep) -> None:
 
 CASES = {
     "dqn": ("dqn",),
-    "coop": ("coop",),
+    "coop": ("coop", {"network": {"hidden": [128, 128, 128]}}),
     "edql, other layers, s constant": ("edql", {"network": {"hidden": [48, 32]}, "edl": {"noise": "constant"}}),
     "g-coop, fifo, single": ("g-coop", {"learner": {"double": False, "loss": "huber"}, "replay": {"eviction": "fifo"}}),
     "half of the updates": ("dqn", {"replay": {"ratio": 0.5}, "learner": {"swap_every": 50}}),
