@@ -26,6 +26,7 @@ S = 0.1
 FIRST = 20  # updates
 CASES = {"transform, constant s": ("transform", False), "transform, s ~ N(0, 1)": ("transform", True),
          "weight-gradient, constant s": ("weight-gradient", False)}  # fmt: skip
+FEEDBACKS = {feedback for feedback, _ in CASES.values()}
 
 
 def transitions(number: int) -> tuple[Tensor, ...]:
@@ -83,9 +84,10 @@ def measure(updates: int) -> pd.DataFrame:
             error[torch.arange(BATCH), actions] = (values[torch.arange(BATCH), actions] - wanted) / BATCH
         plain = edl_gradients(network, obs, error, 0.0, "none")
         step = steps["none"](plain)
+        at_s = {feedback: edl_gradients(network, obs, error, S, feedback) for feedback in FEEDBACKS}
         for case, (feedback, drawn) in CASES.items():
-            s = S * generator.standard_normal() if drawn else S
-            driven = edl_gradients(network, obs, error, s, feedback)
+            share = generator.standard_normal() if drawn else 1.0  # gradients are linear in s
+            driven = {name: plain[name] + share * (gradient - plain[name]) for name, gradient in at_s[feedback].items()}
             of_case = steps[case](driven)
             when = "first" if update < FIRST else "later" if update >= updates // 2 else ""
             if when:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
-from forked import SERVER, become
+from forked import become, forked_process
 
 
 class Command:
@@ -36,10 +36,7 @@ class Command:
         files = [Path(self._folder.name, stream) for stream in ("out", "err")]
         self._files = files if out is None else [out, out if out.is_char_device() else files[1]]
         variables = dict(os.environ if environment is None else environment)
-        self._process = SERVER.Process(
-            target=_run, args=(self.arguments, str(cwd or Path.cwd()), variables, self._files, nohup)
-        )
-        self._process.start()
+        self._process = forked_process(_run, self.arguments, str(cwd or Path.cwd()), variables, self._files, nohup)
         assert self._process.pid is not None
         self.pid = self._process.pid
 

@@ -1,5 +1,6 @@
 """Fixtures of real Zenoh sessions, and the check that a test session leaves nothing behind."""
 
+import gc
 import json
 import os
 import shutil
@@ -16,7 +17,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 import torch
-from forked import SERVER, forked_children, serve
+from forked import forked_children, forked_process, serve
 
 from coop.common.messaging.conversation import RESTING
 from coop.common.messaging.session import open_session
@@ -25,6 +26,8 @@ from coop.common.process.limits import use_threads
 from coop.common.settings.methods import METHODS
 from coop.common.settings.policies import EVICTIONS, SAMPLERS
 from coop.common.types import EnvSpec
+
+gc.disable()  # until all tests are collected: of hundreds of thousands of objects none goes
 
 # torch.compile's own processes would outlive the tests.
 os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"
@@ -71,6 +74,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         limit = item.get_closest_marker("timeout")
         limits[item.path] = max(limits.get(item.path, 0.0), limit.args[0] if limit else 0.0)
     items.sort(key=lambda item: -limits[item.path])
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def _children() -> set[int]:
@@ -178,7 +186,7 @@ def quick_children() -> Iterator[None]:
     """Commands that this process starts as children are forks where torch has been imported."""
 
     def start(asking: socket.socket, requests: socket.socket) -> None:
-        SERVER.Process(target=serve, args=(requests,)).start()
+        forked_process(serve, requests)
 
     with forked_children(start):
         yield

@@ -16,8 +16,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import chdir, contextmanager, nullcontext
 from importlib.metadata import entry_points
+from multiprocessing.context import ForkServerProcess
+from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 from types import SimpleNamespace
 from typing import IO, Any
@@ -27,18 +29,20 @@ from coop.common.process.lifecycle import SUPERVISED
 
 TESTS = str(Path(__file__).parent)
 SERVER = multiprocessing.get_context("forkserver")
-SERVER.set_forkserver_preload(
-    [
-        *("coop.actors.cli", "coop.deploy.local", "coop.evaluation.cli", "coop.lockstep.cli", "coop.learner.process"),
-        *("coop.common.envs.gymnasium_env", "coop.evaluation.evaluate", "coop.lockstep.run", "coop.studies.sweep.cli"),
-        *("coop.records.sinks.tensorboard", "coop.studies.report.writer", "matplotlib.backends.backend_agg"),
-        *("matplotlib.figure", "matplotlib.style"),
-    ]
-)
+SERVER.set_forkserver_preload(["warm"])
 ADOPT, NAME = 36, 15  # PR_SET_CHILD_SUBREAPER, PR_SET_NAME
 LARGEST = 1 << 20  # bytes of a request
 POLL = 0.001  # seconds
 SUPERVISORS = ("coop-local", "coop-sweep")
+
+
+def forked_process(target: Callable[..., object], *args: object) -> ForkServerProcess:
+    """A started process, forked from the server, which finds its `warm` in the folder that it is started in."""
+    with chdir(TESTS):
+        ensure_running()
+    process = SERVER.Process(target=target, args=args)
+    process.start()
+    return process
 
 
 @contextmanager

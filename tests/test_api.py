@@ -21,10 +21,11 @@ from coop.lockstep import cli as lockstep_cli
 pytestmark = [pytest.mark.timeout(300), pytest.mark.usefixtures("quick_children")]
 
 SMALL = {"learning_starts": 50, "capacity": 200}
+NARROW = {"network": {"hidden": [16]}}
 
 
 def trained(path: Path, method: str = "coop", **settings: Any) -> coop.TrainingRun:
-    return coop.train(method=method, total_steps=400, run_dir=path, replay=SMALL, **settings)
+    return coop.train(**{"method": method, "total_steps": 400, "run_dir": path, "replay": SMALL, **NARROW, **settings})
 
 
 def test_a_run_in_the_background_gives_its_rows_and_its_summary(tmp_path: Path) -> None:
@@ -45,8 +46,15 @@ def test_a_run_in_the_background_gives_its_rows_and_its_summary(tmp_path: Path) 
 
 def test_training_equals_the_command_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained(tmp_path / "a", seed=1).wait()
-    flags = ["--preset=cartpole", "--method=coop", "--seed=1", "--total-steps=400", "--replay.capacity=200"]
-    monkeypatch.setattr("sys.argv", ["coop-lockstep", *flags, "--replay.learning-starts=50", f"--run-dir={tmp_path}/b"])
+    flags = [
+        "--preset=cartpole",
+        "--method=coop",
+        "--seed=1",
+        "--total-steps=400",
+        "--replay.capacity=200",
+        "--replay.learning-starts=50",
+    ]
+    monkeypatch.setattr("sys.argv", ["coop-lockstep", *flags, "--network.hidden=16", f"--run-dir={tmp_path}/b"])
     lockstep_cli.main()
     for name in ("config.toml", "episodes.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()

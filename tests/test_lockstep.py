@@ -123,7 +123,7 @@ def test_roles_in_processes_have_no_plays(name: str, flags: list[str], tmp_path:
     ],
 )
 def test_a_target_ends_the_run(flags: list[str], column: str, value: int, tmp_path: Path) -> None:
-    method = ["--method", "dqn", "--total-steps", "4000"]
+    method = ["--method", "dqn", "--total-steps", "4000", "--network.hidden", "16"]
     result = run_command("coop-lockstep", *method, *flags, "--run-dir", tmp_path / "run", check=True)
     name = flags[0].removeprefix("--").replace("-", "_")
     assert result.stdout.rstrip().splitlines()[-1].startswith(f"complete: {name} reached")

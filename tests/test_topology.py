@@ -96,15 +96,16 @@ def check_files(path: Path, steps: int, outcome: str = "complete") -> dict[str, 
 
 def test_coop_local_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run"
-    flags = ("--preset", "cartpole", "--actors", "2", "--seed", "3", "--total-steps", "1500", "--run-dir", str(path))
-    done = run("coop-local", *flags, "--replay.journal", "--checkpoint-every", "500")
+    flags = ("--preset", "cartpole", "--actors", "2", "--seed", "3", "--total-steps", "900", "--run-dir", str(path))
+    flags += ("--network.hidden", "32")
+    done = run("coop-local", *flags, "--replay.journal", "--checkpoint-every", "300")
     assert (done.returncode, done.stderr) == (0, "")
-    check_files(path, 1500)
+    check_files(path, 900)
     again = reexecute(path)
-    assert (again.began, again.updates, again.missing_segments) == (1000, 1372, 0)
+    assert (again.began, again.updates, again.missing_segments) == (600, 810, 0)
     rate = Agent._learning_rate
-    monkeypatch.setattr(Agent, "_learning_rate", lambda agent: rate(agent) * (1.01 if agent.updates == 1200 else 1))
-    with pytest.raises(RunError, match=r"^agent\.networks\[[01]\] differs from .*checkpoints/1372$"):
+    monkeypatch.setattr(Agent, "_learning_rate", lambda agent: rate(agent) * (1.01 if agent.updates == 700 else 1))
+    with pytest.raises(RunError, match=r"^agent\.networks\[[01]\] differs from .*checkpoints/810$"):
         reexecute(path)
     again = run("coop-local", *flags)
     assert again.returncode == 2
@@ -115,6 +116,7 @@ def test_coop_local_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_a_learner_reads_frames_in_the_memory_of_the_replay_service(tmp_path: Path) -> None:
     path = tmp_path / "run"
     flags = ("--preset", "catch", "--actors", "1", "--total-steps", "800", "--run-dir", str(path), "--shared-memory")
+    flags += ("--learner.batch-size", "4")
 
     def shared(pid: int) -> set[str]:
         """The memories that a process has mapped."""
@@ -147,6 +149,7 @@ def test_an_actors_emulators_act_in_groups(tmp_path: Path, endpoint: str) -> Non
     """All streams arrive, each whole: what it read is what the journal has, bit for bit."""
     path = tmp_path / "run"
     flags = ("--preset", "cartpole", "--total-steps", "1500", "--replay.journal", "--run-dir", str(path))
+    flags += ("--network.hidden", "32")
     actor = ("--connect", endpoint, "--envs", "5", "--groups", "2")
     with (
         Command("coop-local", "--actors", "0", "--listen", endpoint, *flags) as head,

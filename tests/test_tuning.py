@@ -182,7 +182,7 @@ def test_what_a_grid_s_fields_are_chosen_from(tmp_path: Path) -> None:
 
 def test_workers_run_at_once_and_two_processes_share_a_search(tmp_path: Path) -> None:
     """The second process waits for the trials of the first one; either may see first that one has ended."""
-    grid = {"fixed": {**FIXED, "total_steps": 1_500}, "vary": RATES}
+    grid = {"fixed": {**FIXED, "total_steps": 1_500, "network": {"hidden": [32]}}, "vary": RATES}
     url = f"sqlite:///{tmp_path / 'mine.db'}"
     call = f"coop.tune({grid!r}, {str(tmp_path / 'a')!r}, trials=2, workers=2, storage={url!r})"
     with subprocess.Popen([sys.executable, "-c", f"import coop; {call}"]) as other:

@@ -153,7 +153,15 @@ def parse(
         raise ProcessExit(0)
     try:
         with redirect_stderr(io.StringIO()):
-            options, unknown = read(args=args, registry=READERS, add_help=False, return_unknown_args=True)
+            # tyro shows no help, and need not look for its texts
+            options, unknown = read(
+                args=args,
+                registry=READERS,
+                add_help=False,
+                return_unknown_args=True,
+                description="",
+                config=(tyro.conf.HelptextFromCommentsOff,),
+            )
     except SystemExit:
         raise UsageError(_problem(args, _flags(parts()))) from None
     if unknown:

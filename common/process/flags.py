@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -119,8 +120,15 @@ def _sections(kind: type[Any], given: object, prefix: str = "") -> Iterator[Sect
 
 def _texts(kind: type[Any]) -> dict[str, str]:
     """The docstrings of a dataclass's fields, inherited ones included."""
-    found = [parse_from_object(each).params for each in reversed(kind.__mro__) if is_dataclass(each)]
-    return {each.arg_name: inspect.cleandoc(each.description or "") for params in found for each in params}
+    found = {}
+    for each in filter(is_dataclass, reversed(kind.__mro__)):
+        found.update(_own_texts(each))
+    return found
+
+
+@cache
+def _own_texts(kind: type[Any]) -> dict[str, str]:
+    return {each.arg_name: inspect.cleandoc(each.description or "") for each in parse_from_object(kind).params}
 
 
 def _default(field: Field[Any]) -> object:
