@@ -13,7 +13,7 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "coop_single_file.py"
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
 def test_the_single_file_plays_the_episodes_of_lockstep(method: str, tmp_path: Path) -> None:
-    steps = 2500
+    steps = 5000
     flags = ["--preset", "cartpole-paper", "--learner.optimizer", "rmsprop", "--method", method, "--seed", "1"]
     ended = run_command(
         "coop-lockstep", *flags, "--total-steps", str(steps), "--run-dir", tmp_path / "run", timeout=120
