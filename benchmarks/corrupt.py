@@ -88,7 +88,7 @@ DISTRIBUTED = (
     Reader("restore", ("{}",)),
 )
 STUDY = (
-    Reader("coop-report", ("{}", "--out", "{out}"), REPORTED, share=1),  # figures and processes take as long as ten others
+    Reader("coop-report", ("{}", "--out", "{out}"), REPORTED, share=1),  # figures, processes
     Reader("coop-report --curves", ("{}", "--curves", "{out}"), ("out/*/*.png",)),
     Reader("coop-sweep", ("{base}.toml", "--dir", "{}", "--jobs", "1"), ("*/episodes.csv",), share=1),
 )
@@ -126,8 +126,8 @@ def prepare(folder: Path) -> dict[str, tuple[Reader, ...]]:
         flags = (*RUN, *SIZED[:1], f"--seed={seed}", f"--run-dir={folder / name}", "--actors=1")
         call("coop-local", *flags, "--replay.journal", "--replay.journal-keep")
     for name, seeds in (("study", "[0, 1]"), ("study-other", "[2, 3]")):
-        grid = f'preset = "cartpole"\nmethods = ["dqn"]\nseeds = {seeds}\n[fixed]\ntotal_steps = 600\nnetwork.hidden = [8]\n'
-        (folder / f"{name}.toml").write_text(grid)
+        fixed = "[fixed]\ntotal_steps = 600\nnetwork.hidden = [8]\n"
+        (folder / f"{name}.toml").write_text(f'preset = "cartpole"\nmethods = ["dqn"]\nseeds = {seeds}\n{fixed}')
         call("coop-sweep", f"{folder / name}.toml", "--dir", str(folder / name), "--jobs", "2")
     for name in ("study",):  # of a packed study alone, another one is no damage
         (folder / name.replace("study", "packed")).mkdir()

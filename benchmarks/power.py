@@ -23,7 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from coop.common.process.processes import command
 
@@ -73,6 +73,7 @@ def cut(kind: str, folder: Path, cuts: int, rng: random.Random) -> tuple[list[st
     losses: list[int] = []
     false = done = 0
     while done < cuts:
+        disk.unlink(missing_ok=True)  # whoever has not closed the one before writes to that one
         with disk.open("wb") as file:
             file.truncate(MIB << 20)
         subprocess.run(["mkfs.ext4", "-q", "-F", str(disk)], check=True)
@@ -113,6 +114,15 @@ def snapshot(disk: Path, image: Path, pid: int, look: Callable[[], T]) -> T:
 @contextlib.contextmanager
 def frozen(pid: int) -> Iterator[None]:
     """Stop a process and its descendants; let them go on at the end."""
+    family = stop(pid)
+    try:
+        yield
+    finally:
+        send(signal.SIGCONT, family)
+
+
+def stop(pid: int) -> list[int]:
+    """Stop a process, and then its descendants; returns all of them."""
     stopped, family = [], [pid]
     while family:
         with contextlib.suppress(OSError):
@@ -120,12 +130,21 @@ def frozen(pid: int) -> Iterator[None]:
             stopped.append(member)
             for started in Path(f"/proc/{member}/task").glob("*/children"):
                 family += map(int, started.read_text().split())
-    try:
-        yield
-    finally:
-        for member in stopped:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(member, signal.SIGCONT)
+    return stopped
+
+
+def send(number: signal.Signals, family: list[int]) -> None:
+    """Send a signal to those that are still there."""
+    for member in family:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(member, number)
+
+
+def kill(process: subprocess.Popen[Any]) -> None:
+    """Kill a process with its descendants, which may have sessions of their own."""
+    if process.poll() is None:
+        send(signal.SIGKILL, stop(process.pid))
+    process.wait()
 
 
 @contextlib.contextmanager
@@ -164,8 +183,7 @@ def started(kind: str, at: Path, folder: Path, number: int) -> Iterator[subproce
     try:
         yield process
     finally:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        kill(process)
 
 
 def begun(kind: str, at: Path) -> bool:
@@ -213,9 +231,7 @@ def resume(kind: str, at: Path, folder: Path) -> tuple[str, int, int]:
             time.sleep(0.1)
         problem = "" if process.poll() is None and size >= 0 else f"{kind}: {log.read_text(errors='replace')[-300:]}"
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        kill(process)
     found = re.search(r"resuming from checkpoint (\d+)", log.read_text(errors="replace"))
     return problem, step_of(at / "run", int(found[1]) if found else 0), 0
 
@@ -235,9 +251,7 @@ def resume_sweep(at: Path, folder: Path) -> tuple[str, int, int]:
     )  # fmt: skip
     assert process.stdout is not None
     lines = [process.stdout.readline() for _ in range(2)]  # the first one: the settings
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    kill(process)
     process.stdout.close()
     found = re.search(r"(\d+) of them finished before", lines[1])
     if found is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from coop.common.process.files import make_folder, write_atomic
 from coop.common.process.flags import HttpAddress
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.ports import check_can_listen, check_loopback
-from coop.common.process.processes import ChildProcess, command, free_endpoint
+from coop.common.process.processes import ChildProcess, command, reserve_endpoint
 from coop.common.settings.capacity import check_memory, check_messages
 from coop.common.settings.config import RunConfig, check_distributed
 from coop.common.settings.resuming import settings_digest
@@ -62,7 +63,8 @@ class Topology:
             write_atomic(resolved, to_toml(config).encode())
         except OSError as error:
             raise RunError(f"run directory {directory}: {error.strerror or error}") from error
-        self.endpoint = options.listen or free_endpoint()
+        self._ports: list[socket.socket] = []
+        self.endpoint = options.listen or self._reserve()
         common = [f"--zenoh-config={options.zenoh_config}"] if options.zenoh_config else []
         common += ["--shared-memory"] if options.shared_memory else []
         joining = [f"--run={config.run}", "--connect", self.endpoint, f"--join-timeout={JOIN_TIMEOUT}", *common]
@@ -75,7 +77,7 @@ class Topology:
         learning += [f"--prometheus={options.prometheus}"] if options.prometheus else []
         self.learner = ChildProcess("learner", command("coop-learner", *learning), logs / "learner.log", locks)
         playing = [*joining, "--allow-import", *modules] if modules else joining
-        serving = [*playing, "--listen", free_endpoint(self.endpoint), f"--run-dir={directory}", "--resume"]
+        serving = [*playing, "--listen", self._reserve(self.endpoint), f"--run-dir={directory}", "--resume"]
         self._others = [ChildProcess("replay", command("coop-replay", *serving), logs / "replay.log", locks)]
         self._others += [
             ChildProcess(f"actor process {number}", command("coop-actor", *playing), logs / f"actor-{number}.log")
@@ -151,8 +153,19 @@ class Topology:
             process.interrupt()
         self.finish()
 
+    def close(self) -> None:
+        """Give the ports back."""
+        for port in self._ports:
+            port.close()
+
     def _all(self) -> list[ChildProcess]:
         return [self.learner, *self._others]
+
+    def _reserve(self, like: str = "") -> str:
+        """A free endpoint that nobody else gets before its role listens there, or while that is started again."""
+        endpoint, port = reserve_endpoint(like)
+        self._ports.append(port)
+        return endpoint
 
 
 def main() -> None:
@@ -188,7 +201,8 @@ def _run() -> None:
             for line in (*notices, options.settings):
                 say(line)
             lock.sign()
-            _supervise(Topology(options, config, directory, lock.descriptors), options, config, directory, stop, page)
+            with closing(Topology(options, config, directory, lock.descriptors)) as topology:
+                _supervise(topology, options, config, directory, stop, page)
 
 
 def _supervise(

@@ -7,10 +7,12 @@ import pytest
 from coop.common.errors import RunError, UsageError
 from coop.common.messaging.endpoints import check_endpoints, unknown_hosts
 from coop.common.messaging.joining import join
+from coop.common.messaging.links import close
 from coop.common.messaging.messages.control import Join
 from coop.common.messaging.session import open_session
 from coop.common.messaging.transport import Node
 from coop.common.process.lifecycle import Stop
+from coop.common.process.processes import reserve_endpoint
 
 
 @pytest.mark.parametrize(
@@ -45,6 +47,18 @@ def test_a_port_in_use_and_foreign_addresses_are_told_in_words() -> None:
         open_session(("tcp/192.0.2.1:7447",))
     with pytest.raises(RunError, match=r"the host 'nowhere\.invalid' is not known"):
         open_session(("tcp/nowhere.invalid:7447",))
+
+
+def test_a_reserved_port_is_for_who_listens_there_alone() -> None:
+    endpoint, port = reserve_endpoint("tls/127.0.0.1:1")
+    host, number = port.getsockname()
+    assert endpoint == f"tls/{host}:{number}"
+    with port:
+        with socket.socket() as other, pytest.raises(OSError, match="in use"):
+            other.bind((host, number))
+        session = open_session((f"tcp/{host}:{number}",))
+        socket.create_connection((host, number)).close()
+        close(session)
 
 
 def test_who_can_t_join_is_told_of_a_host_that_is_not_known() -> None:

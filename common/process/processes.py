@@ -168,11 +168,19 @@ def command(name: str, *flags: str) -> list[str]:
     return [*([found] if found else [sys.executable, "-P", "-m", "coop.deploy.commands", name]), *flags]
 
 
-def free_endpoint(like: str = "tcp/127.0.0.1:0") -> str:
+def free_endpoint(like: str = "") -> str:
     """An endpoint with a free port and the protocol and address of `like` (TCP on loopback if that has no port)."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"{like.rpartition(':')[0] or 'tcp/127.0.0.1'}:{probe.getsockname()[1]}"
+    endpoint, port = reserve_endpoint(like)
+    port.close()
+    return endpoint
+
+
+def reserve_endpoint(like: str = "") -> tuple[str, socket.socket]:
+    """As `free_endpoint`, and the socket that keeps the port from all but who listens there, as long as it is open."""
+    port = socket.socket()
+    port.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as listeners have it
+    port.bind(("127.0.0.1", 0))
+    return f"{like.rpartition(':')[0] or 'tcp/127.0.0.1'}:{port.getsockname()[1]}", port
 
 
 def reason_in(lines: Sequence[str]) -> str:

@@ -84,11 +84,11 @@ wait_for 240 "1500 steps" reached 1500
 echo "head requeued: $(steps) steps"
 scontrol requeue "$head"
 wait_for 600 "2500 steps after the head is back" reached 2500
-grep -q "goes on with the run in" "$work/head.out" || fail "the head began anew"
+grep -q "settings: resumed run" "$work/head.out" || fail "the head began anew"
 echo "head told that its time is nearly up: $(steps) steps"
 scancel --batch --signal=USR1 "$head"
 wait_for 600 "3500 steps after the head has requeued itself" reached 3500
-[ "$(grep -c "goes on with the run in" "$work/head.out")" = 2 ] || fail "the head did not go on twice"
+[ "$(grep -c "settings: resumed run" "$work/head.out")" = 2 ] || fail "the head did not go on twice"
 echo "head cancelled: $(steps) steps"
 scancel "$head"
 wait_for 180 "end of the head" bash -c "[ ! -e '$RUN_DIR/endpoint' ]"
