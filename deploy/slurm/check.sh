@@ -84,11 +84,11 @@ wait_for 240 "1500 steps" reached 1500
 echo "head requeued: $(steps) steps"
 scontrol requeue "$head"
 wait_for 600 "2500 steps after the head is back" reached 2500
-grep -q "settings: resumed run" "$work/head.out" || fail "the head began anew"
+grep -q "^resuming from checkpoint" "$work/head.out" || fail "the head began anew"
 echo "head told that its time is nearly up: $(steps) steps"
 scancel --batch --signal=USR1 "$head"
 wait_for 600 "3500 steps after the head has requeued itself" reached 3500
-[ "$(grep -c "settings: resumed run" "$work/head.out")" = 2 ] || fail "the head did not go on twice"
+[ "$(grep -c "^resuming from checkpoint" "$work/head.out")" = 2 ] || fail "the head did not go on twice"
 echo "head cancelled: $(steps) steps"
 scancel "$head"
 wait_for 180 "end of the head" bash -c "[ ! -e '$RUN_DIR/endpoint' ]"
@@ -109,5 +109,12 @@ scontrol requeue "$cell"
 coop-sweep "$work/four.toml" --slurm --dir "$work/four"
 wait_for 600 "end of the sweep" finished
 [ "$(grep -l '"exit": "complete"' "$work"/four/*/summary.json | wc -l)" = 4 ] || fail "not all four cells are complete"
-echo "passed: run complete, nothing lost; 4 of 4 cells complete"
+
+echo "a sweep of two cells that one task runs at once, after its setup"
+printf 'preset = "cartpole"\nmethods = ["dqn"]\nseeds = [0, 1]\n[fixed]\ntotal_steps = 3000\n' > "$work/two.toml"
+coop-sweep "$work/two.toml" --slurm --per-task 2 --setup "touch '$work/setup'" --dir "$work/two"
+wait_for 600 "end of the second sweep" finished
+[ -e "$work/setup" ] || fail "the setup has not run"
+[ "$(grep -l '"exit": "complete"' "$work"/two/*/summary.json | wc -l)" = 2 ] || fail "not both cells are complete"
+echo "passed: run complete, nothing lost; 4 of 4 and 2 of 2 cells complete"
 failed=0
