@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import coop
 from coop.common.errors import RunError, UsageError
 from coop.studies.report import cli
 from coop.studies.report.packed import PackedStudy
@@ -189,3 +190,11 @@ def test_rows_that_are_refused(flags: list[str], folder: Path, monkeypatch: pyte
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 2
+
+
+def test_tables_of_a_study_whose_methods_have_settings_of_their_own() -> None:
+    """Settings that are none of a run's are missing values; pandas warns of nothing."""
+    frames = coop.load_sweep(Path(__file__).parents[1] / "results" / "cartpole" / "medqn.parquet")
+    settings = frames.episodes.groupby("method")["medqn.epochs"]
+    assert settings.count().gt(0).to_dict() == dict.fromkeys(settings.groups, False) | {"medqn": True}
+    assert frames._repr_html_().count("<table") == 2

@@ -148,6 +148,7 @@ def test_an_offline_run_plays_nothing_and_is_evaluated(data: Path, tmp_path: Pat
     assert saved_run.evaluations["update"].tolist() == [200, 400]
     assert len(saved_run.buffer()) == 40
     assert saved_run.buffer().reuse.sum() == 400 * run.config.learner.batch_size
+    assert saved_run.buffer().truncated is None, "the data set's are not kept"
     with closing(LockstepRun(run.config, tmp_path / "b", "test", Start(), log="none")) as other:
         assert [other.run.memory.due(step) for step in (0, 1, 100)] == [0, 2, 200]  # type: ignore[attr-defined]
 

@@ -12,7 +12,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from commands import run_command
+from commands import Command, run_command
 
 from coop.common.process.processes import command
 from coop.lockstep.lockstep import Lockstep
@@ -23,7 +23,7 @@ from coop.records.run_directory import RunDirectory
 from coop.records.run_options import base_config
 from coop.records.summaries import summary_text
 from coop.studies.watch.run import RunFolder
-from coop.studies.watch.screen import SweepPage
+from coop.studies.watch.screen import SweepPage, time_line
 from coop.studies.watch.sweep import SweepFolder
 
 GRID = """
@@ -190,6 +190,13 @@ def test_the_states_of_cells(tmp_path: Path) -> None:
     sweep.refresh()
     assert sweep.counts()["stopped"] == 2, "its process is gone"
     assert (sweep.speed(), sweep.seconds_left(), sweep.over) == (0, None, False)
+    assert time_line(sweep) == "no cell runs now"
+    lock = RunLock(cells[6], "coop-lockstep", ("learner",)).sign()
+    try:
+        sweep.refresh()
+        assert (sweep.counts()["running"], time_line(sweep)) == (1, "time left not known yet"), "it has no row yet"
+    finally:
+        lock.release()
     for cell in cells[3:]:
         ended(cell, "complete")
     played(cells[3], 600)
@@ -261,13 +268,28 @@ def test_a_sweep_by_its_folder(tmp_path: Path) -> None:
         (["empty"], "neither a run, with its config.toml, nor a sweep, with its sweep.toml"),
         (["nowhere"], "no such folder"),
         (["file"], "no folder"),
+        (["starting", "--once"], "the run there is only starting"),
         (["empty", "--connect", "tcp/127.0.0.1:1"], "--connect: for a run that is found by its learner"),
     ],
 )
 def test_what_is_no_folder_of_a_run(flags: list[str], words: str, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
+    (tmp_path / "starting" / "logs").mkdir(parents=True)
+    (tmp_path / "starting" / "logs" / "config.toml").touch()
     done = run_command("coop-watch", *flags, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert words in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_a_run_that_is_only_starting_is_waited_for(tmp_path: Path) -> None:
+    run_command("coop-lockstep", "--total-steps=60", "--network.hidden=8", f"--run-dir={tmp_path / 'run'}", check=True)
+    (tmp_path / "run" / "logs").mkdir()
+    (tmp_path / "run" / "logs" / "config.toml").touch()
+    (tmp_path / "run" / "config.toml").rename(tmp_path / "config.toml")
+    with Command("coop-watch", "run", cwd=tmp_path) as watching:
+        wait_until(lambda: "only starting" in "".join(watching.output()))
+        (tmp_path / "config.toml").rename(tmp_path / "run" / "config.toml")
+        assert watching.wait(60) == 0
+        assert "60/60" in "".join(watching.output())

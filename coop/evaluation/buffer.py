@@ -35,8 +35,8 @@ class Buffer:
         actions: int32 [n].
         rewards: float32 [n]; n-step returns if `span` is above 1.
         terminated: bool [n], whether the next state is terminal.
-        truncated: bool [n], whether an episode was cut at the next state, which is not terminal; None with several
-            streams of n-step returns, where that is not known. False of what `replay.preload` has brought.
+        truncated: bool [n], whether an episode was cut at the next state, which is not terminal; None where that is not
+            known: with several streams of n-step returns, or with transitions that `replay.preload` has brought.
         span: uint8 [n], environment steps from an observation to the next one.
         ids: int64 [n], numbers of the transitions in order of insertion, from 0.
         age: int64 [n], transitions inserted since this one.
@@ -138,13 +138,11 @@ def _of_episodes(table: SavedTable, ends: NDArray[np.int64]) -> dict[str, Array]
     steps, span = table.columns["ids"] - table.preloaded, table.columns["span"].astype(np.int64)
     own, running = steps >= 0, ~table.columns["terminated"]
     if table.streams > 1:
-        return {"truncated": own & running & np.isin(steps + 1, ends)} if (span == 1).all() else {}
+        known = own.all() and (span == 1).all()
+        return {"truncated": running & np.isin(steps + 1, ends)} if known else {}
     place = np.searchsorted(ends, steps, side="right")
     over = own & (place < len(ends))
     padded = np.concatenate(([0], ends, [0]))
     end, before = padded[place + 1], padded[place]
-    return {
-        "episode": np.where(own, place, -1),
-        "truncated": over & running & (steps + span == end),
-        "length": np.where(over, end - before, 0),
-    }
+    truncated = {"truncated": over & running & (steps + span == end)} if own.all() else {}
+    return {"episode": np.where(own, place, -1), "length": np.where(over, end - before, 0), **truncated}

@@ -29,6 +29,10 @@ class SweepFrames:
     episodes: pd.DataFrame
     metrics: pd.DataFrame
 
+    def _repr_html_(self) -> str:
+        shown = {"episodes": self.episodes, "metrics": self.metrics}
+        return "".join(f"<p>{name}</p>{frame.to_html(max_rows=10)}" for name, frame in shown.items())
+
 
 def load_sweep(folder: str | Path) -> SweepFrames:
     """Read the runs of a sweep, of any folder of runs, or of a packed study; runs that go on are included.
@@ -67,14 +71,12 @@ def load_sweep(folder: str | Path) -> SweepFrames:
         return {"run": name, **{axis: str(v) if isinstance(v, list | tuple) else v for axis, v in values.items()}}
 
     def table(file: str) -> pd.DataFrame:
-        frames = [_beside(settings(name), source.table(name, file)) for name in configs]
-        frames = [frame for frame in frames if len(frame)]
-        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=["run", *axes])
+        frames = {name: frame for name in configs if len(frame := source.table(name, file))}
+        if not frames:
+            return pd.DataFrame(columns=["run", *axes])
+        records = pd.concat(frames.values(), ignore_index=True)
+        rows = [row for name, frame in frames.items() for row in [settings(name)] * len(frame)]
+        columns = {axis: [row[axis] for row in rows] for axis in ("run", *axes) if axis not in records}
+        return pd.concat([pd.DataFrame(columns), records], axis=1)
 
     return SweepFrames(table(EPISODES), table(METRICS))
-
-
-def _beside(settings: dict[str, Any], records: pd.DataFrame) -> pd.DataFrame:
-    """Records behind columns of settings; a record's own column of that name stays."""
-    columns = {name: value for name, value in settings.items() if name not in records}
-    return pd.concat([pd.DataFrame(columns, index=records.index), records], axis=1)

@@ -97,7 +97,15 @@ def _watch_folder(folder: Path, options: WatchOptions, ctrl_c: Stop) -> None:
         raise UsageError(f"--{given[0].replace('_', '-')}: for a run that is found by its learner, not by its folder")
     if not folder.is_dir():
         raise UsageError(f"{folder}: {'no folder' if folder.exists() else 'no such folder'}")
-    if (folder / CONFIG).exists():
+    config, starting = folder / CONFIG, folder / "logs" / CONFIG
+    if starting.exists() and not config.exists():
+        if options.once:
+            raise UsageError(f"{folder}: the run there is only starting")
+        say(f"{folder}: the run there is only starting")
+        while not config.exists():
+            if ctrl_c.wait(TICK_OF_FILES):
+                ctrl_c.raise_for_status()
+    if config.exists():
         check_links(folder)
         run = RunFolder(folder)
         run.refresh()

@@ -30,7 +30,8 @@ def time_line(sweep: SweepFolder) -> str:
     """The speed and the time left."""
     left = sweep.seconds_left()
     if left is None:
-        return "nothing is left to do" if sweep.over else "no cell runs now"
+        running = "running" in sweep.counts()
+        return "nothing is left to do" if sweep.over else "time left not known yet" if running else "no cell runs now"
     return f"{sweep.speed():,.0f} steps/s, about {clock(left)} left"
 
 
