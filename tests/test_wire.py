@@ -78,7 +78,7 @@ def test_arrays_need_not_be_contiguous() -> None:
 def _with(**changes: object) -> bytes:
     header = {"protocol": wire.PROTOCOL, "kind": "k", "run": "r", "fields": {}, "arrays": [], **changes}
     packed = msgpack.packb({name: value for name, value in header.items() if value is not ...})
-    return _packed(packed.replace(msgpack.packb(DEEP), b"\x91" * 5000 + b"\xc0"))
+    return _packed(packed.replace(msgpack.packb(DEEP), b"\x91" * 50_000 + b"\xc0"))
 
 
 def _nested(depth: int) -> object:
