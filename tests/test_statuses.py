@@ -1,16 +1,30 @@
 """What the learner tells of a run: who is there and how, who waits for whom, speeds, and returns so far."""
 
+import time
+from collections.abc import Callable
+
 import pytest
 from msgspec.structs import replace
 
+from coop.common.messaging.keys import status_key
 from coop.common.messaging.members import Origin
 from coop.common.messaging.messages.control import Join
 from coop.common.messaging.messages.status import ActorStatus, Held, Member, Ratio, ReplayStatus, Wait
+from coop.common.messaging.sample_client import SampleClient
+from coop.common.messaging.session import open_session
 from coop.common.messaging.timing import FORGOTTEN, HOLD
+from coop.common.messaging.transport import Node
 from coop.common.numbers import Rate
-from coop.learner.roster import MemberTracker
-from coop.learner.status import waits
+from coop.common.process.console import Console
+from coop.common.process.lifecycle import Stop
+from coop.common.types import EnvSpec
+from coop.learner.join_service import JoinService
+from coop.learner.roster import MemberTracker, Roster
+from coop.learner.shared_checkpoints import SharedCheckpoints
+from coop.learner.status import MEMBERS_EVERY, StatusReporter, waits
 from coop.learner.telemetry import ReturnHistory
+from coop.lockstep.lockstep import Lockstep
+from coop.records.run_options import base_config
 from coop.replay.gate import Gate
 
 
@@ -100,3 +114,36 @@ def test_members_are_listed_with_their_states() -> None:
     assert members.listed(2.0, 9) == [service, first]
     members.add(Join("actor", 99, [], origin=Origin("act", 10)), "actor 2")
     assert members.listed(2.0, 9)[2] == Member("actor 2", "actor", "act", 10, "playing"), "nothing from before its join"
+
+
+def test_members_that_come_and_go_at_once_are_published_ten_times_a_second(
+    nodes: tuple[Node, Node], spec: EnvSpec
+) -> None:
+    learner, actor = nodes
+    run = Lockstep(base_config(["--method", "dqn"]))
+    run.env.close()
+    service = JoinService(learner, run.config, spec, "", 9, SharedCheckpoints([], "run"), Roster(), print)
+    reporter = StatusReporter(learner, run.trainer, SampleClient(learner, Stop(), 1, spec, 32, 1), service, Console())
+    published: list[object] = []
+    actor.on(status_key(actor, "learner"), "counting", lambda key, message: published.append(message.fields["waiting"]))
+
+    def publish_until(reached: Callable[[], object], waiting: str) -> None:
+        deadline = time.monotonic() + 20
+        while not reached():
+            learner.publish_status(replace(reporter.publish(0.0), waiting=waiting))
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+    publish_until(lambda: published, "the first")  # the subscription is known then
+    before = len(published)
+    for tick in range(1000):
+        reporter.publish_members(100 + tick / 1000)
+    publish_until(lambda: "the last" in published, "the last")
+    between = published[before : published.index("the last")]
+    assert 8 <= len(between) - between.count("the first") < 1.5 / MEMBERS_EVERY
+
+
+def test_a_status_of_a_closed_session_is_dropped(endpoint: str) -> None:
+    with Node(open_session((endpoint,)), "test", "actor", 7) as node:
+        node.publish_status(ActorStatus(10, 8))
+    node.publish_status(ActorStatus(10, 8))
