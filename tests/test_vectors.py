@@ -1,5 +1,6 @@
 """Gymnasium's vector environments give the same transitions as single ones, in each of the autoreset modes."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -213,3 +214,14 @@ def test_values_that_are_not_one_for_each_emulator_are_named(lacks: str, words: 
 def test_answers_that_are_none_of_gymnasium_s_are_named(lacks: str, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         played(EnvSettings(id="test/Own-v1", kwargs={"lacks": lacks}))
+
+
+def test_an_episode_is_cut_only_where_one_emulator_can_be_restarted_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("coop.common.envs.gymnasium_env.LONGEST_EPISODE", 3)
+    env = make_vector_env(EnvSettings(id=f"test/Own-v{MODES.index(AutoresetMode.SAME_STEP)}"), 2, 4, bounded=True)
+    with closing(env):
+        env.reset()
+        for _ in range(2):
+            env.step(np.zeros(2, np.int32))
+        with pytest.raises(RunError, match="no limit of episodes but its own, as SAME_STEP restarts no emulator alone"):
+            env.step(np.zeros(2, np.int32))
