@@ -144,6 +144,8 @@ class Squared(UpdateRule):
 @pytest.mark.parametrize("learner", [{}, {"double": True}, {"reward_bound": 0.001}], ids=str)
 @pytest.mark.parametrize("like", ["dqn", "coop"])
 def test_hooks_that_say_the_same_do_the_same(like: str, learner: dict[str, Any], monkeypatch: Any) -> None:
+    """At a rate that no sample's feedback flips at, by a rounding alone."""
+    learner = {"learning_rate": 0.01, **learner}
     of = coop.Method("squared", "", rule=Squared, two_networks=like == "coop", error_driven=like == "coop")
     monkeypatch.setattr(sys.modules[__name__], "SQUARED", of, raising=False)
     own, plain = (agent_of(name, learner=learner) for name in (f"{__name__}:SQUARED", like))

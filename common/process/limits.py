@@ -59,7 +59,7 @@ def _of_slurm(variables: Mapping[str, str]) -> Iterator[MemoryLimit]:
         yield MemoryLimit(node * MIB, "Slurm's job has (SLURM_MEM_PER_NODE)")
     each = _positive(variables.get("SLURM_MEM_PER_CPU"))
     names = ("SLURM_CPUS_ON_NODE", "SLURM_CPUS_PER_TASK")
-    cpus = next((count for name in names if (count := _positive(variables.get(name)))), len(os.sched_getaffinity(0)))
+    cpus = next((count for name in names if (count := _positive(variables.get(name)))), _affinity())
     if each:
         yield MemoryLimit(each * cpus * MIB, "Slurm's job has (SLURM_MEM_PER_CPU)")
 
@@ -67,7 +67,7 @@ def _of_slurm(variables: Mapping[str, str]) -> Iterator[MemoryLimit]:
 def cores(root: Path = ROOT, environment: Mapping[str, str] | None = None) -> int:
     """The number of processors that this process may keep busy; at least 1."""
     variables = os.environ if environment is None else environment
-    found = [len(os.sched_getaffinity(0))]
+    found = [_affinity()]
     for group in _groups("cpu", root):
         first = _words(group / "cpu.cfs_quota_us") + _words(group / "cpu.cfs_period_us")
         numbers = [_positive(word) for word in _words(group / "cpu.max") or first]
@@ -79,6 +79,11 @@ def cores(root: Path = ROOT, environment: Mapping[str, str] | None = None) -> in
             found.append(count)
             break
     return max(1, min(found))
+
+
+def _affinity() -> int:
+    """The number of processors that this process may run on; of the machine where the system does not say, as macOS."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def limit_threads() -> None:

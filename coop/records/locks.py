@@ -318,8 +318,8 @@ def _is_local(folder: Path) -> bool:
 
 
 def _now() -> float:
-    """Seconds, those in which the machine was suspended included."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
+    """Seconds, those in which the machine was suspended included, as macOS counts its monotonic clock's."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 def holder(folder: Path, role: str = "learner") -> tuple[str, bool]:
