@@ -1,6 +1,7 @@
 """Searches by Optuna over real runs, and the tables of all runs of a folder."""
 
 import importlib
+import logging
 import os
 import runpy
 import subprocess
@@ -60,7 +61,14 @@ def test_the_example_searches_and_its_runs_are_tables(
     assert packed.metrics["loss"].tolist() == frames.metrics["loss"].tolist()
 
 
-def test_bad_trials_fail_and_bad_grids_are_refused(tmp_path: Path) -> None:
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    """What Optuna's log says."""
+    monkeypatch.setattr(logging.getLogger("optuna"), "propagate", True)
+    return caplog
+
+
+def test_bad_trials_fail_and_bad_grids_are_refused(tmp_path: Path, said: pytest.LogCaptureFixture) -> None:
     # The first value is fine, the second diverges, and the third is refused.
     vary = {"learner": {"learning_rate": [1e-3, 1e30, -1.0]}}
     sampler = optuna.samplers.GridSampler({"learner.learning_rate": [1e-3, 1e30, -1.0]}, seed=0)
@@ -71,6 +79,12 @@ def test_bad_trials_fail_and_bad_grids_are_refused(tmp_path: Path) -> None:
     }  # fmt: skip
     assert by_rate[1e30].user_attrs["why"].startswith("diverged")
     assert "learner.learning_rate = -1.0" in by_rate[-1.0].user_attrs["why"]
+    for rate, ended in (
+        (1e-3, f"finished with value {study.best_value:g}"),
+        (1e30, "failed: diverged"),
+        (-1.0, "failed"),
+    ):
+        assert f"Trial {by_rate[rate].number} {ended}" in said.text
     for wrong, text in (
         ({"vary": {"learner": {"rate": [1]}}}, r"learner\.rate"),
         ({"vary": {"learner": {"learning_rate": {"low": 1, "high": 0.1}}}}, r"vary\.learner\.learning_rate"),
@@ -229,10 +243,11 @@ class Second(optuna.pruners.BasePruner):
         return bool(trial.number == 1)
 
 
-def test_a_pruned_trial_s_run_is_stopped(tmp_path: Path) -> None:
+def test_a_pruned_trial_s_run_is_stopped(tmp_path: Path, said: pytest.LogCaptureFixture) -> None:
     grid = {"fixed": {**FIXED, "total_steps": 1_000}, "vary": RATES}
     study = coop.tune(grid, tmp_path, trials=2, workers=1, pruner=Second())
     assert [trial.state for trial in study.trials] == [STATE.COMPLETE, STATE.PRUNED]
+    assert "Trial 1 pruned; parameters: {'learner.learning_rate': " in said.text
     summary = coop.load(tmp_path / "trial-0001").summary
     assert summary is not None
     assert (summary["exit"], summary["env_steps"] < 1_000) == ("interrupted", True)

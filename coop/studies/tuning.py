@@ -240,7 +240,7 @@ class _Search:
         self._states = optuna.trial.TrialState
         self._told_by_another = optuna.exceptions.UpdateFinishedTrialError  # process, which saw the end first
         self._running: list[_Running] = []
-        self._log = DEFAULT_LOG
+        self._log = optuna.logging.get_logger("optuna.coop")
         # Those of a search that was interrupted go on; those that another process runs are refused by their locks.
         stale = study.get_trials(states=(self._states.RUNNING,))
         self._stale = [(optuna.Trial(study, each._trial_id), set(each.intermediate_values)) for each in stale]
@@ -271,7 +271,7 @@ class _Search:
             trial.set_user_attr("seeds", list(self._space.file.seeds))
             trial.set_user_attr("settings", {"method": method, **chosen})
             cells = self._space.cells(f"trial-{trial.number:04}", method, chosen)
-            folders = [CellFolder(self._path, cell, self._log) for cell in cells]
+            folders = [CellFolder(self._path, cell, DEFAULT_LOG) for cell in cells]
             running = _Running(trial, folders, Following(folders[0].path, EPISODES), told)
             if self._start(running):
                 self._running.append(running)
@@ -294,7 +294,8 @@ class _Search:
                 self._fail(running.trial, ending.why)
                 return False
             self._finished(running)
-        self._tell(running.trial, sum(running.scores) / len(running.scores))
+        score = sum(running.scores) / len(running.scores)
+        self._tell(running.trial, f"finished with value {score:g}", score)
         return False
 
     def _finished(self, running: _Running) -> None:
@@ -311,7 +312,7 @@ class _Search:
             if ending is None:
                 return
             if running.pruned:
-                self._tell(running.trial, state=self._states.PRUNED)
+                self._tell(running.trial, "pruned", state=self._states.PRUNED)
             elif ending.kind == "finished":
                 self._finished(running)
                 if self._start(running):
@@ -342,12 +343,16 @@ class _Search:
     def _fail(self, trial: optuna.Trial, why: str) -> None:
         with suppress(self._told_by_another):
             trial.set_user_attr("why", why)
-        self._tell(trial, state=self._states.FAIL)
+        self._tell(trial, f"failed: {why}", state=self._states.FAIL)
 
     def _tell(
-        self, trial: optuna.Trial, value: float | None = None, state: optuna.trial.TrialState | None = None
+        self, trial: optuna.Trial, ended: str, value: float | None = None, state: optuna.trial.TrialState | None = None
     ) -> None:
-        """Tell Optuna how a trial has ended; a sampler of a finite grid then says by `Study.stop` that it is over."""
+        """Tell Optuna how a trial has ended, and its log, as `Study.optimize` does.
+
+        A sampler of a finite grid then says by `Study.stop` that it is over.
+        """
+        self._log.info(f"Trial {trial.number} {ended}; parameters: {trial.params}")
         try:
             self._study.tell(trial, value, state, skip_if_finished=True)
         except RuntimeError as error:
