@@ -37,6 +37,11 @@ def batches() -> Iterator[Batch]:
         yield table.sample(32)
 
 
+def replace_rewards(batch: Batch, reward: float) -> Batch:
+    """The batch with this reward in each transition."""
+    return msgspec.structs.replace(batch, rewards=np.full_like(batch.rewards, reward))
+
+
 def drawn(inserted: int = 200, *returns: float, planned: int = 9_000) -> Drawn:
     """The counters that come with a batch, and episodes of these returns."""
     ends = [EpisodeEnd(0, value, 9, 0.1, 0.2, 0.3, 5) for value in returns]
@@ -64,6 +69,44 @@ def test_priorities_are_the_size_of_the_td_errors() -> None:
     assert errors.min() < 0
     np.testing.assert_array_equal(trainer.train(batch, drawn(), 0.0).priorities, np.abs(errors))
     assert Trainer(Agent(CONFIG, SPEC), 0.0).train(batch, drawn(), 0.0).priorities is None
+
+
+def test_what_a_gpu_measures_is_read_later_or_where_it_is_due() -> None:
+    """At broadcasts, at checkpoints and at a row; in between, two updates wait."""
+    learner = replace(CONFIG.learner, swap_every=10_000, publish_every=50)
+    config = replace(CONFIG, learner=learner, replay=ReplaySettings(sampling="prioritized"), checkpoint_every=20)
+    trainer, reference, source = Trainer(Agent(config, SPEC), 0.0), Agent(config, SPEC), batches()
+    trainer.agent.lag = 2
+    ids, errors, waiting, left = [], [], [], []
+    for _ in range(210):
+        batch = next(source)
+        waiting.append((batch.ids, np.abs(reference.update(batch).td_errors)))
+        effects = trainer.train(batch, drawn(), 0.0)
+        read = 0 if effects.ids is None else len(effects.ids) // 32
+        left.append(len(waiting) - read)
+        for number, error in waiting[:read]:
+            ids.append(number)
+            errors.append(error)
+        del waiting[:read]
+        if read:
+            np.testing.assert_array_equal(effects.ids, np.concatenate(ids[-read:]))
+            np.testing.assert_array_equal(effects.priorities, np.concatenate(errors[-read:]))
+        if trainer.checkpoint_due():
+            trainer.checkpoint_begun()
+    at_once = [update for update, count in enumerate(left, start=1) if not count]
+    assert at_once == sorted({*range(20, 211, 20), 50, 100, 150, 200})
+    assert set(left) == {0, 1, 2}
+
+
+def test_what_waits_is_read_before_a_checkpoint() -> None:
+    trainer, source = Trainer(Agent(CONFIG, SPEC), 0.0), batches()
+    trainer.agent.lag = 1
+    trainer.train(next(source), drawn(), 0.0)
+    batch = next(source)
+    trainer.train(replace_rewards(batch, np.inf), drawn(), 0.0)
+    assert trainer.outcome() == ""
+    assert not trainer.saveable()
+    assert trainer.outcome() == "diverged: TD errors are not finite at update 2"
 
 
 def test_a_row_of_metrics_every_200_updates() -> None:
@@ -165,6 +208,17 @@ def test_a_checkpoint_is_due_until_it_is_begun() -> None:
     never = Trainer(Agent(replace(CONFIG, checkpoint_every=0), SPEC), 0.0)
     train(never, 20)
     assert not never.checkpoint_due()
+    never.ask_checkpoint()
+    assert not never.checkpoint_due()
+    train(never, 1)
+    assert never.checkpoint_due()
+
+
+def test_a_checkpoint_that_is_asked_for_puts_off_none() -> None:
+    trainer = Trainer(Agent(replace(CONFIG, checkpoint_every=5), SPEC), 0.0)
+    train(trainer, 5)
+    trainer.ask_checkpoint()
+    assert trainer.checkpoint_due()
 
 
 @pytest.mark.parametrize("method", ["dqn", "edql", "g-coop", "coop"])
