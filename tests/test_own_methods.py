@@ -144,11 +144,10 @@ class Squared(UpdateRule):
 @pytest.mark.parametrize("learner", [{}, {"double": True}, {"reward_bound": 0.001}], ids=str)
 @pytest.mark.parametrize("like", ["dqn", "coop"])
 def test_hooks_that_say_the_same_do_the_same(like: str, learner: dict[str, Any], monkeypatch: Any) -> None:
-    """At a rate that no sample's feedback flips at, by a rounding alone."""
-    learner = {"learning_rate": 0.01, **learner}
     of = coop.Method("squared", "", rule=Squared, two_networks=like == "coop", error_driven=like == "coop")
     monkeypatch.setattr(sys.modules[__name__], "SQUARED", of, raising=False)
-    own, plain = (agent_of(name, learner=learner) for name in (f"{__name__}:SQUARED", like))
+    # Of 8 units, a state may leave one active: how error-driven learning then completes U V^T is a matter of rounding.
+    own, plain = (agent_of(name, learner=learner, network={"hidden": [32]}) for name in (f"{__name__}:SQUARED", like))
     for batch in batches(3):
         np.testing.assert_allclose(own.update(batch).td_errors, plain.update(batch).td_errors, rtol=1e-4, atol=1e-6)
     for one, other in zip(own.networks, plain.networks, strict=True):

@@ -4,9 +4,11 @@ import importlib
 import logging
 import os
 import runpy
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +135,8 @@ def test_storages_that_are_none_are_refused_in_a_line(tmp_path: Path) -> None:
     file.write_bytes(b"")
     with pytest.raises(UsageError, match=r"optuna\.db: File exists$|Not a directory$"):
         tune_none(file)
+    with pytest.raises(RunError, match=r"nowhere/mine\.db: OperationalError: unable to open database file$"):
+        coop.tune(REFUSED, folder, storage=f"sqlite:///{tmp_path}/nowhere/mine.db")
 
 
 def test_a_trial_s_folder_is_no_link_to_another_one(tmp_path: Path) -> None:
@@ -233,7 +237,8 @@ def test_a_storage_that_another_process_makes_meanwhile(url: bool, tmp_path: Pat
 
     study = tuning._study(f"sqlite:///{file}" if url else file, "mine", None)
     assert study.study_name == "mine"
-    assert [each.study_name for each in optuna.get_all_study_summaries(f"sqlite:///{file}")] == ["mine"]
+    with closing(sqlite3.connect(file)) as made:
+        assert made.execute("SELECT study_name FROM studies").fetchall() == [("mine",)]
 
 
 class Second(optuna.pruners.BasePruner):

@@ -50,6 +50,16 @@ def take_standard_files() -> None:
         if present is getattr(sys, f"__{name}__"):  # otherwise a caller in this process has redirected it
             _streams[number] = stream = _Text(number, present)
             setattr(sys, name, stream)
+    sys.unraisablehook = _unraisable
+
+
+def _unraisable(failure: sys.UnraisableHookArgs) -> None:
+    """Print what no code can be told of, but not, as Python 3.13 began to, that a file's descriptor had been closed.
+
+    Users' code has closed it by its number; the file says so where it is written to.
+    """
+    if getattr(failure.exc_value, "errno", None) != errno.EBADF:
+        sys.__unraisablehook__(failure)
 
 
 def out() -> TextIO | None:

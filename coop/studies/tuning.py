@@ -118,9 +118,8 @@ def _study(storage: str | Path, name: str, pruner: optuna.pruners.BasePruner | N
     for left in reversed(range(TRIES)):
         try:
             return optuna.create_study(
-                storage=_sqlite(storage) if isinstance(storage, Path) else storage, study_name=name,
-                direction="maximize", load_if_exists=True, pruner=pruner,
-            )  # fmt: skip
+                storage=_storage(storage), study_name=name, direction="maximize", load_if_exists=True, pruner=pruner
+            )
         except SQLAlchemyError as error:
             if not left or not (isinstance(error, IntegrityError) or "already exists" in str(error)):
                 raise
@@ -128,12 +127,24 @@ def _study(storage: str | Path, name: str, pruner: optuna.pruners.BasePruner | N
     raise AssertionError
 
 
-def _sqlite(file: Path) -> optuna.storages.RDBStorage:
-    """Optuna's storage in a file: by its path, as a URL with a ? or # in it would be that of another file."""
+class _Connection(sqlite3.Connection):
+    """Is closed with its last user: Optuna leaves that to Python, which warns of it from 3.13 on."""
+
+    def __del__(self) -> None:
+        with suppress(sqlite3.ProgrammingError):  # it could not be opened
+            self.close()
+
+
+def _storage(place: str | Path) -> str | optuna.storages.RDBStorage:
+    """Optuna's storage at a URL, or in a file: by its path, as a URL with a ? or # in it would be another file's."""
     import optuna  # noqa: PLC0415 (an extra)
 
-    connect = partial(sqlite3.connect, file, check_same_thread=False)
-    return optuna.storages.RDBStorage(f"sqlite:///{STORAGE}", engine_kwargs={"creator": connect})
+    if isinstance(place, Path):
+        connect = partial(sqlite3.connect, place, check_same_thread=False, factory=_Connection)
+        return optuna.storages.RDBStorage(f"sqlite:///{STORAGE}", engine_kwargs={"creator": connect})
+    if place.startswith("sqlite:///"):
+        return optuna.storages.RDBStorage(place, engine_kwargs={"connect_args": {"factory": _Connection}})
+    return place
 
 
 @contextmanager
