@@ -11,7 +11,7 @@ from benchmarks.simulate.plan import KINDS, Fault, make_plan
 from benchmarks.simulate.planted import PLANTED, planted
 from benchmarks.simulate.runner import Outcome, explain, find, shrink, simulate
 
-SEEDS = 150
+SEEDS = 300
 AT_ONCE = 25
 
 
