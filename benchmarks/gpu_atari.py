@@ -42,8 +42,13 @@ def main() -> None:
         command = [sys.executable, __file__, "--inside", *sys.argv[1:]]
         raise SystemExit(subprocess.run(command, env=gpu.prepared(), check=False).returncode)
     sys.path.insert(0, str(gpu.ROOT))
+    from coop.common.errors import CoopError
+
     if options.minutes > 0:
-        learn(options)
+        try:
+            learn(options)
+        except CoopError as error:
+            sys.exit(f"gpu_atari: error: {error}")
     print(table(options.out, options.methods))
     draw(options)
 

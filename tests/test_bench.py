@@ -324,6 +324,14 @@ def test_every_area_has_a_name_that_can_be_asked_for(bench: Any) -> None:
         assert {target.over, *target.under} <= set(subjects)
 
 
+def test_a_machine_without_the_gpu_is_told_so_in_a_line(tmp_path: Path) -> None:
+    flags = ["--inside", "--device", "cuda:99", "--methods", "dqn", "--minutes", "0.001", "--out", tmp_path / "out"]
+    done = run_command(BENCHMARKS / "gpu_atari.py", *flags)
+    assert done.returncode == 1
+    assert done.stderr.startswith("gpu_atari: error: learner.device = 'cuda:99': ")
+    assert done.stderr.count("\n") == 1
+
+
 def test_the_methods_learn_a_game_in_turn_and_go_on_elsewhere(tmp_path: Path) -> None:
     """`make gpu-atari`, with tiny settings on the processor."""
     out = tmp_path / "out"
