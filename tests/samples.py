@@ -1,9 +1,11 @@
-"""Small valid messages for tests to send and to break, and real play cut into segments."""
+"""Small valid messages for tests to send and to break, real play cut into segments, and which PyTorch this is."""
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
+import torch
 
 from coop.actors.segments import SegmentAssembler
 from coop.common.envs.make import make_vector_env
@@ -14,6 +16,8 @@ from coop.common.transitions import Segment
 from coop.common.types import Array, EnvSpec, EpisodeEnd
 
 INCARNATION = 77
+_CONSTRAINTS = (Path(__file__).parents[1] / "constraints.txt").read_text(encoding="utf-8").splitlines()
+PINNED = f"torch=={torch.__version__.partition('+')[0]}" in _CONSTRAINTS  # whose rounding exact figures are of
 
 
 def make_segment(spec: EnvSpec, sequence: int = 0, steps: int = 4, incarnation: int = 7, **changes: object) -> Segment:

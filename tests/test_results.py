@@ -7,10 +7,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
-import torch
+from samples import PINNED
 
 from benchmarks import feedback
 from coop.evaluation.film import Film
@@ -288,17 +287,15 @@ def test_what_the_pages_say_of_s() -> None:
 def test_what_feedback_does_to_a_step() -> None:
     """The table of docs/algorithm.md, and what the pages quote of it.
 
-    To the last digit with the pinned PyTorch. Another one completes gradients of deficient rank otherwise, by rounding.
+    Another PyTorch than the pinned one completes weights' gradients of deficient rank otherwise, by rounding.
     """
     rows = feedback.measure(1000)
     page = (RESULTS / "../docs/algorithm.md").read_text()
-    pinned = f"torch=={torch.__version__.partition('+')[0]}\n" in (RESULTS / "../constraints.txt").read_text()
     columns = ("gradient", "cosine", "step", "step_cosine")
     for (case, when), part in rows.groupby(["case", "when"], sort=False):
-        (cells,) = re.findall(rf"^\| {re.escape(case)} \| {when} \| (.*) \|$", page, re.MULTILINE)
-        printed = [[float(value) for value in cell.split(", ")] for cell in cells.split(" | ")]
-        found = [part[what].tolist() for what in columns]
-        np.testing.assert_allclose(found, printed, rtol=0, atol=0.005 + 1e-9 if pinned else 0.011)
+        if PINNED or not case.startswith("weight-gradient"):
+            cells = " | ".join(", ".join(f"{value:.2f}" for value in part[what]) for what in columns)
+            assert f"| {case} | {when} | {cells} |" in page
     later = rows[rows["when"] == "later"].set_index("case")
     plain = [f"{value:.2f}" for value in later.loc["transform, constant s", "gradient"]]
     turned = [f"{value:.2f}" for value in later.loc["weight-gradient, constant s", "step_cosine"]]
