@@ -57,7 +57,7 @@ def test_queries_that_wait_take_bounded_memory(
     for sent in range(0, 60, 10):  # what arrives at one time is in memory for a moment
         numbers = range(sent + 1, sent + 11)
         large += [actor.begin(key, wire.encode("ack", "test", Ack(n), padding), 60.0) for n in numbers]
-        until(lambda: learner.bad_messages == len(large) - 1)
+        until(lambda refused=len(large) - 1: learner.bad_messages == refused)
         resided.append(resident())
     assert resided[-1] - resided[0] < 100 * MIB, "of 200"
     last = actor.begin(key, Ack(61).encode("test"), 60.0)
