@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -51,13 +52,16 @@ def test_queries_that_wait_take_bounded_memory(
     learner.serve(key, answer, most=2 * LARGE)
     await_service(actor, key)
     padding = {"padding": np.zeros(LARGE, np.uint8)}
+    def refused(count: int) -> bool:
+        return learner.bad_messages == count
+
     first = actor.begin(key, Ack(0).encode("test"), 60.0)
     large: list[Pending] = []
     resided = []
     for sent in range(0, 60, 10):  # what arrives at one time is in memory for a moment
         numbers = range(sent + 1, sent + 11)
         large += [actor.begin(key, wire.encode("ack", "test", Ack(n), padding), 60.0) for n in numbers]
-        until(lambda refused=len(large) - 1: learner.bad_messages == refused)
+        until(partial(refused, len(large) - 1))
         resided.append(resident())
     assert resided[-1] - resided[0] < 100 * MIB, "of 200"
     last = actor.begin(key, Ack(61).encode("test"), 60.0)
