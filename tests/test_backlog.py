@@ -52,6 +52,7 @@ def test_queries_that_wait_take_bounded_memory(
     learner.serve(key, answer, most=2 * LARGE)
     await_service(actor, key)
     padding = {"padding": np.zeros(LARGE, np.uint8)}
+
     def refused(count: int) -> bool:
         return learner.bad_messages == count
 
