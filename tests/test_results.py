@@ -17,6 +17,7 @@ from coop.evaluation.saved import SavedRun
 from coop.studies.report import comparisons
 from coop.studies.report import results as tables
 from coop.studies.report.baseline import baseline_table, find_baseline
+from coop.studies.report.intervals import over_seeds
 from coop.studies.report.measures import shorter_runs
 from coop.studies.report.sources import open_source
 from coop.studies.report.study import Study, load_study
@@ -240,6 +241,18 @@ def test_studies_that_share_runs() -> None:
         assert sorted(chosen) == [0, 1, 2, 3, 4]
         returns.append(chosen)
     assert returns[0] == returns[1] == returns[2]
+
+
+def test_the_differences_of_the_two_feedbacks() -> None:
+    """The runs of one are in another file than those of the other."""
+    at = ["edl.noise", "learner.reset_role_at_episode", "seed"]
+    transform = table_of("choices", "runs").query("`edl.feedback` == 'transform'").set_index(at)["mean"]
+    gradient = table_of("choices-again", "runs").set_index(at)["mean"]
+    found = [over_seeds(values.to_numpy()) for _, values in (gradient - transform).groupby(level=at[:2])]
+    *first, last = (f"{each.value:.1f} [{each.low:.1f}, {each.high:.1f}]" for each in found)
+    assert f"minus `transform` is {', '.join(first)} and {last}, line by line" in PAGES["cartpole/README.md"]
+    worst = f"ends at {transform.min():.1f} makes most of the first difference, one at {gradient.min():.1f} most of"
+    assert worst in PAGES["cartpole/README.md"]
 
 
 INTERVAL = re.compile(r"\[[+-]?\d[\d.,]*, [+-]?\d[\d.,]*\]")
