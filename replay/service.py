@@ -28,6 +28,7 @@ from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.messaging.wire import Message
 from coop.common.process.console import Console
 from coop.common.process.lifecycle import Stop
+from coop.common.process.memory import return_freed_memory
 from coop.common.transitions import DrawRequest
 from coop.replay.core import ReplayCore, Reply, RetryLater
 from coop.replay.gate import Gate
@@ -297,4 +298,5 @@ class ReplayService:
             if (left := until - self._node.now()) <= 0:
                 return Retry("the replay service is writing its part of the checkpoint").encode(self._node.run)
             yield left
+        return_freed_memory()
         return Ack(self._core.table.inserted).encode(self._node.run)

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from forked import forked_process
 from samples import make_segment, until
 from table_reference import check_references
 
 from coop.common.errors import RunError
+from coop.common.process.memory import keep_freed_memory
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.transitions import DrawRequest
 from coop.common.types import EnvSpec, EpisodeRecord
@@ -312,6 +314,30 @@ def test_learner_checkpoints(tmp_path: Path) -> None:
     assert finished(tmp_path) == [200]
     assert not (tmp_path / "checkpoints" / "500").exists()
     assert newest_checkpoint(tmp_path) is not None
+
+
+def resident() -> int:
+    """Bytes of memory that this process takes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+def _saves_one(folder: Path) -> None:
+    for name in RECORDS:
+        (folder / name).touch()
+    keep_freed_memory()
+    pieces = [bytes(4000) for _ in range(20_000)]
+    kept = pieces[::1000]
+    del pieces
+    before = resident()
+    save_learner(folder, 100, {"flat": torch.zeros(3)})
+    (folder / "freed").write_text(f"{before - resident()} {len(kept)}")
+
+
+def test_after_a_checkpoint_a_process_returns_what_it_has_freed(tmp_path: Path) -> None:
+    forked_process(_saves_one, tmp_path).join()
+    freed, kept = map(int, (tmp_path / "freed").read_text().split())
+    assert kept == 20
+    assert freed > 60e6, "of 80 MB"
 
 
 def test_a_checkpoint_that_is_saved_again_is_whole_meanwhile(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from coop.common.errors import CoopError, UsageError
 from coop.common.process.files import FileDigest, write_atomic
+from coop.common.process.memory import return_freed_memory
 from coop.common.process.output import warn
 from coop.common.process.untrusted import check_torch_file
 from coop.records.checkpoints import (
@@ -63,9 +64,7 @@ def saving_checkpoint(
         remove(path)
     try:
         begin(path)
-        content = io.BytesIO()
-        torch.save(learner_state, content)
-        files = {LEARNER: write_atomic(path / LEARNER, content.getvalue())}
+        files = {LEARNER: _write(path / LEARNER, learner_state)}
         yield path
         manifest = Manifest(run_id, number, files, dict(records), list(fallbacks), settings=settings)
         finish(run_dir, path, manifest)
@@ -75,6 +74,13 @@ def saving_checkpoint(
         remove(path)
         raise
     remove_old(run_dir, number)
+    return_freed_memory()
+
+
+def _write(path: Path, state: dict[str, Any]) -> FileDigest:
+    content = io.BytesIO()
+    torch.save(state, content)
+    return write_atomic(path, content.getvalue())
 
 
 def _whole(path: Path, number: int, run_id: int) -> Manifest | None:
