@@ -16,6 +16,7 @@ from coop.common.process.console import say, stamped
 from coop.common.process.files import make_folder, write_atomic
 from coop.common.process.flags import HttpAddress
 from coop.common.process.lifecycle import Stop, run_main
+from coop.common.process.limits import MIB, check_processes
 from coop.common.process.ports import check_can_listen, check_loopback
 from coop.common.process.processes import ChildProcess, command, reserve_endpoint
 from coop.common.settings.capacity import check_memory, check_messages
@@ -33,6 +34,7 @@ TICK = 0.1  # seconds
 GRACE = 30.0  # seconds for a role's clean stop
 LAST_WORDS = 5.0  # seconds for the news that the run is over, which has reached another role
 JOIN_TIMEOUT = 3600.0  # seconds; this process notices the learner's end itself, and a busy machine may start it slowly
+ACTOR_BYTES = 32 * MIB  # the least that an actor process takes
 
 
 @dataclass(frozen=True)
@@ -179,6 +181,7 @@ def _run() -> None:
         options = replace(options, replay=replace(options.replay, offline=True))
     if options.actors < (0 if options.listen or options.replay.offline else 1):
         raise UsageError(f"--actors {options.actors}: must be at least 1, or 0 with --listen or --replay.preload")
+    check_processes("--actors", options.actors, ACTOR_BYTES)
     config = options.run_config()
     check_distributed(config)
     check_loopback()

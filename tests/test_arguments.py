@@ -99,6 +99,10 @@ def test_paths_that_no_file_system_takes(path: str, tmp_path: Path, monkeypatch:
         (lambda path: coop.tune(GRID, path, seed=-1), "seed = -1: must be a whole number from 0"),
         (lambda path: coop.sweep(GRID, path, stack="2"), "stack = '2': must be a whole number from 1 on"),
         (lambda path: coop.sweep(GRID, path, jobs="2"), "jobs = '2': must be a whole number from 1 on"),
+        (
+            lambda path: coop.sweep(GRID, path, jobs=10**6),
+            "jobs 1,000,000: need 62,500.0 GiB and more; this machine has",
+        ),
         (lambda path: coop.sweep({5: {}}, path), "grid: .*5"),
         (lambda path: coop.sweep({"fixed": {"seed": WRONG}}, path), "grid: .*object"),
     ],

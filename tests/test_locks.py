@@ -222,3 +222,20 @@ def test_who_looks_keeps_nobody_out(tmp_path: Path) -> None:
         timer.start()
         RunLock(tmp_path, "coop-learner", ("learner",)).release()
         timer.join()
+
+
+def test_a_child_that_users_code_has_left_holds_no_folder(tmp_path: Path) -> None:
+    lock = RunLock(tmp_path, "coop-lockstep", ("learner",)).sign()
+    left, asked = os.pipe()
+    child = os.fork()
+    if not child:
+        os.close(asked)
+        os.read(left, 1)
+        os._exit(0)
+    lock.release()
+    try:
+        RunLock(tmp_path, "coop-lockstep", ("learner",)).release()
+    finally:
+        os.close(asked)
+        os.waitpid(child, 0)
+        os.close(left)

@@ -18,6 +18,7 @@ from commands import run_command
             ["replay.capacity = 1,000,000,000: needs up to 6647.8 GiB, this machine has"],
         ),
         ("--actors 0", ["--actors 0: must be at least 1, or 0 with --listen"]),
+        ("--actors 1000000", ["--actors 1,000,000: need 31,250.0 GiB and more; this machine has"]),
         ("--actors=-1 --listen tcp/127.0.0.1:0", ["--actors -1: must be at least 1, or 0 with --listen"]),
     ],
 )

@@ -79,6 +79,34 @@ def test_lockstep_says_how_it_ended_and_goes_on(tmp_path: Path) -> None:
     assert done.stdout.startswith("resuming from checkpoint ")
 
 
+@pytest.mark.parametrize("taken", ["SIG_DFL", "lambda *_: None", "lambda *_: sys.exit(0)"])
+def test_an_environment_that_takes_the_signals_loses_no_run(taken: str, tmp_path: Path) -> None:
+    (tmp_path / "taking.py").write_text(TAKING.format(taken))
+    flags = ("--env.id", "taking:Taking-v0", "--total-steps", "100000", "--run-dir", "run")
+    with Command("coop-lockstep", *flags, cwd=tmp_path) as run:
+        wait_for("the first metrics", lambda: lines(tmp_path / "run" / "metrics.jsonl") >= 1)
+        run.send_signal(signal.SIGTERM)
+        _, err = run.communicate(timeout=60)
+    assert (run.returncode, err) == (143, "")
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["exit"] == "interrupted"
+
+
+TAKING = """
+import signal, sys
+import gymnasium
+from gymnasium.envs.classic_control import CartPoleEnv
+from signal import SIG_DFL
+
+class Taking(CartPoleEnv):
+    def __init__(self):
+        super().__init__()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, {})
+
+gymnasium.register("Taking-v0", Taking, max_episode_steps=200)
+"""
+
+
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_whole_run_on_one_machine(number: signal.Signals, status: int, tmp_path: Path) -> None:
     path = tmp_path / "run"

@@ -179,6 +179,7 @@ def test_bad_flags_are_refused_before_anything_runs(
         ([str(grid), "--quick"], "it has no table [quick]"),
         ([str(grid), "--cell", "x"], "--cell x: not in the grid"),
         ([str(grid), "--jobs", "0"], "--jobs 0: must be at least 1"),
+        ([str(grid), "--jobs", "1000000"], "--jobs 1,000,000: need 62,500.0 GiB and more; this machine has"),
         ([str(tmp_path / "none.toml")], "No such file"),
         (["small-bufers"], "small-buffers"),
     ):

@@ -33,6 +33,7 @@ _OUT_OF_PROCESSES = (  # or of memory
     (BaseException, "can't spawn worker thread"),  # Zenoh's, which is no Exception
 )
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+Handler = Callable[[int, FrameType | None], None]
 
 
 class ProcessExit(SystemExit):
@@ -70,6 +71,7 @@ class Stop:
         self.reason = ""
         self.failed = False
         self.exit_status = 0
+        self._handler: Handler | None = None
 
     def set(self, reason: str, failed: bool = False, exit_status: int = 0) -> None:
         """Request the stop; a later call does not change the reason, `failed` or `exit_status`."""
@@ -82,6 +84,8 @@ class Stop:
         """True once a stop was requested, or once this process's supervisor has gone."""
         if self._parent is not None and os.getppid() != self._parent:
             self.set("the supervisor is gone")
+        if self._handler is not None and {signal.getsignal(number) for number in SIGNALS[:2]} != {self._handler}:
+            self._take_signals(self._handler)  # users' code has taken them over
         return self._set
 
     def wait(self, seconds: float) -> bool:
@@ -107,9 +111,14 @@ class Stop:
             received.add(number)
             self.set("interrupted", exit_status=status_after(number))
 
-        _handle(handle)
+        self._take_signals(handle)
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # under nohup, output may go away
             on_output_gone(lambda: self.set("interrupted", exit_status=status_after(signal.SIGPIPE)))
+
+    def _take_signals(self, handler: Handler) -> None:
+        self._handler = handler
+        if threading.current_thread() is threading.main_thread():
+            _handle(handler)
 
     def raise_for_status(self) -> None:
         """End the process with the status that the stop requires; return if that is 0.
@@ -160,7 +169,7 @@ def raise_on_signals() -> None:
     _handle(handle)
 
 
-def _handle(handler: Callable[[int, FrameType | None], None]) -> None:
+def _handle(handler: Handler) -> None:
     """Handle the signals that end a process; not SIGHUP where nohup has it ignored."""
     for number in SIGNALS:
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:

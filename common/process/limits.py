@@ -16,6 +16,8 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+from coop.common.errors import UsageError
+
 ROOT = Path("/")
 UNLIMITED = 2**60  # bytes; version 1 writes "no limit" as the largest number of pages
 MIB = 2**20
@@ -50,6 +52,13 @@ def memory_limit(root: Path = ROOT, environment: Mapping[str, str] | None = None
                 found.append(MemoryLimit(size, f"the control group's {file} allows"))
     found += _of_slurm(variables)
     return min(found)
+
+
+def check_processes(flag: str, number: int, least: int) -> None:
+    """Raise UsageError for processes of at least `least` bytes each that do not fit into the memory of this job."""
+    limit = memory_limit()
+    if number * least > limit.size:
+        raise UsageError(f"{flag} {number:,}: need {number * least / 2**30:,.1f} GiB and more; {limit}")
 
 
 def _of_slurm(variables: Mapping[str, str]) -> Iterator[MemoryLimit]:

@@ -143,6 +143,8 @@ class FileLock:
                 content = b"" if self.signed else self._before
                 os.pwrite(self.descriptor, content, 0)
                 os.ftruncate(self.descriptor, len(content))
+            with contextlib.suppress(OSError):
+                fcntl.flock(self.descriptor, fcntl.LOCK_UN)  # not by closing it: users' code may have forked
         self.hand_over()
 
 

@@ -21,14 +21,14 @@ from coop.common.places import absolute, shown
 from coop.common.process.cli import parse
 from coop.common.process.console import say
 from coop.common.process.lifecycle import Stop, run_main
-from coop.common.process.limits import cores
+from coop.common.process.limits import check_processes, cores
 from coop.common.settings.starting import settings_line, source_of
 from coop.monitor.display import LiveDisplay
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.studies.sweep import slurm
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
 from coop.studies.sweep.grid import Grid, GridFile, load_grid
-from coop.studies.sweep.local import LocalProcesses
+from coop.studies.sweep.local import CELL_BYTES, LocalProcesses
 from coop.studies.sweep.runner import Executor, Runner
 from coop.studies.sweep.stacking import stacks_of
 
@@ -129,6 +129,8 @@ def _run() -> None:
         if options.slurm:
             raise UsageError("--dask and --slurm: give one of them")
         check_extra("--dask", "dask", "distributed")
+    if options.dask is None and not options.slurm:
+        check_processes("--jobs", options.jobs or 1, CELL_BYTES)
     grid = load_grid(options.grid, options.quick)
     folder = options.dir or absolute(default_folder(options.grid, options.quick))
     cells = chosen(options, grid, folder)

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from coop.common.errors import RunError
-from coop.common.process.limits import cores
+from coop.common.process.limits import MIB, cores
 from coop.common.process.processes import ChildProcess, command
 from coop.records.locks import RunLock
 from coop.studies.sweep.folder import CellFolder, Ending
@@ -21,6 +21,7 @@ from coop.studies.sweep.stacking import Stacks
 TOGETHER = "coop.lockstep.compiled.together"  # the module that plays several cells
 # By default, the libraries that a run uses start a thread per core, and concurrent runs would starve each other.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+CELL_BYTES = 64 * MIB  # the least that a process of a cell takes
 
 
 def cards() -> list[str]:

@@ -13,14 +13,14 @@ import pandas as pd
 from coop.common.arguments import check_whole
 from coop.common.errors import UsageError
 from coop.common.places import absolute
-from coop.common.process.limits import cores
+from coop.common.process.limits import check_processes, cores
 from coop.common.settings.config import value_of
 from coop.evaluation.notebook import table_html
 from coop.records.sinks import DEFAULT_LOG, chosen_sinks
 from coop.records.summaries import read_summary
 from coop.studies.sweep.folder import CellFolder, claim_folder, default_folder
 from coop.studies.sweep.grid import grid_text, load_grid, parse_grid
-from coop.studies.sweep.local import LocalProcesses
+from coop.studies.sweep.local import CELL_BYTES, LocalProcesses
 from coop.studies.sweep.runner import Runner
 from coop.studies.sweep.stacking import stacks_of
 
@@ -72,6 +72,7 @@ def sweep(
     for name, value in (("jobs", jobs), ("stack", stack)):
         if value is not None:
             check_whole(name, value, 1)
+    check_processes("jobs", jobs or 1, CELL_BYTES)
     names = ",".join(chosen_sinks(log)) or "none"
     if isinstance(grid, Mapping):
         if folder is None:
