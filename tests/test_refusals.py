@@ -18,12 +18,16 @@ from commands import run_command
             ["replay.capacity = 1,000,000,000: needs up to 6647.8 GiB, this machine has"],
         ),
         ("--actors 0", ["--actors 0: must be at least 1, or 0 with --listen"]),
-        ("--actors 1000000", ["--actors 1,000,000: need 31,250.0 GiB and more; this machine has"]),
         ("--actors=-1 --listen tcp/127.0.0.1:0", ["--actors -1: must be at least 1, or 0 with --listen"]),
     ],
 )
 def test_refused(flags: str, words: list[str], tmp_path: Path) -> None:
     check(flags.split(), tmp_path / "run", words)
+
+
+def test_more_actors_than_the_memory_holds_are_refused(tmp_path: Path) -> None:
+    line = "--actors 4: need 0.1 GiB and more; Slurm's job has (SLURM_MEM_PER_NODE) 0.1 GiB"
+    check(["--actors", "4"], tmp_path / "run", [line], {"SLURM_MEM_PER_NODE": "100"})
 
 
 def test_a_missing_rom_is_refused(tmp_path: Path) -> None:
