@@ -224,6 +224,21 @@ def test_costs_see_the_step_in_tensors() -> None:
         np.testing.assert_array_equal(getattr(inner, name).numpy(), getattr(outer, name), strict=True)
 
 
+def test_td_errors_towards_own_targets_see_the_batch_and_diverge_quietly() -> None:
+    agent, (batch,) = agent_of("dqn"), batches(1)
+    assert agent.own_td_errors(batch) is None
+    rule = agent.rule = Sees(agent.config, np.random.default_rng(0))
+    plain = agent.own_td_errors(batch)
+    assert plain is not None
+    assert rule.outer.batch is batch
+    np.testing.assert_array_equal(agent.update(batch).td_errors, plain)
+    for network in agent.networks:
+        network.load(1e38 * network.snapshot())
+    diverged = agent.own_td_errors(batch)  # pytest makes an error of every warning
+    assert diverged is not None
+    assert not np.isfinite(diverged).all()
+
+
 def test_a_rule_gets_numpy_unless_its_own_class_says_otherwise() -> None:
     class Plain(UpdateRule):
         pass

@@ -76,6 +76,29 @@ def test_what_a_policy_sees_and_refuses() -> None:
     assert sorted(table.sample(200).rewards.astype(int).tolist())[:1] == [0]
 
 
+def test_a_policy_that_uses_no_episodes_is_told_of_none() -> None:
+    class Without(Refusing):
+        episodes = False
+
+    table_of(Without).insert(make_segment(SPEC, episodes=ends(1, 2)))
+    assert (SEEN["episodes"].tolist(), SEEN["episodes"].dtype) == ([0] * 4, np.int64)
+    assert (SEEN["table"].episodes.shape, SEEN["table"].episodes.dtype) == ((0,), np.int64)
+
+
+def test_a_sampling_sees_episodes_whatever_the_eviction() -> None:
+    class Counting(Sampling):
+        episodes = True
+
+        def draw(self, count: int, size: int) -> Any:
+            SEEN["episodes"] = self.table.episodes[:size].tolist()
+            return np.arange(count), np.ones(count)
+
+    table = table_of(Counting)
+    table.insert(make_segment(SPEC, episodes=ends(1, 2)))
+    table.sample(1)
+    assert SEEN["episodes"] == [0, 0, 1, 2]
+
+
 def test_stacked_observations() -> None:
     spec = EnvSpec("any", (2,), "float32", 3, 3)
     table = table_of(Refusing, spec=spec)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,12 @@ def test_streams_used_least_recently_give_their_frames_back(monkeypatch: pytest.
     assert table_stats(table).frames_held == 5 + 2 * 2
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the memory that is shared")
+def test_frames_are_shared_only_where_that_is_asked_for(spec: EnvSpec) -> None:
+    assert Table(spec, 5, rng=np.random.default_rng(0)).shared_memory == ""
+    assert Table(spec, 5, rng=np.random.default_rng(0), shared_memory=True).shared_memory != ""
+
+
 def test_a_batch_has_each_frame_once() -> None:
     table = Table(make_spec(4), 10, rng=np.random.default_rng(0))
     table.insert(Stream(make_spec(4), 0, np.random.default_rng(0), 50).segment(10))
@@ -136,6 +143,24 @@ def test_priorities_of_evicted_transitions_are_ignored(eviction: str) -> None:
     assert table._columns.priorities.tolist() == [1.0] * 4
     table.insert(stream.segment(1))
     assert table._columns.priorities.tolist() == [1.0] * 4
+
+
+def test_priorities_of_what_has_not_come_yet_are_ignored() -> None:
+    table = Table(make_spec(1), 4, sampling="prioritized", rng=np.random.default_rng(0))
+    table.update_priorities(np.array([0]), np.array([9.0]))
+    table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(2))
+    assert table._columns.priorities[:2].tolist() == [1.0, 1.0]
+
+
+def test_priorities_count_in_double_precision() -> None:
+    found = []
+    for dtype in (np.float32, np.float64):
+        table = Table(make_spec(1), 4, sampling="prioritized", rng=np.random.default_rng(0))
+        table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(4))
+        table.update_priorities(np.arange(4), np.array([0.1, 0.2, 0.3, 0.7], np.float32).astype(dtype))
+        sampling: Any = table._sampling
+        found.append(sampling._tree.values(np.arange(4)))
+    np.testing.assert_array_equal(*found)
 
 
 def test_priorities_find_a_transition_in_whatever_row_it_is() -> None:
@@ -223,6 +248,10 @@ def test_misuse_is_refused() -> None:
         ({"priority_exponent": 0.5}, "priority_exponent: 0.5, but the saved table had 0.6"),
         ({"importance_exponent": 0.5}, "importance_exponent: 0.5, but the saved table had 0.4"),
         ({"spec": make_spec(2)}, r"spec: \['test', .*2, 5\], but the saved table had \['test', .*1, 5\]"),
+        (
+            {"spec": replace(make_spec(1), masks=True)},
+            r"spec: \['test', .*1, 5, True\], but the saved table had \['test', .*1, 5\]",
+        ),
     ],
 )
 def test_a_table_of_other_settings_is_not_restored(change: dict[str, Any], words: str) -> None:
