@@ -49,6 +49,8 @@ def test_only_tensors_change_their_dtype() -> None:
 @LIBRARIES
 def test_a_column_of_each_row_is_read_and_written(make: Any) -> None:
     values, actions = make([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), make([2, 0])
-    assert chosen(values, actions).tolist() == [3.0, 4.0]
-    assert placed(make([7.0, 8.0]), actions, values).tolist() == [[0.0, 0.0, 7.0], [8.0, 0.0, 0.0]]
+    read, written = chosen(values, actions), placed(make([7.0, 8.0]), actions, values)
+    assert type(read) is type(written) is type(values)
+    assert read.tolist() == [3.0, 4.0]
+    assert written.tolist() == [[0.0, 0.0, 7.0], [8.0, 0.0, 0.0]]
     assert values.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]

@@ -392,7 +392,9 @@ def test_the_checksum_of_what_is_preloaded_is_of_all_fields_and_segments(spec: E
 def test_frames_that_are_pinned_are_read_by_their_slots(spec: EnvSpec) -> None:
     table = Table(spec, 8, rng=np.random.default_rng(0))
     table.insert(make_segment(spec, 0, 8))
-    pinned = table.sample_pinned(5).frames
+    drawn = table.sample_pinned(5)
+    batch, pinned = drawn.read(), drawn.frames
+    np.testing.assert_array_equal(batch.frames[batch.obs_index[:, 0], 0], batch.ids)
     stored = table.stored(pinned.slots)
     np.testing.assert_array_equal(stored.read(), pinned.read(), strict=True)
     assert (len(stored), stored.shape, stored.dtype, stored.nbytes) == (
