@@ -348,6 +348,18 @@ def test_a_rule_is_made_of_the_config_and_the_generator_or_names_the_method() ->
         agent_of("test_own_methods:Unmade")
 
 
+def test_values_of_a_rule_become_those_of_the_networks_library() -> None:
+    class Elsewhere(UpdateRule):
+        on_device = True
+
+        def bootstrap(self, next_values: Any, preferred: Any) -> Any:
+            return next_values.numpy().max(1).astype(np.float64)
+
+    agent, values = agent_of("dqn"), torch.rand(4, 2)
+    rule: Any = OwnRule(Elsewhere(agent.config, np.random.default_rng(0)), "method = 'elsewhere'")
+    torch.testing.assert_close(rule.bootstrap(values, values), values.amax(1))
+
+
 def test_targets_of_another_shape_are_refused() -> None:
     class Wide(UpdateRule):
         def targets(self, step: Any) -> Any:
