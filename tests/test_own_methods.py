@@ -315,10 +315,10 @@ def failing(*arguments: Any) -> Any:
         (Answering, "metrics", lambda: {1: 2.0}, UsageError, ": metrics gives the name 1, must be a text"),
         (Answering, "bootstrap", failing, RunError, r" raised SystemExit: no licence \(test_own_methods.py:\d+\)$"),
         (Answering, "metrics", lambda: {"x": "a"}, UsageError, ": metrics gives 'x' as str, must be a number"),
-        (Answering, "metrics", lambda: None, UsageError, ": metrics gives NoneType, must be a table"),
+        (Answering, "metrics", list, UsageError, ": metrics gives list, must be a table"),
         (Answering, "state", lambda: {"x": object()}, UsageError, ": state can't be saved"),
         (Answering, "state", lambda: {"x": lambda: 0}, UsageError, ": state can't be saved"),
-        (Answering, "state", lambda: None, UsageError, ": state gives NoneType, must be a dict"),
+        (Answering, "state", list, UsageError, ": state gives list, must be a dict"),
         (Costing, "loss", lambda step, q: q.sum(1), UsageError, r": loss gives a tensor of shape \[32\], must be"),
         (Costing, "loss", lambda step, q: q.detach().sum(), UsageError, ": loss gives a tensor that does not depend"),
         (Costing, "loss", lambda step, q: 1.0, UsageError, ": loss gives float, must be a tensor of one"),
@@ -348,16 +348,23 @@ def test_a_rule_is_made_of_the_config_and_the_generator_or_names_the_method() ->
         agent_of("test_own_methods:Unmade")
 
 
-def test_values_of_a_rule_become_those_of_the_networks_library() -> None:
+@pytest.mark.parametrize("convert", [torch.Tensor.double, lambda values: values.double().numpy()])
+def test_values_of_a_rule_become_those_of_the_networks_library(convert: Any) -> None:
     class Elsewhere(UpdateRule):
         on_device = True
 
         def bootstrap(self, next_values: Any, preferred: Any) -> Any:
-            return next_values.numpy().max(1).astype(np.float64)
+            return convert(next_values.amax(1))
 
     agent, values = agent_of("dqn"), torch.rand(4, 2)
     rule: Any = OwnRule(Elsewhere(agent.config, np.random.default_rng(0)), "method = 'elsewhere'")
     torch.testing.assert_close(rule.bootstrap(values, values), values.amax(1))
+
+
+def test_the_state_of_a_rule_is_a_part_of_the_agent_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = {"count": 3, "seen": [0.5, "a"], "values": torch.ones(2)}
+    monkeypatch.setattr(Answering, "answers", {"state": lambda: state})
+    assert agent_of("test_own_methods:Answering").state()["rule"] is state
 
 
 def test_targets_of_another_shape_are_refused() -> None:
