@@ -56,7 +56,7 @@ class QNetwork:
         self.double, self.value_bound = config.learner.double, config.learner.value_bound
         example = None if config.feedback == "none" else sample_inputs(spec, 8).to(network.flat.device)
         try:
-            self._trained = Trainable(network, True, example)
+            self._trained = Trainable(network, example)
         except UnsupportedLayerError as error:
             raise UsageError(f"network.kind = {config.network.kind!r}: {error}") from error
         self.plain = not isinstance(self._trained.backprop, AutogradBackprop)
@@ -65,7 +65,7 @@ class QNetwork:
             raise UsageError(
                 f"network.dtype = {config.network.dtype!r}: allowed: 'float32' with network.kind = {kind!r}; {stacks}"
             )
-        self._passes = self._trained if half is None else Trainable(half, True, None)
+        self._passes = self._trained if half is None else Trainable(half, None)
         self.in_numpy = self._passes.in_numpy
         self._rule = FeedbackRule(self._passes.backprop, config.feedback, config.seed, rng)
         self._spec = spec

@@ -252,3 +252,8 @@ def test_a_run_that_diverges_goes_on_quietly(method: str) -> None:
     for batch in batches(3):  # pytest makes an error of every warning
         result = agent.update(batch)
     assert not np.isfinite(result.td_errors).all()
+
+
+def test_updates_of_a_cpu_are_neither_recorded_nor_read_late() -> None:
+    agent = Agent(_config("coop"), SPEC)
+    assert (agent.lag, agent.eager, agent._recorded) == (0, "", None)

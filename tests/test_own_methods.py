@@ -18,6 +18,7 @@ from coop.common.errors import CoopError, JoinError, RunError, UsageError
 from coop.common.imports import permit
 from coop.common.messaging import wire
 from coop.common.messaging.messages.control import JoinReply
+from coop.common.networks import network as network_module
 from coop.common.settings.tables import resolve
 from coop.common.transitions import Batch
 from coop.learner.agent import Agent
@@ -224,6 +225,26 @@ def test_costs_see_the_step_in_tensors() -> None:
         np.testing.assert_array_equal(getattr(inner, name).numpy(), getattr(outer, name), strict=True)
 
 
+@pytest.mark.parametrize("library", ["numpy", "torch"])
+def test_td_errors_towards_own_targets_see_the_batch_and_diverge_quietly(
+    library: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if library == "torch":
+        monkeypatch.setattr(network_module, "_in_numpy", lambda module: None)
+    agent, (batch,) = agent_of("dqn"), batches(1)
+    assert agent.own_td_errors(batch) is None
+    rule = agent.rule = Sees(agent.config, np.random.default_rng(0))
+    plain = agent.own_td_errors(batch)
+    assert plain is not None
+    assert rule.outer.batch is batch
+    np.testing.assert_allclose(agent.update(batch).td_errors, plain, rtol=1e-6)
+    for network in agent.networks:
+        network.load(1e38 * network.snapshot())
+    diverged = agent.own_td_errors(batch)  # pytest makes an error of every warning
+    assert diverged is not None
+    assert not np.isfinite(diverged).all()
+
+
 def test_a_rule_gets_numpy_unless_its_own_class_says_otherwise() -> None:
     class Plain(UpdateRule):
         pass
@@ -276,12 +297,28 @@ def failing(*arguments: Any) -> Any:
             UsageError,
             r": bootstrap gives complex64\[32\]",
         ),
+        (Answering, "bootstrap", lambda values, _: values.max(1) > 0, UsageError, r": bootstrap gives bool\[32\]"),
+        (
+            Answering,
+            "bootstrap",
+            lambda values, _: torch.zeros(32, dtype=torch.bool),
+            UsageError,
+            r": bootstrap gives bool\[32\], must be float32\[32\]$",
+        ),
+        (
+            Answering,
+            "bootstrap",
+            lambda values, _: torch.zeros(32, dtype=torch.complex64),
+            UsageError,
+            r": bootstrap gives complex64\[32\]",
+        ),
+        (Answering, "metrics", lambda: {1: 2.0}, UsageError, ": metrics gives the name 1, must be a text"),
         (Answering, "bootstrap", failing, RunError, r" raised SystemExit: no licence \(test_own_methods.py:\d+\)$"),
         (Answering, "metrics", lambda: {"x": "a"}, UsageError, ": metrics gives 'x' as str, must be a number"),
-        (Answering, "metrics", lambda: None, UsageError, ": metrics gives NoneType, must be a table"),
+        (Answering, "metrics", list, UsageError, ": metrics gives list, must be a table"),
         (Answering, "state", lambda: {"x": object()}, UsageError, ": state can't be saved"),
         (Answering, "state", lambda: {"x": lambda: 0}, UsageError, ": state can't be saved"),
-        (Answering, "state", lambda: None, UsageError, ": state gives NoneType, must be a dict"),
+        (Answering, "state", list, UsageError, ": state gives list, must be a dict"),
         (Costing, "loss", lambda step, q: q.sum(1), UsageError, r": loss gives a tensor of shape \[32\], must be"),
         (Costing, "loss", lambda step, q: q.detach().sum(), UsageError, ": loss gives a tensor that does not depend"),
         (Costing, "loss", lambda step, q: 1.0, UsageError, ": loss gives float, must be a tensor of one"),
@@ -295,6 +332,39 @@ def test_what_a_rule_raises_or_gives_wrongly_names_the_method(
     run = getattr(agent.rule, name) if name in ("metrics", "state") else partial(agent.update, batches(1)[0])
     with pytest.raises(kind, match=f"^method = 'test_own_methods:{rule.__name__}'{words}"):
         run()
+
+
+class Unmade(UpdateRule):
+    def __init__(self, config: Any, rng: Any) -> None:
+        raise ValueError("no licence")
+
+
+def test_a_rule_is_made_of_the_config_and_the_generator_or_names_the_method() -> None:
+    agent = agent_of("test_own_methods:Answering")
+    assert (type(agent.rule), agent.rule.config) == (OwnRule, agent.config)
+    assert agent.rule.rng is agent._noise
+    assert type(agent_of("dqn").rule) is UpdateRule
+    with pytest.raises(RunError, match=r"^method = 'test_own_methods:Unmade' raised ValueError: no licence"):
+        agent_of("test_own_methods:Unmade")
+
+
+@pytest.mark.parametrize("convert", [torch.Tensor.double, lambda values: values.double().numpy()])
+def test_values_of_a_rule_become_those_of_the_networks_library(convert: Any) -> None:
+    class Elsewhere(UpdateRule):
+        on_device = True
+
+        def bootstrap(self, next_values: Any, preferred: Any) -> Any:
+            return convert(next_values.amax(1))
+
+    agent, values = agent_of("dqn"), torch.rand(4, 2)
+    rule: Any = OwnRule(Elsewhere(agent.config, np.random.default_rng(0)), "method = 'elsewhere'")
+    torch.testing.assert_close(rule.bootstrap(values, values), values.amax(1))
+
+
+def test_the_state_of_a_rule_is_a_part_of_the_agent_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = {"count": 3, "seen": [0.5, "a"], "values": torch.ones(2)}
+    monkeypatch.setattr(Answering, "answers", {"state": lambda: state})
+    assert agent_of("test_own_methods:Answering").state()["rule"] is state
 
 
 def test_targets_of_another_shape_are_refused() -> None:

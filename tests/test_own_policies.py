@@ -54,13 +54,15 @@ def ends(*steps: int) -> tuple[EpisodeEnd, ...]:
 def test_what_a_policy_sees_and_refuses() -> None:
     """Rewards, and the first number of an observation, count transitions; episodes end behind the 2nd and the 3rd."""
     table = table_of(Refusing)
-    table.insert(make_segment(SPEC, 0, 4, episodes=ends(1, 2), actions=np.arange(4, dtype=np.int32) % 3))
+    actions, terminated = np.arange(4, dtype=np.int32) % 3, np.array([False, False, True, False])
+    table.insert(make_segment(SPEC, 0, 4, episodes=ends(1, 2), actions=actions, terminated=terminated))
     assert (len(table), table.inserted, table.evicted_unsampled) == (2, 4, 2)
     assert SEEN["episodes"].tolist() == [0, 0, 1, 2]
     assert (SEEN["observations"][:, 0].tolist(), SEEN["next"][:, 0].tolist()) == ([0, 1, 2, 3], [1, 2, 3, 4])
     view, rows = SEEN["table"], np.arange(2)
     assert view.observations(rows)[:, 0].tolist() == [0, 2]
     assert view.next_observations(rows)[:, 0].tolist() == [1, 3]
+    assert view.terminated[:2].tolist() == [False, True]
     assert (view.rewards[:2].tolist(), view.actions[:2].tolist(), view.episodes[:2].tolist()) == (
         [0, 2],
         [0, 2],
@@ -74,6 +76,29 @@ def test_what_a_policy_sees_and_refuses() -> None:
     assert SEEN["episodes"].tolist() == [2, 2, 2, 2]
     assert len(table) == 6
     assert sorted(table.sample(200).rewards.astype(int).tolist())[:1] == [0]
+
+
+def test_a_policy_that_uses_no_episodes_is_told_of_none() -> None:
+    class Without(Refusing):
+        episodes = False
+
+    table_of(Without).insert(make_segment(SPEC, episodes=ends(1, 2)))
+    assert (SEEN["episodes"].tolist(), SEEN["episodes"].dtype) == ([0] * 4, np.int64)
+    assert (SEEN["table"].episodes.shape, SEEN["table"].episodes.dtype) == ((0,), np.int64)
+
+
+def test_a_sampling_sees_episodes_whatever_the_eviction() -> None:
+    class Counting(Sampling):
+        episodes = True
+
+        def draw(self, count: int, size: int) -> Any:
+            SEEN["episodes"] = self.table.episodes[:size].tolist()
+            return np.arange(count), np.ones(count)
+
+    table = table_of(Counting)
+    table.insert(make_segment(SPEC, episodes=ends(1, 2)))
+    table.sample(1)
+    assert SEEN["episodes"] == [0, 0, 1, 2]
 
 
 def test_stacked_observations() -> None:

@@ -163,8 +163,12 @@ def test_a_failed_recording_is_told_and_leaves_the_agent_as_it_was(capsys: pytes
 @pytest.mark.parametrize(
     ("method", "tables", "reason"),
     [
-        ("coop", {"edl": {"feedback": "weight-gradient"}}, "edl.feedback"),
-        ("medqn", {}, "medqn"),
+        (
+            "coop",
+            {"edl": {"feedback": "weight-gradient"}},
+            "edl.feedback = 'weight-gradient' decomposes matrices on the host",
+        ),
+        ("medqn", {}, "the rule of medqn uses the host"),
     ],
 )
 def test_what_is_not_recorded(method: str, tables: dict[str, Any], reason: str) -> None:
@@ -172,10 +176,11 @@ def test_what_is_not_recorded(method: str, tables: dict[str, Any], reason: str) 
     agent = Agent(
         resolve({"network": {"kind": "nips2013"}, "learner": learner, **tables}, method), PICTURES, plain_call
     )
-    assert reason in agent.eager
+    assert agent.eager == reason
     assert make_agent("coop").eager == ""
     vectors = EnvSpec("vectors", (4,), "float32", 1, 2)
-    assert "numpy" in Agent(resolve({"network": {"kind": "mlp"}}, method), vectors, plain_call).eager
+    small = Agent(resolve({"network": {"kind": "mlp"}}, method), vectors, plain_call)
+    assert small.eager == "the network is small and runs in numpy"
 
 
 class _Watch(TorchDispatchMode):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,12 @@ def test_streams_used_least_recently_give_their_frames_back(monkeypatch: pytest.
     assert table_stats(table).frames_held == 5 + 2 * 2
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the memory that is shared")
+def test_frames_are_shared_only_where_that_is_asked_for(spec: EnvSpec) -> None:
+    assert Table(spec, 5, rng=np.random.default_rng(0)).shared_memory == ""
+    assert Table(spec, 5, rng=np.random.default_rng(0), shared_memory=True).shared_memory != ""
+
+
 def test_a_batch_has_each_frame_once() -> None:
     table = Table(make_spec(4), 10, rng=np.random.default_rng(0))
     table.insert(Stream(make_spec(4), 0, np.random.default_rng(0), 50).segment(10))
@@ -136,6 +143,24 @@ def test_priorities_of_evicted_transitions_are_ignored(eviction: str) -> None:
     assert table._columns.priorities.tolist() == [1.0] * 4
     table.insert(stream.segment(1))
     assert table._columns.priorities.tolist() == [1.0] * 4
+
+
+def test_priorities_of_what_has_not_come_yet_are_ignored() -> None:
+    table = Table(make_spec(1), 4, sampling="prioritized", rng=np.random.default_rng(0))
+    table.update_priorities(np.array([0]), np.array([9.0]))
+    table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(2))
+    assert table._columns.priorities[:2].tolist() == [1.0, 1.0]
+
+
+def test_priorities_count_in_double_precision() -> None:
+    found = []
+    for dtype in (np.float32, np.float64):
+        table = Table(make_spec(1), 4, sampling="prioritized", rng=np.random.default_rng(0))
+        table.insert(Stream(make_spec(1), 0, np.random.default_rng(0), 50).segment(4))
+        table.update_priorities(np.arange(4), np.array([0.1, 0.2, 0.3, 0.7], np.float32).astype(dtype))
+        sampling: Any = table._sampling
+        found.append(sampling._tree.values(np.arange(4)))
+    np.testing.assert_array_equal(*found)
 
 
 def test_priorities_find_a_transition_in_whatever_row_it_is() -> None:
@@ -223,6 +248,10 @@ def test_misuse_is_refused() -> None:
         ({"priority_exponent": 0.5}, "priority_exponent: 0.5, but the saved table had 0.6"),
         ({"importance_exponent": 0.5}, "importance_exponent: 0.5, but the saved table had 0.4"),
         ({"spec": make_spec(2)}, r"spec: \['test', .*2, 5\], but the saved table had \['test', .*1, 5\]"),
+        (
+            {"spec": replace(make_spec(1), masks=True)},
+            r"spec: \['test', .*1, 5, True\], but the saved table had \['test', .*1, 5\]",
+        ),
     ],
 )
 def test_a_table_of_other_settings_is_not_restored(change: dict[str, Any], words: str) -> None:
@@ -294,19 +323,80 @@ def test_bytes_of_transitions(sampling: str, row: int) -> None:
 
 
 def test_what_has_come_in_twice_is_counted() -> None:
+    """Draws, priority and version may differ, the content not."""
     spec = EnvSpec("x", (4,), "float32", 1, 2)
-    table = Table(spec, 50, rng=np.random.default_rng(0))
+    table = Table(spec, 50, sampling="prioritized", rng=np.random.default_rng(0))
     for sequence in range(3):
         table.insert(make_segment(spec, sequence))
     assert table.repeated() == 0
-    table.insert(make_segment(spec, 1, incarnation=8))
+    table.sample(5)
+    table.update_priorities(np.arange(12), np.arange(12.0))
+    table.insert(make_segment(spec, 1, incarnation=8, param_version=np.full(4, 9)))
     assert table.repeated() == 4
     differences: list[dict[str, object]] = [
         {"actions": np.ones(4, np.int32)},
         {"rewards": np.full(4, -1.0, np.float32)},
         {"terminated": np.ones(4, np.bool_)},
         {"span": np.full(4, 2, np.uint8)},
+        {"frames": np.zeros((5, 4), np.float32), "carried": 0},
     ]
     for number, change in enumerate(differences):
         table.insert(make_segment(spec, 2, incarnation=10 + number, **change))  # type: ignore[arg-type]
-    assert (len(table), table.repeated()) == (32, 4)
+    assert (len(table), table.repeated()) == (36, 4)
+
+
+def test_preloaded_transitions_count_neither_as_inserted_nor_as_evicted(spec: EnvSpec) -> None:
+    table = Table(spec, 5, rng=np.random.default_rng(0))
+    for sequence in range(2):
+        table.preload(make_segment(spec, sequence))
+        table.sample(9)
+    assert (len(table), table.preloaded, table.inserted, table.numbered) == (5, 8, 0, 8)
+    assert table_stats(table).reuse_evicted == (0,) * 16
+    assert (table.evicted, table.evicted_unsampled) == (0, 0)
+    restored = Table(spec, 5, rng=np.random.default_rng(0))
+    restored.load_state(*whole_state(table))
+    for one in (table, restored):
+        one.insert(make_segment(spec, 2, steps=1, carried=0))
+        batch = one.sample(99)
+        assert sorted(set(batch.ids.tolist())) == [4, 5, 6, 7, 8]
+        np.testing.assert_array_equal(batch.age, 8 - batch.ids)
+        assert (one.preloaded, one.inserted, one.evicted, sum(table_stats(one).reuse_evicted)) == (8, 1, 1, 1)
+        with pytest.raises(ValueError, match="without transitions of the run"):
+            one.preload(make_segment(spec, 3))
+
+
+def test_the_checksum_of_what_is_preloaded_is_of_all_fields_and_segments(spec: EnvSpec) -> None:
+    changes: list[dict[str, object]] = [
+        {},
+        {"frames": np.ones((5, 4), np.float32)},
+        {"actions": np.ones(4, np.int32)},
+        {"rewards": np.ones(4, np.float32)},
+        {"terminated": np.ones(4, np.bool_)},
+        {"span": np.full(4, 2, np.uint8)},
+    ]
+    sums = set()
+    for change in changes:
+        one, other = (Table(spec, 20, rng=np.random.default_rng(0)) for _ in range(2))
+        for table in (one, other):
+            assert table.preload_sum == 0
+            table.preload(make_segment(spec, 0, **change))  # type: ignore[arg-type]
+            table.preload(make_segment(spec, 1))
+        assert one.preload_sum == other.preload_sum
+        sums.add(one.preload_sum)
+        restored = Table(spec, 20, rng=np.random.default_rng(0))
+        restored.load_state(*whole_state(one))
+        assert restored.preload_sum == one.preload_sum
+    assert len(sums) == len(changes)
+
+
+def test_frames_that_are_pinned_are_read_by_their_slots(spec: EnvSpec) -> None:
+    table = Table(spec, 8, rng=np.random.default_rng(0))
+    table.insert(make_segment(spec, 0, 8))
+    drawn = table.sample_pinned(5)
+    batch, pinned = drawn.read(), drawn.frames
+    np.testing.assert_array_equal(batch.frames[batch.obs_index[:, 0], 0], batch.ids)
+    stored = table.stored(pinned.slots)
+    np.testing.assert_array_equal(stored.read(), pinned.read(), strict=True)
+    assert (len(stored), stored.shape, stored.dtype, stored.nbytes) == (
+        len(pinned), pinned.shape, pinned.dtype, pinned.read().nbytes,
+    )  # fmt: skip

@@ -32,9 +32,9 @@ class Trainable:
     theta: Any
     gradient: Any
 
-    def __init__(self, network: FlatNetwork, in_numpy: bool, example: Tensor | None) -> None:
-        """in_numpy: use numpy if the network has a form in numpy. example: see `make_backprop`, which may raise."""
-        form = network.in_numpy if in_numpy and isinstance(network.in_numpy, Dense) else None
+    def __init__(self, network: FlatNetwork, example: Tensor | None) -> None:
+        """example: see `make_backprop`, which may raise."""
+        form = network.in_numpy if isinstance(network.in_numpy, Dense) else None
         self.in_numpy = form is not None
         self.values = form or network
         theta, gradient = network.flat, torch.zeros_like(network.flat)
