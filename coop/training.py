@@ -23,6 +23,7 @@ from coop.common.process.processes import ChildProcess, command
 from coop.common.settings.config import MAY_NAME_MODULES, RunConfig, check_distributed
 from coop.common.settings.effects import without_effect
 from coop.common.settings.overrides import leaves, merged
+from coop.common.settings.reading import with_numbers
 from coop.common.settings.resuming import settings_digest
 from coop.common.settings.starting import env_id_of, stated
 from coop.common.settings.tables import to_tables, to_toml, validated
@@ -240,6 +241,7 @@ def _options(
     if preset is not None and file is not None:
         raise UsageError("preset and config: give one of them")
     directory = None if run_dir is None else absolute(run_dir, "run_dir")
+    settings = with_numbers(RunConfig, settings)
     steps = settings.get("total_steps")
     path = None if file is None else absolute(file, "config")
     base = chosen_config(
