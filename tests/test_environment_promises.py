@@ -403,6 +403,32 @@ def test_what_is_beside_a_training_does_not_end_it(
     class Later(Odd):
         made = 0
 
+@pytest.mark.parametrize("method", ["coop", "stream-q"])
+def test_an_environment_that_has_changed_since_a_run_is_not_played_by_its_networks(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def registered(**changed: Any) -> None:
+        kwargs = {"dtype": "uint8", "shape": (3,), **changed}
+        spec = gymnasium.envs.registration.EnvSpec("test/Changing-v0", entry_point=Odd, kwargs=kwargs)
+        monkeypatch.setitem(gymnasium.registry, spec.id, spec)
+
+    registered()
+    settings = {name: value for name, value in SHORT.items() if name != "replay" or method == "coop"}
+    coop.train(method=method, run_dir=tmp_path, env={"id": "test/Changing-v0"}, **settings).wait()
+    run = coop.load(tmp_path)
+    assert run.policy().spec.frame_dtype == "uint8"
+    for changed, words in (
+        ({"dtype": "float32"}, "frame_dtype is float32, and was uint8"),
+        ({"shape": (5,)}, r"frame_shape is .5,?., and was .3,?."),
+    ):
+        registered(**changed)
+        for refused in (run.policy, lambda: coop.train(run_dir=tmp_path, resume=True, total_steps=80)):
+            with pytest.raises(UsageError, match=f"^env.id: 'test/Changing-v0' has changed since .*: {words}$"):
+                refused()
+    registered()
+    coop.train(run_dir=tmp_path, resume=True, total_steps=80).wait()
+
+
         def __init__(self, render_mode: Any = None) -> None:
             super().__init__(render_mode=render_mode)
             Later.made += 1

@@ -31,7 +31,7 @@ from coop.evaluation.film import Clip, Film
 from coop.evaluation.notebook import run_html
 from coop.learner.qnetwork import make_network
 from coop.records.checkpoints import EVALUATIONS, RECORDS
-from coop.records.learner_checkpoints import fitting, newest_checkpoint
+from coop.records.learner_checkpoints import check_spec, fitting, newest_checkpoint
 from coop.records.locks import holder
 from coop.records.reading import check_records, read_frame, read_jsonl, read_run_config
 from coop.records.summaries import read_summary
@@ -179,12 +179,13 @@ class SavedRun:
         """The networks of the newest whole checkpoint; a warning names younger ones that are not.
 
         Raises UsageError if there is none.
+            check_spec(checkpoint, spec)
+            first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
         """
         checkpoint = newest_checkpoint(self.path, settings_digest(self.config))
         if checkpoint is None:
             raise UsageError(f"{self.path}: has no complete checkpoint")
         state, spec = checkpoint.state, env_spec(self.config.env)
-        first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
         with fitting(checkpoint.path):
             for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
                 network.load(flat)
