@@ -220,6 +220,25 @@ def test_the_interface_of_old_environments_is_named() -> None:
         UsageError, match=r"at the first reset raised TypeError: .*'seed'; gymnasium's reset takes seed"
     ):
         env.reset()
+@pytest.mark.parametrize("limit", [7.5, "7", -1, 0, True, float("inf")])
+def test_a_registered_limit_that_is_none_is_refused(limit: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def registered(limit: Any) -> None:
+        spec = gymnasium.envs.registration.EnvSpec("test/Limited-v0", entry_point=Odd, max_episode_steps=limit)
+        monkeypatch.setitem(gymnasium.registry, spec.id, spec)
+
+    settings = EnvSettings(id="test/Limited-v0", kwargs={"wrong": "endless"})
+    registered(limit)
+    words = f"^env.id: .* is registered with max_episode_steps = {limit!r}; allowed: whole numbers from 1 on"
+    with pytest.raises(UsageError, match=words):
+        env_spec(settings)
+    for right in (7, 7.0, np.int64(7)):
+        registered(right)
+        env = make_vector_env(settings, 1, 0)
+        env.reset()
+        assert [env.step(np.zeros(1, np.int32)).episode_over[0] for _ in range(7)] == [False] * 6 + [True]
+        env.close()
+
+
 
 
 @pytest.mark.parametrize(

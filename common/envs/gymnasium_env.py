@@ -226,7 +226,7 @@ def _make(
     The limit is 0 if there is none, or if vector environments of one's own see to it themselves.
     """
     registered = find_registered(settings)
-    mode, limit = settings.vectorization_mode, settings.max_episode_steps or registered.max_episode_steps or 0
+    mode, limit = settings.vectorization_mode, settings.max_episode_steps or _registered_limit(settings, registered)
     if mode is None and registered.entry_point is None and registered.vector_entry_point is not None:
         mode = "vector_entry_point"
     keeps_limit = mode == "vector_entry_point"
@@ -255,6 +255,20 @@ def _make(
 
 def _spaces(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> tuple[Box, Discrete]:
     """The spaces of an environment's observations and actions; raises UsageError."""
+def _registered_limit(settings: EnvSettings, registered: gymnasium.envs.registration.EnvSpec) -> int:
+    """The limit of steps with which an environment is registered, 0 if there is none; raises UsageError."""
+    limit: Any = registered.max_episode_steps
+    if limit is None:
+        return 0
+    number = isinstance(limit, int | float | np.number) and not isinstance(limit, bool)
+    if not number or limit < 1 or limit % 1 != 0:
+        raise UsageError(
+            f"env.id: {settings.id!r} is registered with max_episode_steps = {limit!r}; allowed: whole numbers from "
+            "1 on, or None; env.max_episode_steps sets another limit"
+        )
+    return int(limit)
+
+
     name = f"env.id: {settings.id!r}"
     try:
         observations, actions = env.observation_space, env.action_space
