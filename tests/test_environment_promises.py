@@ -85,7 +85,9 @@ class Odd(gymnasium.Env[Any, Any]):
             "scaled": self.right + 0.5, "wide": np.full(self.right.shape, 256, np.uint16), "words": np.array(["a"] * 3),
         }  # fmt: skip
         rewards = {"reward [1]": np.ones(1), "reward list": [1.0], "reward None": None, "reward text": "1.0",
-                   "reward nan": float("nan"), "reward inf": np.float32("inf"), "reward large": 1.1e6}  # fmt: skip
+            "masked": np.ma.masked_equal([0, 1, 2], 1),
+                   "reward nan": float("nan"), "reward inf": np.float32("inf"), "reward large": 1.1e6,
+                   "reward masked": np.ma.masked}  # fmt: skip
         if wrong == "step raises":
             raise ValueError("no such move")
         if wrong == "step raises in its words too":
@@ -152,6 +154,8 @@ WRONG: list[tuple[str, dict[str, Any], type[CoopError], str]] = [
     ("ragged", {}, UsageError, rf"{AT_3} the observation \[\[1\], \[1, 2\]\]"),
     ("words", {}, UsageError, rf"{AT_3} observations <U1\[3\]"),
     ("scaled", {"dtype": "uint8"}, UsageError, rf"{AT_3} observations float64\[3\]; its .* says uint8\[3\]"),
+    ("masked", {}, UsageError, rf"{AT_3} the observation with masked entries; allowed: an array without any"),
+    ("reward masked", {}, UsageError, rf"{AT_3} reward float64\[\]; allowed: a single number"),
     ("wide", {"dtype": "uint8"}, UsageError, rf"{AT_3} observations with values to 256; its .* says uint8"),
     ("reward [1]", {}, UsageError, rf"{AT_3} reward float64\[1\]; allowed: a single number"),
     ("reward list", {}, UsageError, rf"{AT_3} reward \[1\.0\]"),
