@@ -12,7 +12,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from coop.common.arguments import check_seconds, check_whole, texts
+from coop.common.arguments import check_flag, check_seconds, check_whole, texts
 from coop.common.errors import CoopError, RunError, UsageError, place
 from coop.common.imports import describe, permit
 from coop.common.places import absolute
@@ -201,6 +201,10 @@ def train(
     named, names = [*texts("allow_import", allow_import), *_named({"method": method, **settings})], chosen_sinks(log)
     permit(named)
     check_whole("actors", actors, 0)
+    for name, flag in (("distributed", distributed), ("resume", resume), ("overwrite", overwrite)):
+        check_flag(name, flag)
+    if resume_from is not None:
+        check_whole("resume_from", resume_from, 0)
     replay = settings.get("replay", {})
     if actors == 0 and isinstance(replay, Mapping) and replay.get("preload"):
         settings["replay"] = {**replay, "offline": True}
