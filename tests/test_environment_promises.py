@@ -20,7 +20,7 @@ from gymnasium.spaces import Box, Discrete
 import coop
 from coop.common.bounds import LONGEST_EPISODE
 from coop.common.envs.gymnasium_env import GymnasiumEnv
-from coop.common.envs.make import env_spec, make_filmed_env, make_vector_env
+from coop.common.envs.make import check_filmed, env_spec, make_filmed_env, make_vector_env
 from coop.common.envs.protocol import VectorEnv
 from coop.common.errors import BadMessage, CoopError, RunError, UsageError
 from coop.common.messaging.messages.insert import check_values
@@ -63,6 +63,8 @@ class Odd(gymnasium.Env[Any, Any]):
         self.action_space = Discrete(2)
         self.wrong, self.right = wrong, np.zeros(tuple(shape), dtype)
         self.render_mode = render_mode
+        if wrong.startswith("metadata "):
+            self.metadata = {"metadata list": [1], "metadata text": "x"}.get(wrong, {"render_modes": 5})  # type: ignore
         if wrong == "fps":
             self.metadata = {**self.metadata, "render_fps": 0}
         self.t, self.resets = 0, 0
@@ -83,9 +85,9 @@ class Odd(gymnasium.Env[Any, Any]):
         observations = {
             "shape": np.zeros(1), "nan": np.full(3, np.nan), "large": np.full(3, 2e6), "ragged": [[1], [1, 2]],
             "scaled": self.right + 0.5, "wide": np.full(self.right.shape, 256, np.uint16), "words": np.array(["a"] * 3),
+            "masked": np.ma.masked_equal([0, 1, 2], 1),
         }  # fmt: skip
         rewards = {"reward [1]": np.ones(1), "reward list": [1.0], "reward None": None, "reward text": "1.0",
-            "masked": np.ma.masked_equal([0, 1, 2], 1),
                    "reward nan": float("nan"), "reward inf": np.float32("inf"), "reward large": 1.1e6,
                    "reward masked": np.ma.masked}  # fmt: skip
         if wrong == "step raises":
@@ -152,10 +154,10 @@ WRONG: list[tuple[str, dict[str, Any], type[CoopError], str]] = [
     ("nan", {}, UsageError, rf"{AT_3} observations with values from nan to nan; allowed: finite"),
     ("large", {}, UsageError, rf"{AT_3} observations with values from 2e\+06 to 2e\+06; .* 1,000,000"),
     ("ragged", {}, UsageError, rf"{AT_3} the observation \[\[1\], \[1, 2\]\]"),
-    ("words", {}, UsageError, rf"{AT_3} observations <U1\[3\]"),
-    ("scaled", {"dtype": "uint8"}, UsageError, rf"{AT_3} observations float64\[3\]; its .* says uint8\[3\]"),
     ("masked", {}, UsageError, rf"{AT_3} the observation with masked entries; allowed: an array without any"),
     ("reward masked", {}, UsageError, rf"{AT_3} reward float64\[\]; allowed: a single number"),
+    ("words", {}, UsageError, rf"{AT_3} observations <U1\[3\]"),
+    ("scaled", {"dtype": "uint8"}, UsageError, rf"{AT_3} observations float64\[3\]; its .* says uint8\[3\]"),
     ("wide", {"dtype": "uint8"}, UsageError, rf"{AT_3} observations with values to 256; its .* says uint8"),
     ("reward [1]", {}, UsageError, rf"{AT_3} reward float64\[1\]; allowed: a single number"),
     ("reward list", {}, UsageError, rf"{AT_3} reward \[1\.0\]"),
@@ -218,12 +220,6 @@ def test_what_can_not_be_played_is_refused_before_it_is(settings: EnvSettings, w
     assert "\n" not in str(refused.value)
 
 
-def test_the_interface_of_old_environments_is_named() -> None:
-    env = make_vector_env(EnvSettings(id="test/Old-v0"), 1, 0)
-    with pytest.raises(
-        UsageError, match=r"at the first reset raised TypeError: .*'seed'; gymnasium's reset takes seed"
-    ):
-        env.reset()
 @pytest.mark.parametrize("limit", [7.5, "7", -1, 0, True, float("inf")])
 def test_a_registered_limit_that_is_none_is_refused(limit: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def registered(limit: Any) -> None:
@@ -243,6 +239,12 @@ def test_a_registered_limit_that_is_none_is_refused(limit: Any, monkeypatch: pyt
         env.close()
 
 
+def test_the_interface_of_old_environments_is_named() -> None:
+    env = make_vector_env(EnvSettings(id="test/Old-v0"), 1, 0)
+    with pytest.raises(
+        UsageError, match=r"at the first reset raised TypeError: .*'seed'; gymnasium's reset takes seed"
+    ):
+        env.reset()
 
 
 @pytest.mark.parametrize(
@@ -401,31 +403,6 @@ def test_a_run_may_move_to_another_machine_s_device(tmp_path: Path) -> None:
         check_resumed(here, replace(there, learner=replace(there.learner, gamma=0.5)), tmp_path / "config.toml")
 
 
-@pytest.mark.parametrize("wrong", ["grey", "fps", ""])
-def test_films_of_any_speed_and_of_grey_pictures(wrong: str) -> None:
-    gif = short_gif(Film(lambda obs: 0, odd(wrong), 0))
-    assert gif.startswith(b"GIF89a")
-
-
-def test_a_film_of_no_picture_is_refused_and_one_that_stands_still_is_not_too_long() -> None:
-    for wrong, found in (("no picture", "object"), ("a picture of text", r"<U1\[3, 3\]")):
-        env = make_filmed_env(odd(wrong), 0)
-        env.reset()
-        with pytest.raises(UsageError, match=f"can't be filmed: it renders {found}"):
-            env.picture()
-    still = Film(lambda obs: 0, replace(odd("endless"), max_episode_steps=800), 0)
-    still.pictures_per_s = 0.5  # 1,600 s of the same picture: a GIF's longest is 655
-    assert short_gif(still).startswith(b"GIF89a")
-
-
-def test_what_is_beside_a_training_does_not_end_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Evaluations, films, the learning curve and the closing of environments may all fail."""
-
-    class Later(Odd):
-        made = 0
-
 @pytest.mark.parametrize("method", ["coop", "stream-q"])
 def test_an_environment_that_has_changed_since_a_run_is_not_played_by_its_networks(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -451,6 +428,38 @@ def test_an_environment_that_has_changed_since_a_run_is_not_played_by_its_networ
     registered()
     coop.train(run_dir=tmp_path, resume=True, total_steps=80).wait()
 
+
+@pytest.mark.parametrize("wrong", ["grey", "fps", ""])
+def test_films_of_any_speed_and_of_grey_pictures(wrong: str) -> None:
+    gif = short_gif(Film(lambda obs: 0, odd(wrong), 0))
+    assert gif.startswith(b"GIF89a")
+
+
+@pytest.mark.parametrize("wrong", ["metadata list", "metadata text", "metadata five"])
+def test_metadata_that_are_none_have_no_pictures(wrong: str) -> None:
+    with pytest.raises(UsageError, match=r"^video_every: env.id: .* has no pictures to film: its metadata"):
+        check_filmed(odd(wrong))
+    assert make_filmed_env(odd(wrong, dtype="uint8", shape=(20, 30)), 0).pictures_per_s == 10
+
+
+def test_a_film_of_no_picture_is_refused_and_one_that_stands_still_is_not_too_long() -> None:
+    for wrong, found in (("no picture", "object"), ("a picture of text", r"<U1\[3, 3\]")):
+        env = make_filmed_env(odd(wrong), 0)
+        env.reset()
+        with pytest.raises(UsageError, match=f"can't be filmed: it renders {found}"):
+            env.picture()
+    still = Film(lambda obs: 0, replace(odd("endless"), max_episode_steps=800), 0)
+    still.pictures_per_s = 0.5  # 1,600 s of the same picture: a GIF's longest is 655
+    assert short_gif(still).startswith(b"GIF89a")
+
+
+def test_what_is_beside_a_training_does_not_end_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Evaluations, films, the learning curve and the closing of environments may all fail."""
+
+    class Later(Odd):
+        made = 0
 
         def __init__(self, render_mode: Any = None) -> None:
             super().__init__(render_mode=render_mode)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -180,9 +180,11 @@ class FilmedGymnasium(GymnasiumEnv):
         """Raise UsageError for an environment that has no pictures, or lacks a package for them."""
         (env,), _ = _make(settings, [0])
         observations, actions = _spaces(settings, env)
-        metadata, vectors = env.metadata or {}, len(FrameMaker(settings, observations).shape) == 1
+        vectors = len(FrameMaker(settings, observations).shape) == 1
+        metadata: Mapping[str, Any] = env.metadata if isinstance(env.metadata, Mapping) else {}  # it may be anything
+        modes = metadata.get("render_modes")
         CheckedEnv(env, settings.id, observations, int(actions.n)).close()
-        if vectors and "rgb_array" not in (metadata.get("render_modes") or ()):
+        if vectors and not (isinstance(modes, Collection) and "rgb_array" in modes):
             raise UsageError(
                 f"env.id: {settings.id!r} has no pictures to film: its metadata['render_modes'] has no 'rgb_array'"
             )
@@ -253,8 +255,6 @@ def _make(
     return envs, 0 if keeps_limit else limit
 
 
-def _spaces(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> tuple[Box, Discrete]:
-    """The spaces of an environment's observations and actions; raises UsageError."""
 def _registered_limit(settings: EnvSettings, registered: gymnasium.envs.registration.EnvSpec) -> int:
     """The limit of steps with which an environment is registered, 0 if there is none; raises UsageError."""
     limit: Any = registered.max_episode_steps
@@ -269,6 +269,8 @@ def _registered_limit(settings: EnvSettings, registered: gymnasium.envs.registra
     return int(limit)
 
 
+def _spaces(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> tuple[Box, Discrete]:
+    """The spaces of an environment's observations and actions; raises UsageError."""
     name = f"env.id: {settings.id!r}"
     try:
         observations, actions = env.observation_space, env.action_space
