@@ -121,7 +121,7 @@ def grid_text(tables: Mapping[str, Any]) -> str:
     """The TOML of a grid's contents; raises UsageError for what TOML can't say."""
     try:
         return tomli_w.dumps(tables)
-    except (TypeError, ValueError, AttributeError) as error:  # the last for a key that is no text
+    except (TypeError, ValueError, AttributeError, RecursionError) as error:  # also for a key that is no text
         raise UsageError(f"grid: {error}") from error
 
 
