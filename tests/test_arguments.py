@@ -22,6 +22,11 @@ class Failing:
         raise KeyError("no")
 
 
+ENDLESS: dict[str, Any] = {}
+ENDLESS["more"] = ENDLESS
+DEEP: list[Any] = []
+for _ in range(5_000):
+    DEEP = [DEEP]
 GRID = {"fixed": {"total_steps": 40}, "seeds": [0]}
 
 
@@ -103,6 +108,14 @@ def test_paths_that_no_file_system_takes(path: str, tmp_path: Path, monkeypatch:
         (lambda path: coop.sweep(GRID, path, quick="no"), "quick = 'no': must be True or False"),
         (lambda path: coop.train(run_dir=path, method=[]), r"method = \[\]: expected str"),
         (lambda path: coop.train(run_dir=path, replay={5: 6}), "replay.5 = 6: no such field"),
+        (
+            lambda path: coop.train(run_dir=path, **{"replay.capacity": 50}),
+            r'replay.capacity = 50: no such field; did you mean replay=\{"capacity": ...\}\?',
+        ),
+        (lambda path: coop.train(run_dir=path, replay=ENDLESS), "replay.more: nests more than 32 tables"),
+        (lambda path: coop.train(run_dir=path, env={"kwargs": ENDLESS}), "env.kwargs: nests more than 32 tables"),
+        (lambda path: coop.train(run_dir=path, env={"kwargs": {"a": DEEP}}), "env.kwargs = .*: nests more than 29"),
+        (lambda path: coop.evaluate(print, env={"kwargs": ENDLESS}), "env.kwargs = .*: nests more than 29 tables"),
         (lambda path: coop.train(run_dir=path, log=5), "log = 5: must be a list of names"),
         (lambda path: coop.train(run_dir=path, log=[None]), "log: None is no name"),
         (lambda path: coop.train(run_dir=path, allow_import="envs"), "allow_import = 'envs': must be a list of names"),

@@ -90,7 +90,7 @@ def _read(kind: Any, value: Any, place: str, whole: Any) -> Any:  # noqa: ANN401
             try:
                 value = mark.function(value)
             except ValueError as error:
-                raise UsageError(f"{place} = {value!r}: {error}") from error
+                raise UsageError(f"{place} = {_shown(value)}: {error}") from error
     if is_dataclass(base) and isinstance(value, Mapping):
         place = place if not place or place.endswith(".") else f"{place}."
         known = fields_of(base)  # type: ignore[arg-type] # a class
@@ -98,7 +98,7 @@ def _read(kind: Any, value: Any, place: str, whole: Any) -> Any:  # noqa: ANN401
             if name not in known:
                 near = _elsewhere(whole).get(ALSO_CALLED.get(str(name), str(name))) or closest(str(name), known)
                 problem = refusal("no such field", near, f"allowed: {', '.join(known)}")
-                raise UsageError(f"{place}{name} = {each!r}: {problem}")
+                raise UsageError(f"{place}{name} = {_shown(each)}: {problem}")
         return {name: _read(known[name], each, f"{place}{name}", whole) for name, each in value.items()}
     if get_origin(base) is tuple and not isinstance(value, list | tuple):
         raise UsageError(f"{place} = {value!r}: must be a list, such as [64, 64]")
@@ -110,6 +110,13 @@ def _read(kind: Any, value: Any, place: str, whole: Any) -> Any:  # noqa: ANN401
 @cache
 def _elsewhere(kind: Any) -> dict[str, str]:  # noqa: ANN401 (any dataclass)
     """The dotted names of nested dataclasses' fields, by themselves and by their last part."""
+def _shown(value: object) -> str:
+    try:
+        return repr(value)
+    except RecursionError:
+        return type(value).__name__
+
+
     found: dict[str, str] = {}
     for name, each in fields_of(kind).items():
         base: Any = get_args(each)[0] if get_origin(each) is Annotated else each
