@@ -97,6 +97,9 @@ def _read(kind: Any, value: Any, place: str, whole: Any) -> Any:  # noqa: ANN401
         for name, each in value.items():
             if name not in known:
                 near = _elsewhere(whole).get(ALSO_CALLED.get(str(name), str(name))) or closest(str(name), known)
+                if near is not None and near == name and "." in near:  # the dotted name that flags have
+                    table, _, last = near.partition(".")
+                    near = f'{table}={{"{last}": ...}}'
                 problem = refusal("no such field", near, f"allowed: {', '.join(known)}")
                 raise UsageError(f"{place}{name} = {_shown(each)}: {problem}")
         return {name: _read(known[name], each, f"{place}{name}", whole) for name, each in value.items()}
@@ -107,9 +110,6 @@ def _read(kind: Any, value: Any, place: str, whole: Any) -> Any:  # noqa: ANN401
     return value
 
 
-@cache
-def _elsewhere(kind: Any) -> dict[str, str]:  # noqa: ANN401 (any dataclass)
-    """The dotted names of nested dataclasses' fields, by themselves and by their last part."""
 def _shown(value: object) -> str:
     try:
         return repr(value)
@@ -117,6 +117,9 @@ def _shown(value: object) -> str:
         return type(value).__name__
 
 
+@cache
+def _elsewhere(kind: Any) -> dict[str, str]:  # noqa: ANN401 (any dataclass)
+    """The dotted names of nested dataclasses' fields, by themselves and by their last part."""
     found: dict[str, str] = {}
     for name, each in fields_of(kind).items():
         base: Any = get_args(each)[0] if get_origin(each) is Annotated else each
