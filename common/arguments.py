@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from coop.common.errors import UsageError
+from coop.common.errors import UsageError, first_line
 
 
 def check_whole(name: str, value: object, least: int, most: int | None = None) -> None:
@@ -23,6 +25,27 @@ def check_seconds(name: str, value: object) -> None:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not number or math.isnan(value) or value < 0:  # type: ignore[operator, arg-type]
         raise UsageError(f"{name} = {value!r}: must be a number of seconds from 0 on")
+
+
+def check_flag(name: str, value: object) -> None:
+    """Raise UsageError unless an argument is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise UsageError(f"{name} = {value!r}: must be True or False")
+
+
+def has_masked(value: object) -> bool:
+    """Whether an array has entries that numpy marks as no data; they become numbers as it is taken for a plain one."""
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
+
+
+def as_array(name: str, value: object) -> NDArray[Any]:
+    """An argument as an array; raises UsageError for what is none, whatever it raises as it is converted."""
+    if has_masked(value):
+        raise UsageError(f"{name}: has masked entries; must be an array without any")
+    try:
+        return np.asarray(value)
+    except Exception as error:  # numpy's, or of an object's own `__array__`
+        raise UsageError(f"{name}: not an array: {first_line(error)}") from error
 
 
 def texts(name: str, value: object) -> list[str]:

@@ -1,4 +1,4 @@
-"""Numbers: updates due, means of returns, exact text, strict JSON, the speed of a count, states of random generators.
+"""Numbers: whole ones in texts, updates due, means, exact text, strict JSON, speeds, states of random generators.
 
 The running mean over the last 100 episodes is the paper's measure.
 """
@@ -9,6 +9,7 @@ import json
 import math
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,17 @@ from numpy.typing import ArrayLike, NDArray
 RETURN_WINDOW = 100  # episodes
 SHORT_WINDOW = 20  # episodes: few enough to show what play has just reached
 METRICS_EVERY = 200  # updates from one row of metrics to the next
+
+
+def whole_number(text: str) -> int:
+    """Read a whole number: 1000000, 1_000_000 or 1e6."""
+    try:
+        return int(text)
+    except ValueError:
+        with suppress(ValueError):
+            if (number := float(text)).is_integer():
+                return int(number)
+        raise
 
 
 def updates_due(ratio: float, steps: int) -> int:

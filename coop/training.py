@@ -12,7 +12,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from coop.common.arguments import check_seconds, check_whole, texts
+from coop.common.arguments import check_flag, check_seconds, check_whole, texts
 from coop.common.errors import CoopError, RunError, UsageError, place
 from coop.common.imports import describe, permit
 from coop.common.places import absolute
@@ -23,6 +23,7 @@ from coop.common.process.processes import ChildProcess, command
 from coop.common.settings.config import MAY_NAME_MODULES, RunConfig, check_distributed
 from coop.common.settings.effects import without_effect
 from coop.common.settings.overrides import leaves, merged
+from coop.common.settings.reading import with_numbers
 from coop.common.settings.resuming import settings_digest
 from coop.common.settings.starting import env_id_of, stated
 from coop.common.settings.tables import to_tables, to_toml, validated
@@ -200,6 +201,10 @@ def train(
     named, names = [*texts("allow_import", allow_import), *_named({"method": method, **settings})], chosen_sinks(log)
     permit(named)
     check_whole("actors", actors, 0)
+    for name, flag in (("distributed", distributed), ("resume", resume), ("overwrite", overwrite)):
+        check_flag(name, flag)
+    if resume_from is not None:
+        check_whole("resume_from", resume_from, 0)
     replay = settings.get("replay", {})
     if actors == 0 and isinstance(replay, Mapping) and replay.get("preload"):
         settings["replay"] = {**replay, "offline": True}
@@ -240,6 +245,7 @@ def _options(
     if preset is not None and file is not None:
         raise UsageError("preset and config: give one of them")
     directory = None if run_dir is None else absolute(run_dir, "run_dir")
+    settings = with_numbers(RunConfig, settings)
     steps = settings.get("total_steps")
     path = None if file is None else absolute(file, "config")
     base = chosen_config(

@@ -32,7 +32,7 @@ from coop.learner.service import LearnerService
 from coop.learner.shared_checkpoints import SharedCheckpoints
 from coop.learner.trainer import Trainer
 from coop.monitor.health import answering
-from coop.records.learner_checkpoints import fitting, load_learner
+from coop.records.learner_checkpoints import check_spec, fitting, load_learner
 from coop.records.locks import RunLock
 from coop.records.resumption import Survey
 from coop.records.run_directory import RunDirectory, claim_run_directory
@@ -106,6 +106,7 @@ def training_run(
     state = found.of(number).state if number else None
     if state is not None:
         with fitting(found.of(number).path):
+            check_spec(found.of(number), spec)
             trainer.load_state(state, node.now())
         found = found.cut_back(number, "the replay service has no whole part of it")
         skipped = "; ".join(found.fallbacks(number))

@@ -16,6 +16,7 @@ from coop.common.settings.methods import METHODS
 from coop.learner.losses import Values
 from coop.learner.methods.rule import UpdateRule
 from coop.lockstep import cli as lockstep_cli
+from coop.studies.sweep.grid import Grid, GridFile
 
 # Whole runs, also on a busy machine.
 pytestmark = [pytest.mark.timeout(300), pytest.mark.usefixtures("quick_children")]
@@ -58,6 +59,22 @@ def test_training_equals_the_command_s(tmp_path: Path, monkeypatch: pytest.Monke
     lockstep_cli.main()
     for name in ("config.toml", "episodes.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+@pytest.mark.parametrize("steps", [300.0, "300", "3e2", np.int64(300), np.float32(300)])
+def test_whole_numbers_are_understood_before_others_follow_from_them(steps: Any, tmp_path: Path) -> None:
+    call: dict[str, Any] = {"preset": "cartpole", "network": {"hidden": [8]}, "run_dir": tmp_path}
+    run = coop.train(total_steps=steps, learner={"batch_size": np.uint8(32)}, **call)
+    run.stop()
+    plain = coop.train(total_steps=300, learner={"batch_size": 32}, overwrite=True, **call)
+    plain.stop()
+    assert run.config == plain.config
+    assert (run.config.replay.learning_starts, run.config.planned_updates) == (30, 270)
+    mine, other = (Grid(GridFile(fixed={"total_steps": each})).cells[0].config for each in (steps, 300))
+    assert mine == other
+    for wrong in (300.5, "many", 0, -(10**30), 10**400, True, float("nan")):
+        with pytest.raises(coop.UsageError, match=r"^total_steps = .*: "):
+            coop.train(**{**call, "total_steps": wrong, "overwrite": True})
 
 
 def test_a_stopped_run_goes_on_where_it_stopped(tmp_path: Path) -> None:

@@ -9,11 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import coop
 from coop.common.arguments import check_seconds, check_whole, texts
 
 WRONG: Any = object()
+
+
+class Failing:
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise KeyError("no")
+
+
+ENDLESS: dict[str, Any] = {}
+ENDLESS["more"] = ENDLESS
+DEEP: list[Any] = []
+for _ in range(5_000):
+    DEEP = [DEEP]
 GRID = {"fixed": {"total_steps": 40}, "seeds": [0]}
 
 
@@ -88,8 +101,21 @@ def test_paths_that_no_file_system_takes(path: str, tmp_path: Path, monkeypatch:
     [
         (lambda path: coop.train(run_dir=path, actors="2"), "actors = '2': must be a whole number"),
         (lambda path: coop.train(run_dir=path, actors=1.5, distributed=True), r"actors = 1\.5: must be a whole number"),
+        (lambda path: coop.train(run_dir=path, resume="no"), "resume = 'no': must be True or False"),
+        (lambda path: coop.train(run_dir=path, overwrite=0), "overwrite = 0: must be True or False"),
+        (lambda path: coop.train(run_dir=path, distributed=None), "distributed = None: must be True or False"),
+        (lambda path: coop.train(run_dir=path, resume_from=True), "resume_from = True: must be a whole number from 0"),
+        (lambda path: coop.sweep(GRID, path, quick="no"), "quick = 'no': must be True or False"),
         (lambda path: coop.train(run_dir=path, method=[]), r"method = \[\]: expected str"),
         (lambda path: coop.train(run_dir=path, replay={5: 6}), "replay.5 = 6: no such field"),
+        (
+            lambda path: coop.train(run_dir=path, **{"replay.capacity": 50}),
+            r'replay.capacity = 50: no such field; did you mean replay=\{"capacity": ...\}\?',
+        ),
+        (lambda path: coop.train(run_dir=path, replay=ENDLESS), "replay.more: nests more than 32 tables"),
+        (lambda path: coop.train(run_dir=path, env={"kwargs": ENDLESS}), "env.kwargs: nests more than 32 tables"),
+        (lambda path: coop.train(run_dir=path, env={"kwargs": {"a": DEEP}}), "env.kwargs = .*: nests more than 29"),
+        (lambda path: coop.evaluate(print, env={"kwargs": ENDLESS}), "env.kwargs = .*: nests more than 29 tables"),
         (lambda path: coop.train(run_dir=path, log=5), "log = 5: must be a list of names"),
         (lambda path: coop.train(run_dir=path, log=[None]), "log: None is no name"),
         (lambda path: coop.train(run_dir=path, allow_import="envs"), "allow_import = 'envs': must be a list of names"),
@@ -119,6 +145,16 @@ def test_what_starts_runs(call: Callable[[Path], object], said: str, tmp_path: P
         (lambda run: coop.load(run.path, allow_import=5), "allow_import = 5: must be a list of names"),
         (lambda run: run.policy(1.0), r"network = 1\.0: allowed"),
         (lambda run: run.policy(True), "network = True: allowed"),
+        (lambda run: run.buffer(live="no"), "live = 'no': must be True or False"),
+        (lambda run: run.q_values(torch.zeros(4, requires_grad=True)), "observation: not an array: RuntimeError: "),
+        (lambda run: run.q_values(Failing()), "observation: not an array: KeyError: 'no'"),
+        (lambda run: run.q_values(np.ma.masked_equal([0, 1, 2, 3.0], 2)), "observation: has masked entries"),
+        (lambda run: run.policy()([0, 0, 0, 0], Failing()), "mask: not an array: KeyError: 'no'"),
+        (lambda run: run.policy()([0] * 4, np.ma.masked_equal([1, 0], 0)), "mask: has masked entries"),
+        (
+            lambda run: coop.evaluate(lambda obs: Failing(), env=run.config.env.id),
+            "policy: what it gives: not an array",
+        ),
         (lambda run: run.film(seed="x"), "seed = 'x': must be a whole number"),
         (lambda run: run.buffer(live=True, timeout=None), "timeout = None: must be a number of seconds"),
         (lambda run: run.buffer(timeout=float("nan")), "timeout = nan: must be a number of seconds"),
@@ -129,7 +165,10 @@ def test_what_starts_runs(call: Callable[[Path], object], said: str, tmp_path: P
         (lambda run: coop.evaluate(run.policy(), epsilon="0"), "epsilon = '0': must be from 0 to 1"),
         (lambda run: coop.evaluate(run.policy(), env=5), "env = 5: must be an id"),
         (lambda run: coop.evaluate(None), "policy: NoneType is no function"),  # type: ignore[arg-type]
-        (lambda run: coop.evaluate(lambda obs: [0, [1]], env=run.config.env.id), "policy: gives what is no array"),
+        (
+            lambda run: coop.evaluate(lambda obs: [0, [1]], env=run.config.env.id),
+            "policy: what it gives: not an array: ValueError: ",
+        ),
     ],
 )
 def test_what_reads_runs(call: Callable[[coop.SavedRun], object], said: str, saved: coop.SavedRun) -> None:

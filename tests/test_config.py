@@ -12,6 +12,7 @@ from coop.common.errors import UsageError
 from coop.common.messaging import wire
 from coop.common.settings import schedules
 from coop.common.settings.capacity import check_messages
+from coop.common.settings.reading import parse_toml
 from coop.common.settings.tables import first_difference, load_tables, preset_names, resolve, to_tables, to_toml
 from coop.common.types import EnvSpec
 from coop.records.run_options import RunOptions, base_config, parse_run
@@ -223,6 +224,16 @@ def test_files_are_refused_by_field(tables: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError) as caught:
         resolve(tables)
     assert words in str(caught.value)
+
+
+def test_arguments_of_environments_nest_as_deep_as_files_are_read() -> None:
+    deep: list[Any] = [1]
+    for _ in range(28):
+        deep = [deep]
+    config = resolve({"env": {"kwargs": {"a": deep}}})
+    assert resolve(parse_toml(to_toml(config))) == config
+    with pytest.raises(UsageError, match=r"^env.kwargs = .*: nests more than 29 tables and lists$"):
+        resolve({"env": {"kwargs": {"a": [deep]}}})
 
 
 def test_a_file_that_is_not_toml(tmp_path: Path) -> None:

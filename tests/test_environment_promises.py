@@ -20,7 +20,7 @@ from gymnasium.spaces import Box, Discrete
 import coop
 from coop.common.bounds import LONGEST_EPISODE
 from coop.common.envs.gymnasium_env import GymnasiumEnv
-from coop.common.envs.make import env_spec, make_filmed_env, make_vector_env
+from coop.common.envs.make import check_filmed, env_spec, make_filmed_env, make_vector_env
 from coop.common.envs.protocol import VectorEnv
 from coop.common.errors import BadMessage, CoopError, RunError, UsageError
 from coop.common.messaging.messages.insert import check_values
@@ -63,6 +63,8 @@ class Odd(gymnasium.Env[Any, Any]):
         self.action_space = Discrete(2)
         self.wrong, self.right = wrong, np.zeros(tuple(shape), dtype)
         self.render_mode = render_mode
+        if wrong.startswith("metadata "):
+            self.metadata = {"metadata list": [1], "metadata text": "x"}.get(wrong, {"render_modes": 5})  # type: ignore
         if wrong == "fps":
             self.metadata = {**self.metadata, "render_fps": 0}
         self.t, self.resets = 0, 0
@@ -83,9 +85,11 @@ class Odd(gymnasium.Env[Any, Any]):
         observations = {
             "shape": np.zeros(1), "nan": np.full(3, np.nan), "large": np.full(3, 2e6), "ragged": [[1], [1, 2]],
             "scaled": self.right + 0.5, "wide": np.full(self.right.shape, 256, np.uint16), "words": np.array(["a"] * 3),
+            "masked": np.ma.masked_equal([0, 1, 2], 1),
         }  # fmt: skip
         rewards = {"reward [1]": np.ones(1), "reward list": [1.0], "reward None": None, "reward text": "1.0",
-                   "reward nan": float("nan"), "reward inf": np.float32("inf"), "reward large": 1.1e6}  # fmt: skip
+                   "reward nan": float("nan"), "reward inf": np.float32("inf"), "reward large": 1.1e6,
+                   "reward masked": np.ma.masked}  # fmt: skip
         if wrong == "step raises":
             raise ValueError("no such move")
         if wrong == "step raises in its words too":
@@ -150,6 +154,8 @@ WRONG: list[tuple[str, dict[str, Any], type[CoopError], str]] = [
     ("nan", {}, UsageError, rf"{AT_3} observations with values from nan to nan; allowed: finite"),
     ("large", {}, UsageError, rf"{AT_3} observations with values from 2e\+06 to 2e\+06; .* 1,000,000"),
     ("ragged", {}, UsageError, rf"{AT_3} the observation \[\[1\], \[1, 2\]\]"),
+    ("masked", {}, UsageError, rf"{AT_3} the observation with masked entries; allowed: an array without any"),
+    ("reward masked", {}, UsageError, rf"{AT_3} reward float64\[\]; allowed: a single number"),
     ("words", {}, UsageError, rf"{AT_3} observations <U1\[3\]"),
     ("scaled", {"dtype": "uint8"}, UsageError, rf"{AT_3} observations float64\[3\]; its .* says uint8\[3\]"),
     ("wide", {"dtype": "uint8"}, UsageError, rf"{AT_3} observations with values to 256; its .* says uint8"),
@@ -212,6 +218,25 @@ def test_what_can_not_be_played_is_refused_before_it_is(settings: EnvSettings, w
     with pytest.raises(UsageError, match=words) as refused:
         env_spec(settings)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("limit", [7.5, "7", -1, 0, True, float("inf")])
+def test_a_registered_limit_that_is_none_is_refused(limit: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def registered(limit: Any) -> None:
+        spec = gymnasium.envs.registration.EnvSpec("test/Limited-v0", entry_point=Odd, max_episode_steps=limit)
+        monkeypatch.setitem(gymnasium.registry, spec.id, spec)
+
+    settings = EnvSettings(id="test/Limited-v0", kwargs={"wrong": "endless"})
+    registered(limit)
+    words = f"^env.id: .* is registered with max_episode_steps = {limit!r}; allowed: whole numbers from 1 on"
+    with pytest.raises(UsageError, match=words):
+        env_spec(settings)
+    for right in (7, 7.0, np.int64(7)):
+        registered(right)
+        env = make_vector_env(settings, 1, 0)
+        env.reset()
+        assert [env.step(np.zeros(1, np.int32)).episode_over[0] for _ in range(7)] == [False] * 6 + [True]
+        env.close()
 
 
 def test_the_interface_of_old_environments_is_named() -> None:
@@ -378,10 +403,43 @@ def test_a_run_may_move_to_another_machine_s_device(tmp_path: Path) -> None:
         check_resumed(here, replace(there, learner=replace(there.learner, gamma=0.5)), tmp_path / "config.toml")
 
 
+@pytest.mark.parametrize("method", ["coop", "stream-q"])
+def test_an_environment_that_has_changed_since_a_run_is_not_played_by_its_networks(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def registered(**changed: Any) -> None:
+        kwargs = {"dtype": "uint8", "shape": (3,), **changed}
+        spec = gymnasium.envs.registration.EnvSpec("test/Changing-v0", entry_point=Odd, kwargs=kwargs)
+        monkeypatch.setitem(gymnasium.registry, spec.id, spec)
+
+    registered()
+    settings = {name: value for name, value in SHORT.items() if name != "replay" or method == "coop"}
+    coop.train(method=method, run_dir=tmp_path, env={"id": "test/Changing-v0"}, **settings).wait()
+    run = coop.load(tmp_path)
+    assert run.policy().spec.frame_dtype == "uint8"
+    for changed, words in (
+        ({"dtype": "float32"}, "frame_dtype is float32, and was uint8"),
+        ({"shape": (5,)}, r"frame_shape is .5,?., and was .3,?."),
+    ):
+        registered(**changed)
+        for refused in (run.policy, lambda: coop.train(run_dir=tmp_path, resume=True, total_steps=80)):
+            with pytest.raises(UsageError, match=f"^env.id: 'test/Changing-v0' has changed since .*: {words}$"):
+                refused()
+    registered()
+    coop.train(run_dir=tmp_path, resume=True, total_steps=80).wait()
+
+
 @pytest.mark.parametrize("wrong", ["grey", "fps", ""])
 def test_films_of_any_speed_and_of_grey_pictures(wrong: str) -> None:
     gif = short_gif(Film(lambda obs: 0, odd(wrong), 0))
     assert gif.startswith(b"GIF89a")
+
+
+@pytest.mark.parametrize("wrong", ["metadata list", "metadata text", "metadata five"])
+def test_metadata_that_are_none_have_no_pictures(wrong: str) -> None:
+    with pytest.raises(UsageError, match=r"^video_every: env.id: .* has no pictures to film: its metadata"):
+        check_filmed(odd(wrong))
+    assert make_filmed_env(odd(wrong, dtype="uint8", shape=(20, 30)), 0).pictures_per_s == 10
 
 
 def test_a_film_of_no_picture_is_refused_and_one_that_stands_still_is_not_too_long() -> None:

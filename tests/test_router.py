@@ -68,10 +68,16 @@ def test_no_router() -> None:
 
 def test_a_config_that_is_none(tmp_path: Path) -> None:
     config = tmp_path / "zenoh.json5"
-    config.write_text("{mode: 1}")
-    done = run_command("coop-router", "--zenoh-config", config)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("coop-router: error: zenoh configuration: ")
+    for text, words in (
+        ("{mode: 1}", "JSON error: "),
+        ("{\n mode:\n", "line 3:1: expected "),
+        ("", "Empty config file"),
+    ):
+        config.write_text(text)
+        done = run_command("coop-router", "--zenoh-config", config)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.startswith(f"coop-router: error: --zenoh-config {config}: {words}")
+        assert done.stderr.count("\n") == 1
 
 
 def test_a_run_behind_a_router(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ import coop
 from coop.common.errors import RunError, UsageError
 from coop.studies import tuning
 from coop.studies.report.packing import pack
-from coop.studies.tuning import Space
+from coop.studies.space import Space
 
 pytestmark = [
     pytest.mark.timeout(500),
@@ -92,6 +92,7 @@ def test_bad_trials_fail_and_bad_grids_are_refused(tmp_path: Path, said: pytest.
         ({"vary": {"learner": {"learning_rate": {"low": 1, "high": 0.1}}}}, r"vary\.learner\.learning_rate"),
         ({"vary": {"learner": {"learning_rate": 1}}}, "must be a list"),
         ({"methdos": ["dqn"]}, "methdos"),
+        ({"vary": {"learner": {"batch_size": [WRONG]}}}, "grid: .*object"),
     ):
         with pytest.raises(coop.UsageError, match=text):
             coop.tune(wrong, tmp_path / "b")
@@ -99,6 +100,7 @@ def test_bad_trials_fail_and_bad_grids_are_refused(tmp_path: Path, said: pytest.
         coop.load_sweep(tmp_path / "b")
 
 
+WRONG = object()
 REFUSED: Any = {"vary": {"learner": {"learning_rate": [1e-3, -1.0]}}, "fixed": FIXED}  # by each of its trials
 
 
@@ -137,6 +139,38 @@ def test_storages_that_are_none_are_refused_in_a_line(tmp_path: Path) -> None:
         tune_none(file)
     with pytest.raises(RunError, match=r"nowhere/mine\.db: OperationalError: unable to open database file$"):
         coop.tune(REFUSED, folder, storage=f"sqlite:///{tmp_path}/nowhere/mine.db")
+
+
+def test_a_search_goes_on_with_the_same_settings_alone(tmp_path: Path) -> None:
+    tune_none(tmp_path / "a")
+    for changed, words in (
+        ({"fixed": {**FIXED, "total_steps": 320}}, "fixed.total_steps = 320: the search 'a' has 300; give another"),
+        ({"methods": ["dqn"]}, r"methods = \['dqn'\]: the search 'a' has \['coop'\]"),
+        ({"seeds": [0, 1]}, r"seeds = \[0, 1\]: the search 'a' has \[0\]"),
+        (
+            {"vary": {"learner": {"learning_rate": [1e-3]}}},
+            r"vary.learner.learning_rate: .*trial 0 of the search 'a' had",
+        ),
+        ({"vary": RATES}, r"vary.learner.learning_rate: FloatDistribution.*; trial 0 .* had CategoricalDistribution"),
+    ):
+        with pytest.raises(UsageError, match=f"^{words}"):
+            coop.tune({**REFUSED, **changed}, tmp_path / "a", trials=2, workers=1)
+    assert len(coop.tune({**REFUSED, "title": "Why?"}, tmp_path / "a", trials=1).trials) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"sampler": 5}, "sampler = 5: must be a BaseSampler, or None"),
+        ({"pruner": "median"}, "pruner = 'median': must be a BasePruner, or None"),
+        ({"storage": 5}, "storage = 5: must be a str, or None"),
+        ({"storage": "mysql://x"}, "storage mysql://x: ImportError: "),
+        ({"storage": "redis://x"}, "storage redis://x: ValueError: "),
+    ],
+)
+def test_what_is_no_sampler_pruner_or_storage(given: dict[str, Any], words: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=f"^{words}"):
+        coop.tune(REFUSED, tmp_path / "a", **given)
 
 
 def test_a_trial_s_folder_is_no_link_to_another_one(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from coop.common.arguments import has_masked
 from coop.common.bounds import MAX_MAGNITUDE
 from coop.common.errors import RunError, UsageError
 from coop.common.own_code import brief, described
@@ -265,7 +266,10 @@ class CheckedEnv:
     def _scalar(self, what: str, value: Any, kind: Callable[[Any], T]) -> T:  # noqa: ANN401
         """The number or truth value that an array without dimensions, or a number of numpy, is."""
         if isinstance(value, bool | int | float) or (
-            isinstance(value, np.generic | np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
+            isinstance(value, np.generic | np.ndarray)
+            and value.shape == ()
+            and value.dtype.kind in "biuf"
+            and not has_masked(value)
         ):
             with suppress(OverflowError):  # of an int beyond all floats
                 if kind is float or value in (0, 1):  # 2 and NaN are true to Python, and mean something else
@@ -307,6 +311,8 @@ def _shown(value: object) -> str:
 
 
 def _as_array(given: object, what: str = "observation") -> Array:
+    if has_masked(given):
+        raise Unfit(f"gives the {what} with masked entries", "allowed: an array without any")
     try:
         return np.asarray(given)
     except Exception:  # numbers of unequal lengths, or an object that fails to convert; numpy's or its own

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -180,9 +180,11 @@ class FilmedGymnasium(GymnasiumEnv):
         """Raise UsageError for an environment that has no pictures, or lacks a package for them."""
         (env,), _ = _make(settings, [0])
         observations, actions = _spaces(settings, env)
-        metadata, vectors = env.metadata or {}, len(FrameMaker(settings, observations).shape) == 1
+        vectors = len(FrameMaker(settings, observations).shape) == 1
+        metadata: Mapping[str, Any] = env.metadata if isinstance(env.metadata, Mapping) else {}  # it may be anything
+        modes = metadata.get("render_modes")
         CheckedEnv(env, settings.id, observations, int(actions.n)).close()
-        if vectors and "rgb_array" not in (metadata.get("render_modes") or ()):
+        if vectors and not (isinstance(modes, Collection) and "rgb_array" in modes):
             raise UsageError(
                 f"env.id: {settings.id!r} has no pictures to film: its metadata['render_modes'] has no 'rgb_array'"
             )
@@ -226,7 +228,7 @@ def _make(
     The limit is 0 if there is none, or if vector environments of one's own see to it themselves.
     """
     registered = find_registered(settings)
-    mode, limit = settings.vectorization_mode, settings.max_episode_steps or registered.max_episode_steps or 0
+    mode, limit = settings.vectorization_mode, settings.max_episode_steps or _registered_limit(settings, registered)
     if mode is None and registered.entry_point is None and registered.vector_entry_point is not None:
         mode = "vector_entry_point"
     keeps_limit = mode == "vector_entry_point"
@@ -251,6 +253,20 @@ def _make(
         text = f"env.id = {settings.id!r}, env.kwargs = {settings.kwargs}: {raised(error)}"
         raise UsageError(text) from error
     return envs, 0 if keeps_limit else limit
+
+
+def _registered_limit(settings: EnvSettings, registered: gymnasium.envs.registration.EnvSpec) -> int:
+    """The limit of steps with which an environment is registered, 0 if there is none; raises UsageError."""
+    limit: Any = registered.max_episode_steps
+    if limit is None:
+        return 0
+    number = isinstance(limit, int | float | np.number) and not isinstance(limit, bool)
+    if not number or limit < 1 or limit % 1 != 0:
+        raise UsageError(
+            f"env.id: {settings.id!r} is registered with max_episode_steps = {limit!r}; allowed: whole numbers from "
+            "1 on, or None; env.max_episode_steps sets another limit"
+        )
+    return int(limit)
 
 
 def _spaces(settings: EnvSettings, env: gymnasium.Env[Any, Any]) -> tuple[Box, Discrete]:

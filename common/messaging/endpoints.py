@@ -77,8 +77,11 @@ def explain_shared_memory(error: Exception) -> str:
 
 
 def zenoh_reason(error: Exception) -> str:
-    """The text of Zenoh's error without its source locations."""
-    return str(error).splitlines()[0].split(" at /")[0]
+    """The text of Zenoh's error without its source locations, in one line."""
+    lines = str(error).split(" at /")[0].splitlines()
+    if lines[0].startswith(" --> "):  # the place in a file, the line there, and at last what is wrong with it
+        return f"line {lines[0].removeprefix(' --> ')}: {lines[-1].strip(' =')}"
+    return lines[0]
 
 
 def _host_and_port(address: str) -> tuple[str, str]:

@@ -84,7 +84,8 @@ def open_session(
         config.insert_json5("connect/endpoints", json.dumps(list(connect)))
         config.insert_json5("connect/timeout_ms", "1000" if mode == "client" else "-1")  # a client waits for its link
     except zenoh.ZError as error:
-        raise UsageError(f"zenoh configuration: {zenoh_reason(error)}") from error
+        name = f"--zenoh-config {zenoh_config}" if zenoh_config else "zenoh configuration"
+        raise UsageError(f"{name}: {zenoh_reason(error)}") from error
     try:
         with _threads(mode, listens=bool(listen)):
             session = zenoh.open(config)

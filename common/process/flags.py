@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -15,6 +14,7 @@ import tyro
 from docstring_parser import parse_from_object
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from coop.common.numbers import whole_number
 from coop.common.places import user_path
 
 HttpAddress = Annotated[str, tyro.conf.arg(metavar="[HOST:]PORT")]
@@ -50,17 +50,6 @@ def _int(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
         is_instance=lambda value: isinstance(value, int) and not isinstance(value, bool),
         str_from_instance=lambda value: [str(value)],
     )
-
-
-def whole_number(text: str) -> int:
-    """Read a whole number: 1000000, 1_000_000 or 1e6."""
-    try:
-        return int(text)
-    except ValueError:
-        with suppress(ValueError):
-            if (number := float(text)).is_integer():
-                return int(number)
-        raise
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from coop.common.bounds import MAX_INTEGER, MAX_KWARGS, MAX_STEPS
 from coop.common.errors import UsageError
-from coop.common.settings.reading import Read, parse_toml
+from coop.common.settings.reading import MAX_DEPTH, Read, parse_toml
 
 Positive = Annotated[int, Meta(gt=0, le=MAX_INTEGER)]
 Steps = Annotated[int, Meta(gt=0, le=MAX_STEPS)]
@@ -47,22 +47,24 @@ def _transferable(table: Any) -> Any:  # noqa: ANN401 (another type is refused w
     """Refuse values that a TOML file or a message could not carry."""
     if not isinstance(table, dict):
         return table
-    _check_values(table)
+    _check_values(table, MAX_DEPTH - 3)  # below env and kwargs in a file
     if (size := len(msgspec.msgpack.encode(table))) > MAX_KWARGS:
         raise ValueError(f"{size:,} bytes; allowed: at most {MAX_KWARGS:,}")
     return table
 
 
-def _check_values(value: Any) -> None:  # noqa: ANN401 (whatever the table holds)
+def _check_values(value: Any, depth: int) -> None:  # noqa: ANN401 (whatever the table holds)
+    if depth < 0 and isinstance(value, dict | list):
+        raise ValueError(f"nests more than {MAX_DEPTH - 3} tables and lists")
     match value:
         case dict():
             if not all(isinstance(key, str) for key in value):
                 raise ValueError("names must be strings")
             for each in value.values():
-                _check_values(each)
+                _check_values(each, depth - 1)
         case list():
             for each in value:
-                _check_values(each)
+                _check_values(each, depth - 1)
         case bool() | str():
             pass
         case int() if -MAX_INTEGER <= value <= MAX_INTEGER:

@@ -10,6 +10,7 @@ from typing import Any
 from coop.common.errors import UsageError
 from coop.common.settings.config import RunConfig
 from coop.common.settings.methods import METHODS, table_of
+from coop.common.settings.reading import MAX_DEPTH
 
 _FieldPath = tuple[str, ...]  # in nested tables: ("learner", "optimizer")
 _FIELDS = {field.name for field in fields(RunConfig)}
@@ -33,7 +34,9 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def leaves(tables: Mapping[str, Any], at: _FieldPath = ()) -> Iterator[tuple[_FieldPath, Any]]:
-    """Yield the values of nested tables with their paths."""
+    """Yield the values of nested tables with their paths; raises UsageError for tables that nest without end."""
+    if len(at) > MAX_DEPTH:
+        raise UsageError(f"{'.'.join(at[:2])}: nests more than {MAX_DEPTH} tables")
     for key, value in tables.items():
         if isinstance(value, Mapping):
             yield from leaves(value, (*at, str(key)))

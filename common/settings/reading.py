@@ -5,13 +5,16 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
+import numpy as np
 
 from coop.common.errors import ALSO_CALLED, UsageError, closest, refusal
+from coop.common.numbers import whole_number
 
 T = TypeVar("T")
 MAX_DEPTH = 32  # of tables and lists in each other
@@ -47,11 +50,30 @@ def checked(kind: type[T], tables: Any, prefix: str = "") -> T:  # noqa: ANN401 
     Raises:
         UsageError: an unknown field or a value that is not allowed, with the field, the value and what is allowed.
     """
-    tables = _read(kind, tables, prefix, kind)
+    tables = _read(kind, with_numbers(kind, tables), prefix, kind)
     try:
         return msgspec.convert(tables, kind, strict=False)
     except msgspec.ValidationError as error:
         raise UsageError(_explained(error, kind, tables, prefix)) from error
+
+
+def with_numbers(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any types, any value)
+    """Nested tables in which whole numbers are ints and numpy's are Python's, for what is derived from them.
+
+    kind: a dataclass, whose fields say where whole numbers stand. What is none there is left as it is.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    base = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    if is_dataclass(base) and isinstance(value, Mapping):
+        known = fields_of(base)  # type: ignore[arg-type] # a class
+        return {name: with_numbers(known.get(name, object), each) for name, each in value.items()}
+    if get_origin(base) is tuple and isinstance(value, list | tuple):
+        return [with_numbers(get_args(base)[0], each) for each in value]
+    if (base is int or int in get_args(base)) and isinstance(value, str | float):
+        with suppress(ValueError):
+            return whole_number(str(value))
+    return value
 
 
 @cache
@@ -68,21 +90,31 @@ def _read(kind: Any, value: Any, place: str, whole: Any) -> Any:  # noqa: ANN401
             try:
                 value = mark.function(value)
             except ValueError as error:
-                raise UsageError(f"{place} = {value!r}: {error}") from error
+                raise UsageError(f"{place} = {_shown(value)}: {error}") from error
     if is_dataclass(base) and isinstance(value, Mapping):
         place = place if not place or place.endswith(".") else f"{place}."
         known = fields_of(base)  # type: ignore[arg-type] # a class
         for name, each in value.items():
             if name not in known:
                 near = _elsewhere(whole).get(ALSO_CALLED.get(str(name), str(name))) or closest(str(name), known)
+                if near is not None and near == name and "." in near:  # the dotted name that flags have
+                    table, _, last = near.partition(".")
+                    near = f'{table}={{"{last}": ...}}'
                 problem = refusal("no such field", near, f"allowed: {', '.join(known)}")
-                raise UsageError(f"{place}{name} = {each!r}: {problem}")
+                raise UsageError(f"{place}{name} = {_shown(each)}: {problem}")
         return {name: _read(known[name], each, f"{place}{name}", whole) for name, each in value.items()}
     if get_origin(base) is tuple and not isinstance(value, list | tuple):
         raise UsageError(f"{place} = {value!r}: must be a list, such as [64, 64]")
     if get_origin(base) is tuple:
         return [_read(get_args(base)[0], each, f"{place}[{n}]", whole) for n, each in enumerate(value)]
     return value
+
+
+def _shown(value: object) -> str:
+    try:
+        return repr(value)
+    except RecursionError:
+        return type(value).__name__
 
 
 @cache

@@ -16,7 +16,7 @@ from coop.common.process.untrusted import MAX_SETTINGS, read_text
 from coop.common.settings.config import OF_MACHINE, OUTSIDE, LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.methods import METHODS
 from coop.common.settings.overrides import merged, of_method
-from coop.common.settings.reading import checked, fields_of, parse_toml
+from coop.common.settings.reading import checked, fields_of, parse_toml, with_numbers
 from coop.common.settings.rules import check_rules, fitted
 
 CONFIG = "config.toml"
@@ -65,7 +65,8 @@ def shortened(tables: Mapping[str, Any], total_steps: int) -> dict[str, Any]:
     """
     replay, learner = tables.get("replay", {}), tables.get("learner", {})
     start = min(replay.get("learning_starts", ReplaySettings.learning_starts), max(1, total_steps // 10))
-    part = min(1.0, total_steps / tables.get("total_steps", RunConfig.total_steps))
+    full = tables.get("total_steps", RunConfig.total_steps)
+    part = min(max(total_steps, 0), full) / full  # one that is out of range is refused later
     final = learner.get("learning_rate_final", LearnerSettings.learning_rate_final) ** part
     return {
         **tables,
@@ -84,25 +85,21 @@ def resolve(tables: Mapping[str, Any], method: str | None = None) -> RunConfig:
     Raises:
         UsageError: an unknown field or a value out of range; names the field, the value and what is allowed.
     """
-    return validated(_completed(of_method(tables, method)))
+    return validated(_completed(with_numbers(RunConfig, of_method(tables, method))))
 
 
 def _completed(tables: dict[str, Any]) -> dict[str, Any]:
     """The tables with the defaults that follow from other fields; what is no number is refused later."""
     replay, actor = tables.get("replay", {}), tables.get("actor", {})
     steps = tables.get("total_steps", RunConfig.total_steps)
-    if not isinstance(replay, Mapping) or not isinstance(actor, Mapping) or not _whole(steps):
+    if not isinstance(replay, Mapping) or not isinstance(actor, Mapping) or not isinstance(steps, int):
         return tables
-    tenth, capacity = max(1, int(steps) // 10), replay.get("capacity", ReplaySettings.capacity)
-    if "learning_starts" not in replay and _whole(capacity):
+    tenth, capacity = max(1, steps // 10), replay.get("capacity", ReplaySettings.capacity)
+    if "learning_starts" not in replay and isinstance(capacity, int):
         least = replay.get("n_step", ReplaySettings.n_step)
-        start = 1 if replay.get("preload") else min(ReplaySettings.learning_starts, int(capacity), tenth)
+        start = 1 if replay.get("preload") else min(ReplaySettings.learning_starts, capacity, tenth)
         replay = {**replay, "learning_starts": max(start, least) if isinstance(least, int) else start}
     return {**tables, "replay": replay, "actor": {"epsilon_steps": tenth, **actor}}
-
-
-def _whole(value: object) -> bool:
-    return isinstance(value, int) or (isinstance(value, float) and value.is_integer())
 
 
 def validated(

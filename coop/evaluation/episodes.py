@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from coop.common.arguments import as_array
 from coop.common.envs.make import env_spec, make_vector_env
 from coop.common.envs.protocol import VectorEnv
 from coop.common.errors import CoopError, UsageError
@@ -54,10 +55,7 @@ def play(env: VectorEnv, act: Acting, episodes: int, stopped: Callable[[], bool]
 def chosen(act: Acting, obs: Array, spec: EnvSpec, mask: NDArray[np.bool_] | None) -> NDArray[np.int32]:
     """The actions, int32 [envs], of a policy; raises UsageError if they are none, or not allowed."""
     answer = act(obs) if mask is None else act(obs, mask)
-    try:
-        given = np.asarray(answer)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"policy: gives what is no array: {error}") from error
+    given = as_array("policy: what it gives", answer)
     if given.size == len(obs) and given.dtype.kind in "iu":
         actions = given.reshape(len(obs))
         if actions.min() >= 0 and actions.max() < spec.num_actions:

@@ -13,7 +13,7 @@ import pandas as pd
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from coop.common.arguments import check_seconds, check_whole, texts
+from coop.common.arguments import as_array, check_flag, check_seconds, check_whole, texts
 from coop.common.bounds import MAX_INTEGER
 from coop.common.envs.make import env_spec
 from coop.common.errors import UsageError
@@ -31,7 +31,7 @@ from coop.evaluation.film import Clip, Film
 from coop.evaluation.notebook import run_html
 from coop.learner.qnetwork import make_network
 from coop.records.checkpoints import EVALUATIONS, RECORDS
-from coop.records.learner_checkpoints import fitting, newest_checkpoint
+from coop.records.learner_checkpoints import check_spec, fitting, newest_checkpoint
 from coop.records.locks import holder
 from coop.records.reading import check_records, read_frame, read_jsonl, read_run_config
 from coop.records.summaries import read_summary
@@ -99,10 +99,7 @@ class SavedPolicy:
         return values if batch is given else values[0]
 
     def _as_mask(self, mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        try:
-            given = np.asarray(mask)
-        except (TypeError, ValueError) as error:
-            raise UsageError(f"mask: not an array: {error}") from error
+        given = as_array("mask", mask)
         if given.shape != shape or given.dtype.kind not in "biu" or not np.isin(given, (0, 1)).all():
             wanted = f"bool or 0 and 1, {list(shape)}"
             raise UsageError(f"mask {given.dtype}{list(given.shape)}: {self.spec.env_id} has {wanted}")
@@ -113,10 +110,7 @@ class SavedPolicy:
     def _as_stored(self, obs: ArrayLike) -> Array:
         """An observation in the dtype of the environment's; numbers in lists may stand for it if they fit exactly."""
         dtype = np.dtype(self.spec.frame_dtype)
-        try:
-            given = np.asarray(obs)
-        except (TypeError, ValueError) as error:
-            raise UsageError(f"observation: not an array: {error}") from error
+        given = as_array("observation", obs)
         if given.dtype.kind not in "biuf" or not (
             np.can_cast(given.dtype, dtype, "same_kind")
             or (given.dtype.kind != "f" and np.array_equal(given.astype(dtype), given))
@@ -184,8 +178,9 @@ class SavedRun:
         if checkpoint is None:
             raise UsageError(f"{self.path}: has no complete checkpoint")
         state, spec = checkpoint.state, env_spec(self.config.env)
-        first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
         with fitting(checkpoint.path):
+            check_spec(checkpoint, spec)
+            first, second = (make_network(self.config, spec, number, CPU) for number in (0, 1))
             for network, flat in zip((first, second), state["agent"]["networks"], strict=True):
                 network.load(flat)
             steps, returns = state["drawn"]["inserted"], state["telemetry"]["returns"]
@@ -200,6 +195,7 @@ class SavedRun:
             UsageError: the run keeps no table, or has no checkpoint here that holds one.
             RunError: the run saved no checkpoint in that time.
         """
+        check_flag("live", live)
         check_seconds("timeout", timeout)
         if live and not self.config.streaming:
             ask_and_wait(self.path, timeout, lambda: holder(self.path)[1])

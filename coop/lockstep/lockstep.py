@@ -21,7 +21,7 @@ from coop.common.types import EpisodeRecord
 from coop.learner.trainer import Effects, Trainer
 from coop.lockstep.memory import make_experience
 from coop.records.checkpoints import REPLAY
-from coop.records.learner_checkpoints import fitting, saving_checkpoint
+from coop.records.learner_checkpoints import check_spec, fitting, saving_checkpoint
 from coop.records.resumption import Whole
 from coop.records.run_directory import RunDirectory
 from coop.replay.persistence.storage import Mark
@@ -150,6 +150,7 @@ class Lockstep:
         if "player" not in state:
             raise UsageError(f"{checkpoint.path}: saved by a distributed run; coop-local --resume continues it")
         with fitting(checkpoint.path):
+            check_spec(checkpoint, self.env.spec)
             self._replay_actions(state["player"]["actions"].tolist(), replaying)
             if state["player"]["seen"] != self._seen:
                 raise RunError(

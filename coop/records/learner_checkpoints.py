@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
 from msgspec.structs import replace
 
@@ -17,6 +18,8 @@ from coop.common.process.files import FileDigest, write_atomic
 from coop.common.process.memory import return_freed_memory
 from coop.common.process.output import warn
 from coop.common.process.untrusted import check_torch_file
+from coop.common.settings.tables import first_difference
+from coop.common.types import EnvSpec
 from coop.records.checkpoints import (
     LEARNER,
     PART,
@@ -120,6 +123,16 @@ def load_learner(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict):
         raise TypeError("not a learner's state")
     return state
+
+
+def check_spec(checkpoint: Whole, spec: EnvSpec) -> None:
+    """Raise UsageError if the environment is another one than the run was trained in; old checkpoints don't say."""
+    now = msgspec.to_builtins(msgspec.structs.asdict(spec))
+    if found := first_difference(now, checkpoint.state.get("spec", now)):
+        name, here, there = found
+        raise UsageError(
+            f"env.id: {spec.env_id!r} has changed since {checkpoint.path} was saved: {name} is {here}, and was {there}"
+        )
 
 
 @contextmanager

@@ -17,9 +17,10 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from coop.common.errors import RunError, UsageError
 from coop.common.imports import check_extra, hand_over, permit
+from coop.common.numbers import whole_number
 from coop.common.places import absolute, shown
 from coop.common.process import cli
-from coop.common.process.flags import HttpAddress, whole_number
+from coop.common.process.flags import HttpAddress
 from coop.common.process.output import warn
 from coop.common.process.untrusted import check_links
 from coop.common.settings.config import RunConfig

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,14 +19,12 @@ from coop.common.numbers import RETURN_WINDOW
 from coop.common.places import absolute
 from coop.common.process.files import make_folder
 from coop.common.process.limits import cores
-from coop.common.process.untrusted import MAX_SETTINGS, read_text, refuse_links
-from coop.common.settings.overrides import merged, nested
-from coop.common.settings.reading import checked, parse_toml
+from coop.common.process.untrusted import refuse_links
 from coop.records.following import EPISODES, Following
 from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import read_summary
+from coop.studies.space import Space
 from coop.studies.sweep.folder import CellFolder
-from coop.studies.sweep.grid import Cell, Grid, GridFile
 from coop.studies.sweep.local import LocalProcesses
 
 if TYPE_CHECKING:
@@ -39,7 +36,6 @@ TRIES = 25  # to make a storage's tables while others do
 MOST_SEED = 2**31  # of the sampler, to which the number of trials is added; numpy takes 32 bits
 REPORTS = 20  # of a run, to the pruner, at equal distances in environment steps
 GRACE = 60.0  # seconds for the runs to save their state
-RANGE = {"low", "high", "log", "step"}
 
 
 def tune(
@@ -81,10 +77,21 @@ def tune(
     check_whole("workers", cores() if workers is None else workers, 1)
     check_whole("seed", seed, 0, MOST_SEED)
     path = absolute(folder, "folder")
+    for name, given, kind in (
+        ("sampler", sampler, optuna.samplers.BaseSampler),
+        ("pruner", pruner, optuna.pruners.BasePruner),
+        ("storage", storage, str),
+    ):
+        if not isinstance(given, kind | None):
+            raise UsageError(f"{name} = {given!r}: must be a {kind.__name__}, or None")
     space = Space(grid)
     file = _file_in(path)
     with _storing(storage or str(file)):
-        study = _study(storage or file, path.name, pruner)
+        try:
+            study = _study(storage or file, path.name, pruner)
+        except (ImportError, ValueError) as error:  # no such database here
+            raise UsageError(f"storage {storage}: {first_line(error)}") from error
+        space.check(study)
         # Another seed after each interruption: the same one would draw the same settings again.
         study.sampler = sampler or optuna.samplers.TPESampler(seed=seed + len(study.trials))
         search = _Search(study, space, path, workers or cores())
@@ -158,72 +165,6 @@ def _storing(storage: str) -> Iterator[None]:
     except (SQLAlchemyError, StorageInternalError) as error:
         why = next((each for each in (error.__cause__, getattr(error, "orig", None)) if each), error)
         raise RunError(f"storage {storage}: {first_line(getattr(why, 'orig', None) or why)}") from error
-
-
-class Space:
-    """The settings among which a search chooses."""
-
-    def __init__(self, grid: str | Path | Mapping[str, Any]) -> None:
-        """Read a grid; raises UsageError, also for settings that no run takes."""
-        if not isinstance(grid, Mapping):
-            path = absolute(grid, "grid")
-        try:
-            tables = dict(grid) if isinstance(grid, Mapping) else parse_toml(read_text(path, MAX_SETTINGS))
-            tables.pop("quick", None)
-            self.file = checked(GridFile, tables)
-        except (OSError, UnicodeDecodeError, CoopError) as error:
-            name = "grid" if isinstance(grid, Mapping) else f"grid {grid}"
-            raise UsageError(f"{name}: {getattr(error, 'strerror', None) or error}") from error
-        self.axes = _axes(self.file.vary)
-        first = {name: each["low"] if isinstance(each, Mapping) else each[0] for name, each in self.axes.items()}
-        self.cells("trial", self.file.methods[0], first)
-
-    def cells(self, name: str, method: str, chosen: Mapping[str, Any]) -> list[Cell]:
-        """A cell for each seed with the chosen settings, by their dotted names; raises UsageError."""
-        fixed = self.file.fixed
-        for field_name, value in chosen.items():
-            fixed = merged(fixed, nested(tuple(field_name.split(".")), value))
-        cells = Grid(replace(self.file, methods=(method,), fixed=fixed, vary={})).cells
-        each = [f"{name}-seed={cell.config.seed}" if len(cells) > 1 else name for cell in cells]
-        return [Cell(own, cell.config) for own, cell in zip(each, cells, strict=True)]
-
-    def suggest(self, trial: optuna.Trial) -> tuple[str, dict[str, Any]]:
-        """(method, settings) of a trial."""
-        methods = list(self.file.methods)
-        method = trial.suggest_categorical("method", methods) if len(methods) > 1 else methods[0]
-        return str(method), {name: _suggested(trial, name, values) for name, values in self.axes.items()}
-
-
-def _axes(vary: Mapping[str, Any], at: str = "") -> dict[str, Any]:
-    """The varying fields by dotted names: a list, or the table of a range. Raises UsageError."""
-    found: dict[str, Any] = {}
-    for key, value in vary.items():
-        name = f"{at}{key}"
-        if isinstance(value, Mapping) and "low" in value:
-            low, high = value["low"], value.get("high")
-            kinds = all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high))
-            log_and_step = value.get("log") and "step" in value
-            if value.keys() - RANGE or not kinds or low > high or log_and_step or (value.get("log") and low <= 0):
-                raise UsageError(f"vary.{name} = {dict(value)!r}: must be low and high, with log = true or a step")
-            found[name] = value
-        elif isinstance(value, Mapping):
-            found |= _axes(value, f"{name}.")
-        elif isinstance(value, list | tuple) and value:
-            found[name] = list(value)
-        else:
-            raise UsageError(f"vary.{name} = {value!r}: must be a list of at least one value, or low and high")
-    return found
-
-
-def _suggested(trial: optuna.Trial, name: str, values: Any) -> Any:  # noqa: ANN401 (of any field)
-    if isinstance(values, Mapping):
-        low, high, log, step = values["low"], values["high"], bool(values.get("log")), values.get("step")
-        if isinstance(low, int) and isinstance(high, int):
-            return trial.suggest_int(name, low, high, log=log, step=step or 1)
-        return trial.suggest_float(name, low, high, log=log, step=step)
-    if all(isinstance(value, str | bool | int | float) for value in values):
-        return trial.suggest_categorical(name, values)
-    return json.loads(str(trial.suggest_categorical(name, [json.dumps(value) for value in values])))
 
 
 @dataclass

@@ -24,7 +24,7 @@ from coop.common.settings.fields import Positive
 from coop.common.settings.methods import METHODS
 from coop.common.settings.names import MethodName
 from coop.common.settings.overrides import leaves, merged, nested, of_method
-from coop.common.settings.reading import checked, parse_toml
+from coop.common.settings.reading import checked, parse_toml, with_numbers
 from coop.common.settings.starting import env_id_of, starting_tables, stated
 from coop.common.settings.tables import load_tables, resolve, shortened, to_tables, validated
 
@@ -121,7 +121,7 @@ def grid_text(tables: Mapping[str, Any]) -> str:
     """The TOML of a grid's contents; raises UsageError for what TOML can't say."""
     try:
         return tomli_w.dumps(tables)
-    except (TypeError, ValueError, AttributeError) as error:  # the last for a key that is no text
+    except (TypeError, ValueError, AttributeError, RecursionError) as error:  # also for a key that is no text
         raise UsageError(f"grid: {error}") from error
 
 
@@ -176,11 +176,12 @@ def _cells(file: GridFile, choices: Iterable[Choice]) -> tuple[Cell, ...]:
 
     cells = []
     for choice in choices:
-        total_steps = choice.values.get(("total_steps",), file.fixed.get("total_steps"))
-        fits = type(total_steps) is int and total_steps > 0  # other values are refused below
         given = file.fixed
         for path, value in choice.values.items():
             given = merged(given, nested(path, value))
+        given = with_numbers(RunConfig, given)
+        total_steps = given.get("total_steps")
+        fits = type(total_steps) is int and total_steps > 0  # other values are refused below
         start = base(choice.method, total_steps if fits else None, env_id_of(given))
         tables = {**of_method(merged(start, given), choice.method), "seed": choice.seed}
         cells.append(Cell(choice.name, validated(tables, stated(given), lockstep=file.mode == "lockstep")))

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from coop.common.arguments import check_whole
+from coop.common.arguments import check_flag, check_whole
 from coop.common.errors import UsageError
 from coop.common.places import absolute
 from coop.common.process.limits import check_processes, cores
@@ -69,6 +69,7 @@ def sweep(
     Raises:
         UsageError: the grid or a setting is invalid, or the folder holds other runs.
     """
+    check_flag("quick", quick)
     for name, value in (("jobs", jobs), ("stack", stack)):
         if value is not None:
             check_whole(name, value, 1)
