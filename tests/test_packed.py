@@ -165,6 +165,26 @@ def test_what_cannot_be_packed(folder: Path, tmp_path: Path) -> None:
         write_report(folder / "sweep.toml", tmp_path / "out")
 
 
+def test_nothing_but_a_packed_study_is_replaced(folder: Path, tmp_path: Path) -> None:
+    run = folder / "dqn-seed=0"
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "link.parquet").symlink_to("notes.txt")
+    kept = {path: path.read_bytes() for path in (run / "episodes.csv", folder / "sweep.toml", tmp_path / "notes.txt")}
+    for path in kept:
+        with pytest.raises(UsageError, match=rf"would replace .*{path.name}: not a packed study: .*name a new file"):
+            pack(folder, path)
+    with pytest.raises(UsageError, match=r"link\.parquet: a link, to notes\.txt"):
+        pack(folder, tmp_path / "link.parquet")
+    for runs in (folder, run):
+        with pytest.raises(UsageError, match=r"in the folder of the run .*dqn-seed=0; name a file outside of it"):
+            pack(runs, run / "new.parquet")
+    assert {path: path.read_bytes() for path in kept} == kept
+    assert not (run / "new.parquet").exists()
+    for seed in (0, 1):
+        pack(folder / f"dqn-seed={seed}", folder / "one.parquet")
+    assert PackedStudy(folder / "one.parquet").names == ["dqn-seed=1"]
+
+
 def test_a_thinned_study_keeps_its_episodes_and_warnings(folder: Path, tmp_path: Path) -> None:
     left_out = {"time": 1e9, "loss": 0.5, "reuse_histogram": [1, 2]}
     rows = [
