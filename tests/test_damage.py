@@ -292,6 +292,35 @@ def test_overwriting_leaves_a_folder_without_a_run_as_it_is(tmp_path: Path) -> N
     assert contents(tmp_path) == before
 
 
+def test_files_of_the_user_are_not_replaced_by_a_run(run: Path, tmp_path: Path) -> None:
+    there, written = tmp_path / "mine", (run / "config.toml").read_text()
+    mine = {name: f"mine: {name}".encode() for name in ("summary.json", "evaluations.csv", "learning_curve.png")}
+    mine |= {"roster.json": b"{}", "videos/100.gif": b"GIF", "config.toml": b"# a note\nmethod = 'dqn'\n"}
+    (there / "videos").mkdir(parents=True)
+    for name, data in mine.items():
+        (there / name).write_bytes(data)
+        with pytest.raises(UsageError, match=rf"{name} there is no run's, and would be replaced; .*--overwrite"):
+            Start().check_free(there)
+        (there / name).unlink()
+    (there / "config.toml").write_text(written)  # of a run that is about to begin
+    Start().check_free(there)
+    for name, data in mine.items():
+        (there / name).write_bytes(data)
+    refused = run_command("coop-lockstep", "--config", there / "config.toml", "--run-dir", there)
+    assert (refused.returncode, refused.stderr.count("\n"), "config.toml there" in refused.stderr) == (2, 1, True)
+    assert contents(there) == mine
+    (there / "summary.json").unlink()
+    for start in (Start(overwrite=True), Start(resume=True)):
+        _, (line, *_) = start.prepare(there, replay=False)
+        (aside,) = (there / "aside").iterdir()
+        assert line.startswith("config.toml, evaluations.csv, ")
+        assert line.endswith(f"is in {aside}")
+        assert contents(aside) == {name: data for name, data in mine.items() if name != "summary.json"}
+        aside.rename(tmp_path / "moved")
+        shutil.copytree(tmp_path / "moved", there, dirs_exist_ok=True)
+        shutil.rmtree(tmp_path / "moved")
+
+
 def test_a_run_killed_before_its_first_checkpoint_begins_again_with_its_records_aside(run: Path) -> None:
     (run / "summary.json").unlink()
     for folder in (run / "checkpoints").iterdir():

@@ -17,8 +17,8 @@ from coop.common.errors import UsageError
 from coop.common.settings.medqn import MedqnSettings
 from coop.common.settings.tables import resolve
 from coop.studies.sweep.cli import SweepOptions, chosen, main
-from coop.studies.sweep.folder import CellFolder
-from coop.studies.sweep.grid import load_grid, shipped_grids
+from coop.studies.sweep.folder import CellFolder, claim_folder
+from coop.studies.sweep.grid import load_grid, parse_grid, shipped_grids
 from coop.studies.sweep.local import LocalProcesses
 
 pytestmark = pytest.mark.timeout(300)  # a dozen processes, one after the other, also on a machine that is busy
@@ -162,6 +162,28 @@ def test_a_grid_sets_fields_of_single_methods(tmp_path: Path) -> None:
         path.write_text(text + wrong)
         with pytest.raises(UsageError, match=words):
             load_grid(str(path))
+
+
+def claimed(folder: Path, text: str) -> None:
+    """Assign a folder to a grid, whose cells may begin then."""
+    grid = parse_grid(text, "grid")
+    cells = [CellFolder(folder, cell) for cell in grid.cells]
+    claim_folder(grid, cells, folder)
+    for cell in cells:
+        cell.path.mkdir(exist_ok=True)
+        cell.prepare()
+
+
+def test_a_config_that_the_user_wrote_is_not_replaced_by_a_cell(tmp_path: Path) -> None:
+    claimed(tmp_path, TINY)
+    held = tmp_path / "dqn-seed=0" / "config.toml"
+    held.write_text(text := f"# mine\n{held.read_text()}")
+    with pytest.raises(UsageError, match=r"config\.toml: not "):
+        claimed(tmp_path, TINY)
+    held.write_text(text := text.rpartition("# crc32")[0])
+    with pytest.raises(UsageError, match=r"config\.toml: not written by a sweep"):
+        claimed(tmp_path, TINY)
+    assert held.read_text() == text
 
 
 def test_bad_flags_are_refused_before_anything_runs(

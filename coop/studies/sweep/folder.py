@@ -11,10 +11,11 @@ from coop.common.errors import RunError, UsageError
 from coop.common.numbers import RETURN_WINDOW
 from coop.common.process.files import make_folder, write_atomic
 from coop.common.process.untrusted import check_links, refuse_links
-from coop.common.settings.tables import identity, run_config_text, sealed_toml
+from coop.common.settings.tables import CONFIG, identity, run_config_text, sealed_toml
 from coop.records.checkpoints import RECORDS, SWEEP, checked_summary
 from coop.records.locks import LockHeld, RunLock
 from coop.records.reading import read_csv_tail, read_run_config
+from coop.records.resumption import strays
 from coop.records.sinks import DEFAULT_LOG
 from coop.studies.sweep.grid import Cell, Grid
 
@@ -48,12 +49,14 @@ class CellFolder:
         self.path = sweep / cell.name
 
     def check(self) -> None:
-        """Raise UsageError if the folder holds a run of another config, or is a link."""
+        """Raise UsageError if the folder holds a run of another config, or a config of the user's, or is a link."""
         refuse_links(self.path)
         check_links(self.path)
         held = self.path / "config.toml"
         if held.exists() and identity(read_run_config(self.path)) != identity(self.cell.config):
             raise UsageError(f"{held}: not the config of this grid's cell; give another --dir")
+        if CONFIG in strays(self.path):
+            raise UsageError(f"{held}: not written by a sweep, and would be replaced; give another --dir")
 
     def ending(self) -> Ending | None:
         """How its run ended for good; None if it has to be run or continued."""
