@@ -1,6 +1,7 @@
 """Packed studies: every number comes back, and a report of the file is the report of the folder."""
 
 import csv
+import errno
 import json
 from pathlib import Path
 
@@ -154,6 +155,35 @@ def test_curves_of_all_runs(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     drawn = {path.parent.name: path.read_bytes() for path in (tmp_path / "a").glob("*/learning_curve.png")}
     assert sorted(drawn) == ["dqn-seed=0", "dqn-seed=1", "dqn-seed=2"]
     assert drawn == {path.parent.name: path.read_bytes() for path in (tmp_path / "b").glob("*/learning_curve.png")}
+
+
+def full(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left")
+
+
+def test_a_report_replaces_nothing_but_a_report(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "mine"
+    out.mkdir()
+    for name in ("index.html", "returns_steps.png", "returns_steps.csv", "table_runs.md"):
+        (out / name).write_text("mine")
+        with pytest.raises(UsageError, match=rf"--out .*mine: {name} there is no report's; name an empty or a new"):
+            write_report(folder, out)
+        assert [path.name for path in out.iterdir()] == [name]
+        assert (out / name).read_text() == "mine"
+        (out / name).unlink()
+    (out / "notes.txt").write_text("mine")
+    with monkeypatch.context() as patch:
+        patch.setattr("coop.studies.report.writer._draw_all", full)
+        with pytest.raises(UsageError, match="No space left"):
+            write_report(folder, out)
+    for _ in range(2):
+        write_report(folder, out)
+        assert "has not ended" not in (out / "index.html").read_text()
+    (folder / "report").mkdir()
+    (folder / "report" / "table_runs.md").write_text("of a report whose page is not kept")
+    monkeypatch.setattr("sys.argv", ["coop-report", str(folder)])
+    cli.main()
+    assert "<code>coop-report" in (folder / "report" / "index.html").read_text()
 
 
 def test_what_cannot_be_packed(folder: Path, tmp_path: Path) -> None:

@@ -66,4 +66,5 @@ def _run() -> None:
         base = runs if runs.is_dir() else runs.with_suffix("")
         if options.out is None:
             refuse_links(base / "report")
-        print(shown(write_report(runs, options.out or base / "report", options.baseline)))
+        out, own = options.out or base / "report", options.out is None
+        print(shown(write_report(runs, out, options.baseline, own=own)))
