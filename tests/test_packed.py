@@ -208,6 +208,9 @@ def test_nothing_but_a_packed_study_is_replaced(folder: Path, tmp_path: Path) ->
     for runs in (folder, run):
         with pytest.raises(UsageError, match=r"in the folder of the run .*dqn-seed=0; name a file outside of it"):
             pack(runs, run / "new.parquet")
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(UsageError, match="Too many levels of symbolic links"):
+        pack(folder, tmp_path / "loop" / "new.parquet")
     assert {path: path.read_bytes() for path in kept} == kept
     assert not (run / "new.parquet").exists()
     for seed in (0, 1):

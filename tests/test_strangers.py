@@ -145,6 +145,15 @@ def test_no_link_leads_out_of_a_run(trained: Path, tmp_path: Path, place: str) -
     assert list(mine.iterdir()) == [] if mine.is_dir() else mine.read_text() == "precious"
 
 
+@pytest.mark.parametrize("name", ["metrics.jsonl", "checkpoints", "summary.json"])
+def test_a_link_that_leads_to_itself_is_named(trained: Path, tmp_path: Path, name: str) -> None:
+    run = a_copy(trained, tmp_path / "theirs")
+    linked(run / name, Path(name))
+    for look in (check_links, coop.load, open_source):
+        with pytest.raises(RunError, match=rf"{name}: a link that leads to itself"):
+            look(run)
+
+
 def cell(run: Path) -> CellFolder:
     """The run as the cell of a sweep."""
     (one,) = parse_grid('methods = ["dqn"]\nseeds = [0]\n', "g.toml").cells

@@ -6,6 +6,7 @@ compared with the bytes that are there before memory is taken for it.
 
 from __future__ import annotations
 
+import errno
 import io
 import mmap
 import os
@@ -94,10 +95,20 @@ def check_links(folder: Path) -> None:
         return
     inside = folder.resolve()
     for path in _own(folder):
+        if path.is_symlink() and _leads_to_itself(path):
+            raise RunError(f"{path}: a link that leads to itself; not followed")
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
             raise RunError(f"{path}: a link that leads out of the run, to {path.readlink()}; not followed")
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise RunError(f"{path}: neither a file nor a folder; not opened")
+
+
+def _leads_to_itself(path: Path) -> bool:
+    try:
+        path.stat()
+    except OSError as error:
+        return error.errno == errno.ELOOP
+    return False
 
 
 def _own(folder: Path) -> Iterator[Path]:

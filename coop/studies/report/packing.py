@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -64,7 +65,7 @@ def _check_place(path: Path, runs: Sequence[Path]) -> None:
             PackedStudy(path)
         except UsageError as error:
             raise UsageError(f"--pack: would replace {error}; name a new file") from error
-    there = path.resolve()
+    there = Path(os.path.realpath(path))  # unlike `resolve`, it bears links that lead to themselves
     if inside := next((run for run in runs if there.is_relative_to(run.resolve())), None):
         raise UsageError(f"--pack {path}: in the folder of the run {inside}; name a file outside of it")
 
