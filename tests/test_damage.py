@@ -30,6 +30,8 @@ from coop.evaluation.export import export
 from coop.lockstep.run import LockstepRun
 from coop.records import checkpoints, resumption
 from coop.records.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, write_manifest
+from coop.records.curve import learning_curve
+from coop.records.growing import GrowingTable
 from coop.records.locks import _place
 from coop.records.reading import read_csv, read_jsonl, read_lines, read_run_config
 from coop.records.resumption import Start, survey
@@ -41,6 +43,7 @@ from coop.replay.persistence.recovery import recover
 from coop.studies.report.packed import PackedStudy
 from coop.studies.report.packing import pack
 from coop.studies.report.study import load_study
+from coop.studies.report.writer import draw_curves
 from coop.studies.sweep.folder import CellFolder
 from coop.studies.sweep.grid import load_grid
 
@@ -635,6 +638,38 @@ def test_lines_that_cannot_be_read_are_named(
         load_study(run.parent)
     with pytest.raises(RunError, match=name.replace(".", r"\.")):
         _ = coop.load(run).episodes
+
+
+@pytest.mark.parametrize(
+    ("text", "line"), [(b"3\r3", "new-line character"), (b"9" * 140_000, "field larger"), (b"3\0", "holds a NUL byte")]
+)
+def test_records_without_a_seal_are_refused_by_their_line(text: bytes, line: str, run: Path, tmp_path: Path) -> None:
+    """Without a summary and checkpoints, nothing but the line itself says that it is damaged."""
+    path = run / "episodes.csv"
+    (run / "summary.json").unlink()
+    shutil.rmtree(run / "checkpoints")
+    path.write_bytes(path.read_bytes().replace(b"\n4,", b"\n" + text + b",", 1))
+    reads: tuple[Callable[[], object], ...] = (
+        lambda: coop.load(run).episodes,
+        lambda: pack(run, tmp_path / "study.parquet"),
+        lambda: draw_curves(run, tmp_path / "curves"),
+        lambda: learning_curve(run, "a run"),
+    )
+    for read in reads:
+        with pytest.raises(RunError, match=rf"episodes\.csv, line 6: (can't be read: )?{line}"):
+            read()
+    assert run_command("coop-watch", run, "--once").stderr.count("Traceback") == 0
+    table = GrowingTable(path)
+    assert [row["episode"] for row in table.rows()][:5] == ["0", "1", "2", "3", "3\0" if b"\0" in text else "5"]
+
+
+def test_an_empty_record_has_no_rows(run: Path) -> None:
+    (run / "summary.json").unlink()
+    shutil.rmtree(run / "checkpoints")
+    for text in ("", "half a line"):
+        (run / "episodes.csv").write_text(text)
+        assert coop.load(run).episodes.empty
+        assert read_csv(run / "episodes.csv") == []
 
 
 def test_a_digit_of_a_record_is_not_changed_in_silence(run: Path) -> None:
