@@ -98,7 +98,7 @@ def _check_own(index: Path, others: Sequence[Path]) -> None:
     """Refuse to replace files beside a page that is no report's; raises UsageError, and OSError."""
     if index.exists() and MARK.encode() in read_bytes(index):
         return
-    if there := next((path for path in (index, *others) if path.exists()), None):
+    if there := next((path for path in (index, *others) if path.is_file()), None):
         raise UsageError(f"--out {index.parent}: {there.name} there is no report's; name an empty or a new folder")
 
 
