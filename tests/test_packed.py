@@ -245,6 +245,17 @@ def test_rows_that_are_refused(flags: list[str], folder: Path, monkeypatch: pyte
     assert ended.value.code == 2
 
 
+def test_a_file_without_a_suffix_has_no_place_for_its_report(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pack(folder, tmp_path / "packed")
+    monkeypatch.setattr("sys.argv", ["coop-report", str(tmp_path / "packed")])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert "packed: a file without a suffix, so that its report has no place; give --out" in capsys.readouterr().err
+
+
 def test_tables_of_a_study_whose_methods_have_settings_of_their_own() -> None:
     """Settings that are none of a run's are missing values; pandas warns of nothing."""
     frames = coop.load_sweep(Path(__file__).parents[1] / "results" / "cartpole" / "medqn.parquet")
