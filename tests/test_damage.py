@@ -30,6 +30,8 @@ from coop.evaluation.export import export
 from coop.lockstep.run import LockstepRun
 from coop.records import checkpoints, resumption
 from coop.records.checkpoints import DONE, WRITING, Manifest, checkpoint_numbers, write_manifest
+from coop.records.curve import learning_curve
+from coop.records.growing import GrowingTable
 from coop.records.locks import _place
 from coop.records.reading import read_csv, read_jsonl, read_lines, read_run_config
 from coop.records.resumption import Start, survey
@@ -41,6 +43,7 @@ from coop.replay.persistence.recovery import recover
 from coop.studies.report.packed import PackedStudy
 from coop.studies.report.packing import pack
 from coop.studies.report.study import load_study
+from coop.studies.report.writer import draw_curves
 from coop.studies.sweep.folder import CellFolder
 from coop.studies.sweep.grid import load_grid
 
@@ -290,6 +293,35 @@ def test_overwriting_leaves_a_folder_without_a_run_as_it_is(tmp_path: Path) -> N
     before = contents(tmp_path)
     assert resumption.overwrite(tmp_path) == ""
     assert contents(tmp_path) == before
+
+
+def test_files_of_the_user_are_not_replaced_by_a_run(run: Path, tmp_path: Path) -> None:
+    there, written = tmp_path / "mine", (run / "config.toml").read_text()
+    mine = {name: f"mine: {name}".encode() for name in ("summary.json", "evaluations.csv", "learning_curve.png")}
+    mine |= {"roster.json": b"{}", "videos/100.gif": b"GIF", "config.toml": b"# a note\nmethod = 'dqn'\n"}
+    (there / "videos").mkdir(parents=True)
+    for name, data in mine.items():
+        (there / name).write_bytes(data)
+        with pytest.raises(UsageError, match=rf"{name} there is no run's, and would be replaced; .*--overwrite"):
+            Start().check_free(there)
+        (there / name).unlink()
+    (there / "config.toml").write_text(written)  # of a run that is about to begin
+    Start().check_free(there)
+    for name, data in mine.items():
+        (there / name).write_bytes(data)
+    refused = run_command("coop-lockstep", "--config", there / "config.toml", "--run-dir", there)
+    assert (refused.returncode, refused.stderr.count("\n"), "config.toml there" in refused.stderr) == (2, 1, True)
+    assert contents(there) == mine
+    (there / "summary.json").unlink()
+    for start in (Start(overwrite=True), Start(resume=True)):
+        _, (line, *_) = start.prepare(there, replay=False)
+        (aside,) = (there / "aside").iterdir()
+        assert line.startswith("config.toml, evaluations.csv, ")
+        assert line.endswith(f"is in {aside}")
+        assert contents(aside) == {name: data for name, data in mine.items() if name != "summary.json"}
+        aside.rename(tmp_path / "moved")
+        shutil.copytree(tmp_path / "moved", there, dirs_exist_ok=True)
+        shutil.rmtree(tmp_path / "moved")
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_again_with_its_records_aside(run: Path) -> None:
@@ -606,6 +638,38 @@ def test_lines_that_cannot_be_read_are_named(
         load_study(run.parent)
     with pytest.raises(RunError, match=name.replace(".", r"\.")):
         _ = coop.load(run).episodes
+
+
+@pytest.mark.parametrize(
+    ("text", "line"), [(b"3\r3", "new-line character"), (b"9" * 140_000, "field larger"), (b"3\0", "holds a NUL byte")]
+)
+def test_records_without_a_seal_are_refused_by_their_line(text: bytes, line: str, run: Path, tmp_path: Path) -> None:
+    """Without a summary and checkpoints, nothing but the line itself says that it is damaged."""
+    path = run / "episodes.csv"
+    (run / "summary.json").unlink()
+    shutil.rmtree(run / "checkpoints")
+    path.write_bytes(path.read_bytes().replace(b"\n4,", b"\n" + text + b",", 1))
+    reads: tuple[Callable[[], object], ...] = (
+        lambda: coop.load(run).episodes,
+        lambda: pack(run, tmp_path / "study.parquet"),
+        lambda: draw_curves(run, tmp_path / "curves"),
+        lambda: learning_curve(run, "a run"),
+    )
+    for read in reads:
+        with pytest.raises(RunError, match=rf"episodes\.csv, line 6: (can't be read: )?{line}"):
+            read()
+    assert run_command("coop-watch", run, "--once").stderr.count("Traceback") == 0
+    table = GrowingTable(path)
+    assert [row["episode"] for row in table.rows()][:5] == ["0", "1", "2", "3", "3\0" if b"\0" in text else "5"]
+
+
+def test_an_empty_record_has_no_rows(run: Path) -> None:
+    (run / "summary.json").unlink()
+    shutil.rmtree(run / "checkpoints")
+    for text in ("", "half a line"):
+        (run / "episodes.csv").write_text(text)
+        assert coop.load(run).episodes.empty
+        assert read_csv(run / "episodes.csv") == []
 
 
 def test_a_digit_of_a_record_is_not_changed_in_silence(run: Path) -> None:

@@ -1,6 +1,7 @@
 """Packed studies: every number comes back, and a report of the file is the report of the folder."""
 
 import csv
+import errno
 import json
 from pathlib import Path
 
@@ -156,6 +157,35 @@ def test_curves_of_all_runs(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert drawn == {path.parent.name: path.read_bytes() for path in (tmp_path / "b").glob("*/learning_curve.png")}
 
 
+def full(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left")
+
+
+def test_a_report_replaces_nothing_but_a_report(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "mine"
+    out.mkdir()
+    for name in ("index.html", "returns_steps.png", "returns_steps.csv", "table_runs.md"):
+        (out / name).write_text("mine")
+        with pytest.raises(UsageError, match=rf"--out .*mine: {name} there is no report's; name an empty or a new"):
+            write_report(folder, out)
+        assert [path.name for path in out.iterdir()] == [name]
+        assert (out / name).read_text() == "mine"
+        (out / name).unlink()
+    (out / "notes.txt").write_text("mine")
+    with monkeypatch.context() as patch:
+        patch.setattr("coop.studies.report.writer._draw_all", full)
+        with pytest.raises(UsageError, match="No space left"):
+            write_report(folder, out)
+    for _ in range(2):
+        write_report(folder, out)
+        assert "has not ended" not in (out / "index.html").read_text()
+    (folder / "report").mkdir()
+    (folder / "report" / "table_runs.md").write_text("of a report whose page is not kept")
+    monkeypatch.setattr("sys.argv", ["coop-report", str(folder)])
+    cli.main()
+    assert "<code>coop-report" in (folder / "report" / "index.html").read_text()
+
+
 def test_what_cannot_be_packed(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no folder with runs to pack"):
         pack(tmp_path, tmp_path / "a.parquet")
@@ -163,6 +193,29 @@ def test_what_cannot_be_packed(folder: Path, tmp_path: Path) -> None:
         pack(folder, tmp_path / "none" / "a.parquet")
     with pytest.raises(UsageError, match=r"sweep.toml: not a packed study: "):
         write_report(folder / "sweep.toml", tmp_path / "out")
+
+
+def test_nothing_but_a_packed_study_is_replaced(folder: Path, tmp_path: Path) -> None:
+    run = folder / "dqn-seed=0"
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "link.parquet").symlink_to("notes.txt")
+    kept = {path: path.read_bytes() for path in (run / "episodes.csv", folder / "sweep.toml", tmp_path / "notes.txt")}
+    for path in kept:
+        with pytest.raises(UsageError, match=rf"would replace .*{path.name}: not a packed study: .*name a new file"):
+            pack(folder, path)
+    with pytest.raises(UsageError, match=r"link\.parquet: a link, to notes\.txt"):
+        pack(folder, tmp_path / "link.parquet")
+    for runs in (folder, run):
+        with pytest.raises(UsageError, match=r"in the folder of the run .*dqn-seed=0; name a file outside of it"):
+            pack(runs, run / "new.parquet")
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(UsageError, match="Too many levels of symbolic links"):
+        pack(folder, tmp_path / "loop" / "new.parquet")
+    assert {path: path.read_bytes() for path in kept} == kept
+    assert not (run / "new.parquet").exists()
+    for seed in (0, 1):
+        pack(folder / f"dqn-seed={seed}", folder / "one.parquet")
+    assert PackedStudy(folder / "one.parquet").names == ["dqn-seed=1"]
 
 
 def test_a_thinned_study_keeps_its_episodes_and_warnings(folder: Path, tmp_path: Path) -> None:
@@ -190,6 +243,17 @@ def test_rows_that_are_refused(flags: list[str], folder: Path, monkeypatch: pyte
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 2
+
+
+def test_a_file_without_a_suffix_has_no_place_for_its_report(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pack(folder, tmp_path / "packed")
+    monkeypatch.setattr("sys.argv", ["coop-report", str(tmp_path / "packed")])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert "packed: a file without a suffix, so that its report has no place; give --out" in capsys.readouterr().err
 
 
 def test_tables_of_a_study_whose_methods_have_settings_of_their_own() -> None:

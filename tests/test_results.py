@@ -307,8 +307,9 @@ def test_what_feedback_does_to_a_step() -> None:
     columns = ("gradient", "cosine", "step", "step_cosine")
     for (case, when), part in rows.groupby(["case", "when"], sort=False):
         if PINNED or not case.startswith("weight-gradient"):
-            cells = " | ".join(", ".join(f"{value:.2f}" for value in part[what]) for what in columns)
-            assert f"| {case} | {when} | {cells} |" in page
+            (line,) = (line for line in page.splitlines() if line.startswith(f"| {case} | {when} |"))
+            printed = [float(number) for number in re.findall(r"\d+\.\d\d", line.split(" | ", 2)[2])]
+            assert printed == pytest.approx([value for what in columns for value in part[what]], abs=0.012)
     later = rows[rows["when"] == "later"].set_index("case")
     plain = [f"{value:.2f}" for value in later.loc["transform, constant s", "gradient"]]
     turned = [f"{value:.2f}" for value in later.loc["weight-gradient, constant s", "step_cosine"]]

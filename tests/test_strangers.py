@@ -27,11 +27,13 @@ from coop.common.imports import hand_over, import_module, permit, remember
 from coop.common.process import untrusted
 from coop.common.process.files import LineFile, measure, write_atomic
 from coop.common.process.untrusted import (
+    MAX_SETTINGS,
     check_links,
     check_run_name,
     check_torch_file,
     load_array,
     page_sizes,
+    read_bytes,
     refuse_links,
 )
 from coop.common.settings.fields import _read_table
@@ -143,6 +145,27 @@ def test_no_link_leads_out_of_a_run(trained: Path, tmp_path: Path, place: str) -
     with pytest.raises(RunError, match="a link that leads out of the run"):
         open_source(tmp_path)
     assert list(mine.iterdir()) == [] if mine.is_dir() else mine.read_text() == "precious"
+
+
+def test_a_device_or_a_pipe_is_not_read_without_end() -> None:
+    with pytest.raises(RunError, match=r"/dev/zero: has more than 16,777,216 bytes"):
+        read_bytes(Path("/dev/zero"), MAX_SETTINGS)
+    with pytest.raises(UsageError, match=r"--config /dev/zero: /dev/zero: has more than"):
+        load_tables(None, Path("/dev/zero"))
+    reading, writing = os.pipe()
+    os.write(writing, b"seed = 7\n")
+    os.close(writing)
+    assert load_tables(None, Path(f"/dev/fd/{reading}")) == {"seed": 7}
+    os.close(reading)
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "checkpoints", "summary.json"])
+def test_a_link_that_leads_to_itself_is_named(trained: Path, tmp_path: Path, name: str) -> None:
+    run = a_copy(trained, tmp_path / "theirs")
+    linked(run / name, Path(name))
+    for look in (check_links, coop.load, open_source):
+        with pytest.raises(RunError, match=rf"{name}: a link that leads to itself"):
+            look(run)
 
 
 def cell(run: Path) -> CellFolder:

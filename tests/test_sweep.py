@@ -17,9 +17,10 @@ from coop.common.errors import UsageError
 from coop.common.settings.medqn import MedqnSettings
 from coop.common.settings.tables import resolve
 from coop.studies.sweep.cli import SweepOptions, chosen, main
-from coop.studies.sweep.folder import CellFolder
-from coop.studies.sweep.grid import load_grid, shipped_grids
+from coop.studies.sweep.folder import CellFolder, claim_folder
+from coop.studies.sweep.grid import load_grid, parse_grid, shipped_grids
 from coop.studies.sweep.local import LocalProcesses
+from coop.studies.tuning import tune
 
 pytestmark = pytest.mark.timeout(300)  # a dozen processes, one after the other, also on a machine that is busy
 NAMED = "CUDA_VISIBLE_DEVICES="
@@ -162,6 +163,63 @@ def test_a_grid_sets_fields_of_single_methods(tmp_path: Path) -> None:
         path.write_text(text + wrong)
         with pytest.raises(UsageError, match=words):
             load_grid(str(path))
+
+
+def claimed(folder: Path, text: str) -> None:
+    """Assign a folder to a grid, whose cells may begin then."""
+    grid = parse_grid(text, "grid")
+    cells = [CellFolder(folder, cell) for cell in grid.cells]
+    claim_folder(grid, cells, folder)
+    for cell in cells:
+        cell.path.mkdir(exist_ok=True)
+        cell.prepare()
+
+
+def test_a_config_that_the_user_wrote_is_not_replaced_by_a_cell(tmp_path: Path) -> None:
+    claimed(tmp_path, TINY)
+    held = tmp_path / "dqn-seed=0" / "config.toml"
+    held.write_text(text := f"# mine\n{held.read_text()}")
+    with pytest.raises(UsageError, match=r"config\.toml: not "):
+        claimed(tmp_path, TINY)
+    held.write_text(text := text.rpartition("# crc32")[0])
+    with pytest.raises(UsageError, match=r"config\.toml: not written by a sweep"):
+        claimed(tmp_path, TINY)
+    assert held.read_text() == text
+
+
+def test_a_grid_may_change_in_its_folder_but_not_become_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seeds in ("seeds = [0, 1]\n", "seeds = [0, 1, 2]\n"):
+        claimed(tmp_path, seeds + TINY)
+        assert capsys.readouterr().out == ""
+    for _ in range(2):  # said when it changes
+        claimed(tmp_path, "seeds = [1, 2, 3]\n" + TINY)
+    said = "reports leave out what this grid has no cell of: 2 runs, such as coop-seed=0\n"
+    assert capsys.readouterr().out == f"{tmp_path}: {said}"
+    before = (tmp_path / "sweep.toml").read_text()
+    with pytest.raises(UsageError, match=r"holds another sweep, with runs such as coop-seed=0; give another --dir"):
+        claimed(tmp_path, "seeds = [4]\n" + TINY)
+    assert (tmp_path / "sweep.toml").read_text() == before
+
+
+def test_a_grid_that_the_user_wrote_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.toml"
+    path.write_text(text := f"# mine\n{TINY}")
+    done = sweep(str(path), "--dir", str(tmp_path))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"{path}: not written by a sweep, and would be replaced; give another --dir" in done.stderr
+    assert path.read_text() == text
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_run_s_folder_takes_no_other_runs(tmp_path: Path) -> None:
+    (tmp_path / "run-id").write_text("7\n")
+    with pytest.raises(UsageError, match=r"--dir .*: the folder of a run; give another one"):
+        claimed(tmp_path, TINY)
+    with pytest.raises(UsageError, match=r"folder .*: the folder of a run; give another one"):
+        tune({"methods": ["dqn"], "fixed": {"total_steps": 900}}, tmp_path, trials=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["run-id"]
 
 
 def test_bad_flags_are_refused_before_anything_runs(

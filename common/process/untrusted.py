@@ -6,11 +6,13 @@ compared with the bytes that are there before memory is taken for it.
 
 from __future__ import annotations
 
+import errno
 import io
 import mmap
 import os
 import pickle
 import re
+import stat
 import unicodedata
 import zipfile
 from collections import OrderedDict
@@ -26,6 +28,7 @@ from coop.common.types import Array
 MAX_NAME_BYTES = 100
 MAX_TEXT = 1 << 30  # bytes of a text file that is read at once
 MAX_SETTINGS = 1 << 24  # bytes of one that holds settings
+_PIECE = 1 << 20  # bytes read at once of what has no size
 _PATTERN = frozenset("*?[")
 LEFT = (
     "config.toml", "episodes.csv", "metrics.jsonl", "evaluations.csv", "summary.json", "run-id", "roster.json",
@@ -94,10 +97,20 @@ def check_links(folder: Path) -> None:
         return
     inside = folder.resolve()
     for path in _own(folder):
+        if path.is_symlink() and _leads_to_itself(path):
+            raise RunError(f"{path}: a link that leads to itself; not followed")
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
             raise RunError(f"{path}: a link that leads out of the run, to {path.readlink()}; not followed")
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise RunError(f"{path}: neither a file nor a folder; not opened")
+
+
+def _leads_to_itself(path: Path) -> bool:
+    try:
+        path.stat()
+    except OSError as error:
+        return error.errno == errno.ELOOP
+    return False
 
 
 def _own(folder: Path) -> Iterator[Path]:
@@ -137,12 +150,20 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
     """The content of a file of at most `most` bytes, MAX_TEXT by default.
 
     Raises OSError, and RunError for a larger file before it is read: one that is empty for the most part takes no
-    space on a disk, or in an archive.
+    space on a disk, or in an archive. Of a pipe or a device, which has no size, no more is read.
     """
-    size, most = path.stat().st_size, MAX_TEXT if most is None else most
-    if size > most:
-        raise RunError(f"{path}: has {size:,} bytes; allowed: at most {most:,}")
-    return path.read_bytes()
+    status, most = path.stat(), MAX_TEXT if most is None else most
+    if status.st_size > most:
+        raise RunError(f"{path}: has {status.st_size:,} bytes; allowed: at most {most:,}")
+    if stat.S_ISREG(status.st_mode):
+        return path.read_bytes()
+    data = bytearray()
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
+            data += piece
+            if len(data) > most:
+                raise RunError(f"{path}: has more than {most:,} bytes; allowed: at most that")
+    return bytes(data)
 
 
 def read_text(path: Path, most: int | None = None) -> str:

@@ -20,7 +20,7 @@ from coop.common.settings.reading import checked, fields_of, parse_toml, with_nu
 from coop.common.settings.rules import check_rules, fitted
 
 CONFIG = "config.toml"
-_SEAL = "# crc32 "
+SEAL = "# crc32 "
 
 
 def preset_names() -> list[str]:
@@ -144,12 +144,12 @@ def run_config_text(config: RunConfig) -> str:
 
 def sealed_toml(text: str) -> str:
     """The text of a TOML file, with its checksum as a comment."""
-    return f"{text}{_SEAL}{zlib.crc32(text.encode()):08x}\n"
+    return f"{text}{SEAL}{zlib.crc32(text.encode()):08x}\n"
 
 
 def check_toml(text: str, place: object, *, needed: bool = False) -> None:
     """Check a text of `sealed_toml`; needed: it must have a checksum. Raises UsageError."""
-    content, seal, _ = text.rpartition(_SEAL)
+    content, seal, _ = text.rpartition(SEAL)
     if (seal or needed) and text != sealed_toml(content):
         raise UsageError(f"{place}: not what was written (wrong checksum)")
 

@@ -66,7 +66,11 @@ class GrowingTable(GrowingFile):
         lines = self.lines()
         if self.restarted:
             self._columns = []
-        for values in csv.reader(lines):
+        for line in lines:
+            try:
+                (values,) = csv.reader([line])
+            except csv.Error:
+                continue  # as a row with other columns
             if not self._columns:
                 self._columns = values
             elif len(values) == len(self._columns):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.errors import RunError, UsageError
+from coop.common.errors import RunError, UsageError, first_line
 from coop.common.process.output import warn, warn_once
 from coop.common.process.untrusted import MAX_SETTINGS, check_run_name, read_bytes, read_text
 from coop.common.settings.config import RunConfig
@@ -89,6 +89,9 @@ def read_lines(path: Path) -> list[str]:
     if half:
         last = whole.count(b"\n") + 2 if newline else 1
         warn(f"{path}: line {last}, the last one, is incomplete, and left out")
+    if (place := data.find(b"\0")) >= 0:
+        line = data[:place].count(b"\n") + 1
+        raise RunError(f"{path}, line {line}: holds a NUL byte")
     try:
         return (whole + newline).decode().split("\n")[:-1]
     except UnicodeDecodeError as error:
@@ -98,11 +101,17 @@ def read_lines(path: Path) -> list[str]:
 
 def read_csv(path: Path) -> list[dict[str, str]]:
     """The rows of a CSV record; raises as `read_lines`, and for a row with another number of values than the header."""
-    header, *rows = csv.reader(read_lines(path)) if path.stat().st_size else [[]]
-    for number, row in enumerate(rows, 2):
-        if len(row) != len(header):
-            raise RunError(f"{path}, line {number}: {len(row)} values instead of {len(header)}")
-    return [dict(zip(header, row, strict=True)) for row in rows]
+    reader = csv.reader(read_lines(path))
+    try:
+        header: list[str] = next(reader, [])
+        rows = []
+        for row in reader:
+            if len(row) != len(header):
+                raise RunError(f"{path}, line {reader.line_num}: {len(row)} values instead of {len(header)}")
+            rows.append(dict(zip(header, row, strict=True)))
+    except csv.Error as error:
+        raise RunError(f"{path}, line {reader.line_num}: can't be read: {error}") from error
+    return rows
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
@@ -111,11 +120,15 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
 
 
 def read_frame(path: Path) -> pd.DataFrame:
-    """A CSV record with the types that its values have; raises as `read_csv`."""
+    """A CSV record with the types that its values have, without columns if it is empty; raises as `read_csv`."""
     import pandas as pd  # noqa: PLC0415 (half a second, which a learner does not need)
 
     read_csv(path)  # names a line that pandas would fill up
-    return pd.read_csv(io.StringIO("\n".join(read_lines(path))))
+    lines = read_lines(path)
+    try:
+        return pd.read_csv(io.StringIO("\n".join(lines))) if lines else pd.DataFrame()
+    except ValueError as error:  # what pandas takes for no CSV; it names the line
+        raise RunError(f"{path}: can't be read: {first_line(error)}") from error
 
 
 def read_csv_tail(path: Path, most: int) -> list[dict[str, str]]:
@@ -176,8 +189,14 @@ def read_run_config(run_dir: Path) -> RunConfig:
 
 
 def returns_by_step(text: str) -> Floats:
-    """Environment steps, in order, and mean returns, of the lines with the least epsilon: float64 [2, lines]."""
-    rows = list(csv.DictReader(text.splitlines()))
+    """Environment steps, in order, and mean returns, of the lines with the least epsilon: float64 [2, lines].
+
+    Raises ValueError, TypeError or KeyError for a line that is none.
+    """
+    try:
+        rows = list(csv.DictReader(text.splitlines()))
+    except csv.Error as error:
+        raise ValueError(str(error)) from error
     least = min((float(row["epsilon"]) for row in rows), default=0.0)
     found = [(float(row["env_step"]), float(row["return_mean"])) for row in rows if float(row["epsilon"]) == least]
     return np.array(sorted(found), np.float64).reshape(-1, 2).T

@@ -16,9 +16,10 @@ from typing import Any
 
 import msgspec
 
-from coop.common.errors import RunError, UsageError
+from coop.common.errors import CoopError, RunError, UsageError
 from coop.common.process.files import FileDigest, aside_folder, measure, move_aside, truncate
-from coop.common.process.untrusted import LEFT, MAX_SETTINGS, read_bytes
+from coop.common.process.untrusted import LEFT, MAX_SETTINGS, read_bytes, read_text
+from coop.common.settings.tables import CONFIG, check_toml
 from coop.records.checkpoints import (
     DONE,
     EVALUATIONS,
@@ -43,6 +44,7 @@ from coop.records.run_ids import has_run_id, read_run_id
 from coop.records.summaries import SUMMARY, read_summary
 
 _STARTED = (*RECORDS, EVALUATIONS, SUMMARY, "learning_curve.png", "tb", "videos")  # by a run without a checkpoint
+_REPLACED = (CONFIG, EVALUATIONS, SUMMARY, "learning_curve.png", "roster.json")  # by one that begins
 
 
 @dataclass(frozen=True)
@@ -199,10 +201,18 @@ class Start:
         return self.resume or self.resume_from is not None
 
     def check_free(self, run_dir: Path) -> None:
-        """Raise UsageError if a run is in the directory that this one neither goes on with nor moves aside."""
-        if holds_run(run_dir) and not (self.goes_on or self.overwrite):
+        """Raise UsageError if a run is in the directory that this one neither goes on with nor moves aside.
+
+        So are files of the user that this one would replace.
+        """
+        if self.goes_on or self.overwrite:
+            return
+        if holds_run(run_dir):
             how = "give another folder, go on with --resume (resume=True in Python), or move it aside with --overwrite"
             raise UsageError(f"run directory {run_dir}: holds a run already; {how}")
+        if there := strays(run_dir):
+            how = "give another folder, or move it aside with --overwrite"
+            raise UsageError(f"run directory {run_dir}: {there[0]} there is no run's, and would be replaced; {how}")
 
     def prepare(
         self,
@@ -237,13 +247,42 @@ class Start:
         if self.goes_on:
             found = survey(run_dir, replay=replay, records=True, settings=settings, load=load, every=every)
             found.check()
-            notices.append(found.describe())
+            try:
+                notices += [_move_strays(run_dir), found.describe()]
+            except OSError as error:
+                raise RunError(f"run directory {run_dir}: {reason(error)}") from error
         return found, [line for line in notices if line]
 
 
 def holds_run(run_dir: Path) -> bool:
     """True if a run has begun in a folder."""
     return has_run_id(run_dir) or any((run_dir / name).exists() for name in RECORDS) or bool(finished(run_dir))
+
+
+def strays(run_dir: Path) -> list[str]:
+    """What a run would replace or remove in a folder in which none has begun, by name: the user's."""
+    if holds_run(run_dir):
+        return []
+    names = (*_REPLACED, *(f"videos/{film.name}" for film in (run_dir / "videos").glob("[0-9]*.gif")))
+    return [name for name in names if (run_dir / name).exists() and not (name == CONFIG and _is_written(run_dir))]
+
+
+def _is_written(run_dir: Path) -> bool:
+    """Whether config.toml is as the product wrote it, for a run that has not begun."""
+    try:
+        check_toml(read_text(run_dir / CONFIG, MAX_SETTINGS), CONFIG, needed=True)
+    except (OSError, UnicodeDecodeError, CoopError):
+        return False
+    return True
+
+
+def _move_strays(run_dir: Path) -> str:
+    """Move the user's files aside that a run would replace; return a line that says so. Raises OSError."""
+    if not (there := strays(run_dir)):
+        return ""
+    to = aside_folder(run_dir)
+    move_aside(run_dir, there, to)
+    return f"{', '.join(there)} of {run_dir}, which no run had written, is in {to}"
 
 
 def go_back(found: Survey, number: int | None) -> str:
@@ -318,9 +357,9 @@ def keep_from(run_dir: Path, number: int) -> str:
 
 def overwrite(run_dir: Path) -> str:
     """Move the run in a directory aside, so that another may begin; return a line that says so. Raises OSError."""
-    there = [name for name in LEFT if (run_dir / name).exists()]
     if not holds_run(run_dir):
-        return ""
+        return _move_strays(run_dir)
+    there = [name for name in LEFT if (run_dir / name).exists()]
     to = aside_folder(run_dir)
     move_aside(run_dir, there, to)
     return f"the run that was in {run_dir} is in {to}"

@@ -7,7 +7,10 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
 
 from coop.common.errors import RunError
 from coop.common.numbers import finite, strict_json
@@ -53,6 +56,29 @@ class Summary:
         )
 
 
+_Size = Annotated[int, Meta(ge=0)]
+
+
+class _Types(msgspec.Struct):
+    """The types of the fields of summary.json; earlier versions lack some, and numbers that are not finite are null."""
+
+    method: str = ""
+    env: str = ""
+    seed: int = 0
+    env_steps: int = 0
+    updates: int = 0
+    episodes: int = 0
+    return_mean_100: float | None = None
+    return_sd_100: float | None = None
+    wall_seconds: float | None = None
+    transitions_accepted: int | None = None
+    transitions_lost: int | None = None
+    duplicates_refused: int | None = None
+    exit: str = ""
+    fallbacks: list[str] = msgspec.field(default_factory=list)
+    records: dict[str, tuple[_Size, _Size]] = msgspec.field(default_factory=dict)
+
+
 def summary_text(fields: Mapping[str, Any]) -> str:
     """The text of summary.json: the fields, and their checksum."""
     plain = finite(dict(fields))
@@ -63,7 +89,7 @@ def parse_summary(text: str, place: object) -> dict[str, Any]:
     """Read the text of a summary, without its checksum; place: for the error.
 
     Raises:
-        RunError: it is torn, or differs from what was written.
+        RunError: it is torn, differs from what was written, or has a field of another type.
     """
     try:
         fields = json.loads(text)
@@ -73,6 +99,10 @@ def parse_summary(text: str, place: object) -> dict[str, Any]:
         raise RunError(f"{place}: can't be read: {error}") from error
     if fields.pop(_SEAL, None) not in (None, _checksum(fields)):  # packed ones of earlier versions have none
         raise RunError(f"{place}: wrong checksum")
+    try:
+        msgspec.convert(fields, _Types)
+    except msgspec.ValidationError as error:
+        raise RunError(f"{place}: can't be read: {error}") from error
     return fields
 
 

@@ -24,7 +24,7 @@ from coop.records.following import EPISODES, Following
 from coop.records.sinks import DEFAULT_LOG
 from coop.records.summaries import read_summary
 from coop.studies.space import Space
-from coop.studies.sweep.folder import CellFolder
+from coop.studies.sweep.folder import CellFolder, check_no_run
 from coop.studies.sweep.local import LocalProcesses
 
 if TYPE_CHECKING:
@@ -107,6 +107,7 @@ def _file_in(folder: Path) -> Path:
     """The file of Optuna's storage in a folder, which it creates; raises UsageError where none can be."""
     file = folder / STORAGE
     refuse_links(file)
+    check_no_run(folder, "folder")
     try:
         make_folder(folder)
     except OSError as error:

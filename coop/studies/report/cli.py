@@ -65,5 +65,8 @@ def _run() -> None:
 
         base = runs if runs.is_dir() else runs.with_suffix("")
         if options.out is None:
+            if base.is_file():
+                raise UsageError(f"{runs}: a file without a suffix, so that its report has no place; give --out")
             refuse_links(base / "report")
-        print(shown(write_report(runs, options.out or base / "report", options.baseline)))
+        out, own = options.out or base / "report", options.out is None
+        print(shown(write_report(runs, out, options.baseline, own=own)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,8 +14,9 @@ import pyarrow.parquet as pq
 
 from coop.common.errors import UsageError
 from coop.common.process.files import sync_folder, write_atomic
+from coop.common.process.untrusted import refuse_links
 from coop.records.parquet_seals import SEAL, UNSEALED, sealed
-from coop.studies.report.packed import EPISODES, METRICS, SWEEP, TEXTS, decimals
+from coop.studies.report.packed import EPISODES, METRICS, SWEEP, TEXTS, PackedStudy, decimals
 from coop.studies.report.sources import FolderSource
 
 SMALLEST = 22  # zstd's level
@@ -30,11 +32,12 @@ def pack(folder: Path, path: Path, rows: int | None = None) -> str:
 
     Raises:
         RunError: a file can't be read.
-        UsageError: the folder holds no run, or the file cannot be written.
+        UsageError: the folder holds no run, or the file cannot be written, lies in a run, or is no packed study.
     """
     source = FolderSource(folder)
     if not source.names:
         raise UsageError(f"{folder}: no folder with runs to pack")
+    _check_place(path, [source.path(run) for run in source.names])
     columns = {"run": pa.array(source.names, pa.string())}
     for file in TEXTS:
         columns[file] = pa.array([source.text(run, file) for run in source.names], pa.string())
@@ -52,6 +55,19 @@ def pack(folder: Path, path: Path, rows: int | None = None) -> str:
     except OSError as error:
         raise UsageError(f"--pack {path}: {error.strerror or error}") from error
     return f"{path}: {len(source.names)} runs in {path.stat().st_size:,} bytes"
+
+
+def _check_place(path: Path, runs: Sequence[Path]) -> None:
+    """Refuse a file that is something else than a packed study, and one in a run's folder; raises UsageError."""
+    refuse_links(path)
+    if path.is_file():
+        try:
+            PackedStudy(path)
+        except UsageError as error:
+            raise UsageError(f"--pack: would replace {error}; name a new file") from error
+    there = Path(os.path.realpath(path))  # unlike `resolve`, it bears links that lead to themselves
+    if inside := next((run for run in runs if there.is_relative_to(run.resolve())), None):
+        raise UsageError(f"--pack {path}: in the folder of the run {inside}; name a file outside of it")
 
 
 def thinned(table: pd.DataFrame, rows: int) -> pd.DataFrame:

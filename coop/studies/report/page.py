@@ -42,6 +42,12 @@ code { background: #f3f4f6; padding: 0.1rem 0.3rem; }
 """
 
 
+MARK = "Made by <code>coop-report "
+"""What every report of this product has in its page."""
+BEGUN = f"<!doctype html><p>{MARK}</code>, which has not ended.</p>\n"
+"""The page until the report is whole."""
+
+
 def page(
     study: Study,
     folder: Path,
@@ -80,7 +86,7 @@ def page(
         *(_folded(each.title, counted(len(each.rows), "row"), each.html()) for each in tables if each not in first),
         _missing(study, lacking),
         _warnings(study),
-        f"<p class=note>Made by <code>coop-report {html.escape(folder.name)}</code>: {_versions()}. Every figure is "
+        f"<p class=note>{MARK}{html.escape(folder.name)}</code>: {_versions()}. Every figure is "
         "beside this page as PNG and PDF with its points as CSV, every table as CSV and Markdown.</p></html>",
     ]
     return "\n".join(parts) + "\n"

@@ -76,6 +76,10 @@ class FolderSource:
             check_toml(text, self._folder / SWEEP, needed=any(self._folder.glob(f"*/{RUN_ID}")))
         return text
 
+    def path(self, run: str) -> Path:
+        """The folder of a run."""
+        return self._folder / run
+
     def text(self, run: str, file: str) -> str | None:
         """See `RunSource`."""
         path = self._folder / run / file

@@ -12,12 +12,12 @@ import numpy as np
 from coop.common.errors import RunError, UsageError
 from coop.common.process.limits import cores
 from coop.common.process.output import warn
-from coop.common.process.untrusted import refuse_links
+from coop.common.process.untrusted import read_bytes, refuse_links
 from coop.records.curve import draw_curve
 from coop.studies.report.baseline import baseline_figure, baseline_table, find_baseline
 from coop.studies.report.figures import figures
 from coop.studies.report.packed import EPISODES
-from coop.studies.report.page import page
+from coop.studies.report.page import BEGUN, MARK, page
 from coop.studies.report.plots import Figure, draw
 from coop.studies.report.results import tables
 from coop.studies.report.sources import open_source
@@ -53,13 +53,15 @@ def draw_curves(runs: Path, out: Path) -> list[Path]:
     return drawn
 
 
-def write_report(runs: Path, out: Path, baseline: str | None = None) -> Path:
+def write_report(runs: Path, out: Path, baseline: str | None = None, *, own: bool = False) -> Path:
     """Write the report of a folder of runs, and warn of untrustworthy runs; return its path.
 
-    baseline: a method or a run, from which the differences of the others are reported.
+    baseline: a method or a run, from which the differences of the others are reported. own: nobody has named the
+    folder, which is a report's by its name.
 
     Raises:
-        UsageError: the folder holds no run, the report's folder cannot be written, or the baseline is not in it.
+        UsageError: the folder holds no run, the report's folder cannot be written or has files of its user under the
+            report's names, or the baseline is not in it.
         RunError: no run is finished, or a finished one has a torn file.
     """
     study = load_study(runs)
@@ -75,17 +77,29 @@ def write_report(runs: Path, out: Path, baseline: str | None = None) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         refuse_links(*out.iterdir())
         drawn = [(figure, out / f"{figure.name}.png") for figure in made]
+        index = out / "index.html"
+        figure_files = [path.with_suffix(kind) for _, path in drawn for kind in (".png", ".pdf", ".csv")]
+        table_files = [out / f"table_{table.name}{kind}" for table in results for kind in (".csv", ".md")]
+        _check_own(index, [] if own else [*figure_files, *table_files])
+        index.write_text(BEGUN, encoding="utf-8")  # so that a report may replace one that has not ended
         _draw_all(drawn)
         for figure in made:
             (out / f"{figure.name}.csv").write_text(figure.points().csv(), encoding="utf-8")
         for table in results:
             (out / f"table_{table.name}.csv").write_text(table.csv(), encoding="utf-8")
             (out / f"table_{table.name}.md").write_text(table.markdown(), encoding="utf-8")
-        index = out / "index.html"
         index.write_text(page(study, runs, results, drawn, lacking), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror}") from error
     return index
+
+
+def _check_own(index: Path, others: Sequence[Path]) -> None:
+    """Refuse to replace files beside a page that is no report's; raises UsageError, and OSError."""
+    if index.exists() and MARK.encode() in read_bytes(index):
+        return
+    if there := next((path for path in (index, *others) if path.is_file()), None):
+        raise UsageError(f"--out {index.parent}: {there.name} there is no report's; name an empty or a new folder")
 
 
 def _draw_all(figures: Sequence[tuple[Figure, Path]]) -> None:

@@ -9,12 +9,14 @@ from typing import Literal
 
 from coop.common.errors import RunError, UsageError
 from coop.common.numbers import RETURN_WINDOW
+from coop.common.process.console import counted, say
 from coop.common.process.files import make_folder, write_atomic
-from coop.common.process.untrusted import check_links, refuse_links
-from coop.common.settings.tables import identity, run_config_text, sealed_toml
+from coop.common.process.untrusted import check_links, read_bytes, refuse_links
+from coop.common.settings.tables import CONFIG, SEAL, identity, run_config_text, sealed_toml
 from coop.records.checkpoints import RECORDS, SWEEP, checked_summary
 from coop.records.locks import LockHeld, RunLock
-from coop.records.reading import read_csv_tail, read_run_config
+from coop.records.reading import read_csv_tail, read_run_config, run_names
+from coop.records.resumption import holds_run, strays
 from coop.records.sinks import DEFAULT_LOG
 from coop.studies.sweep.grid import Cell, Grid
 
@@ -48,12 +50,14 @@ class CellFolder:
         self.path = sweep / cell.name
 
     def check(self) -> None:
-        """Raise UsageError if the folder holds a run of another config, or is a link."""
+        """Raise UsageError if the folder holds a run of another config, or a config of the user's, or is a link."""
         refuse_links(self.path)
         check_links(self.path)
         held = self.path / "config.toml"
         if held.exists() and identity(read_run_config(self.path)) != identity(self.cell.config):
             raise UsageError(f"{held}: not the config of this grid's cell; give another --dir")
+        if CONFIG in strays(self.path):
+            raise UsageError(f"{held}: not written by a sweep, and would be replaced; give another --dir")
 
     def ending(self) -> Ending | None:
         """How its run ended for good; None if it has to be run or continued."""
@@ -100,12 +104,44 @@ def claim_folder(grid: Grid, cells: Sequence[CellFolder], folder: Path) -> None:
     """Assign a folder to a sweep, or refuse it before anything runs.
 
     Raises:
-        UsageError: it holds runs of other configs, or cannot be written.
+        UsageError: it holds runs of other configs, is a run's or another sweep's, or cannot be written.
     """
+    check_no_run(folder, "--dir")
     try:
         make_folder(folder)
+        _check_sweep(grid, folder)
         for cell in cells:
             cell.check()
         write_atomic(folder / SWEEP, sealed_toml(grid.to_toml()).encode())
     except OSError as error:
         raise UsageError(f"--dir {folder}: {error.strerror}") from error
+
+
+def check_no_run(folder: Path, name: str) -> None:
+    """Refuse the folder of a run as one for runs; name: of what gave it. Raises UsageError."""
+    if holds_run(folder):
+        raise UsageError(f"{name} {folder}: the folder of a run; give another one")
+
+
+def _check_sweep(grid: Grid, folder: Path) -> None:
+    """Refuse a folder whose sweep.toml the user wrote, or with runs of which none is a cell of this grid.
+
+    Runs that are none, as of a grid that has shrunk, are named, since reports leave them out. Raises UsageError, and
+    OSError.
+    """
+    path = folder / SWEEP
+    if not path.exists():
+        return
+    refuse_links(path)
+    held = read_bytes(path)
+    if SEAL.encode() not in held:
+        raise UsageError(f"{path}: not written by a sweep, and would be replaced; give another --dir")
+    if held == sealed_toml(grid.to_toml()).encode():
+        return
+    runs, cells = run_names(folder), {choice.name for choice in grid.choices}
+    others = [name for name in runs if name not in cells]
+    if others and len(others) == len(runs):
+        raise UsageError(f"--dir {folder}: holds another sweep, with runs such as {others[0]}; give another --dir")
+    if others:
+        named = f"{counted(len(others), 'run')}, such as {others[0]}"
+        say(f"{folder}: reports leave out what this grid has no cell of: {named}")
