@@ -161,7 +161,7 @@ class Trainer:
             "telemetry": self.telemetry.state(),
             "drawn": {name: value for name, value in msgspec.structs.asdict(self.drawn).items() if name != "episodes"},
             "seconds": self.seconds(now),
-            "spec": msgspec.to_builtins(msgspec.structs.asdict(self.agent.spec)),
+            "spec": msgspec.structs.asdict(self.agent.spec),
         }
 
     def load_state(self, state: dict[str, Any], now: float) -> None:

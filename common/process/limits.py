@@ -55,9 +55,9 @@ def memory_limit(root: Path = ROOT, environment: Mapping[str, str] | None = None
 
 
 def check_processes(flag: str, number: int, least: int) -> None:
-    """Raise UsageError for processes of at least `least` bytes each that do not fit into the memory of this job."""
+    """Raise UsageError for several processes of at least `least` bytes each that do not fit into the job's memory."""
     limit = memory_limit()
-    if number * least > limit.size:
+    if number > 1 and number * least > limit.size:
         raise UsageError(f"{flag} {number:,}: need {number * least / 2**30:,.1f} GiB and more; {limit}")
 
 

@@ -127,8 +127,11 @@ def load_learner(path: Path) -> dict[str, Any]:
 
 def check_spec(checkpoint: Whole, spec: EnvSpec) -> None:
     """Raise UsageError if the environment is another one than the run was trained in; old checkpoints don't say."""
-    now = msgspec.to_builtins(msgspec.structs.asdict(spec))
-    if found := first_difference(now, checkpoint.state.get("spec", now)):
+    if (saved := checkpoint.state.get("spec")) is None:
+        return
+    with fitting(checkpoint.path):
+        was = replace(msgspec.convert(saved, EnvSpec), env_id=spec.env_id)
+    if found := first_difference(msgspec.structs.asdict(spec), msgspec.structs.asdict(was)):
         name, here, there = found
         raise UsageError(
             f"env.id: {spec.env_id!r} has changed since {checkpoint.path} was saved: {name} is {here}, and was {there}"

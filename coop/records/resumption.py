@@ -264,7 +264,7 @@ def strays(run_dir: Path) -> list[str]:
     if holds_run(run_dir):
         return []
     names = (*_REPLACED, *(f"videos/{film.name}" for film in (run_dir / "videos").glob("[0-9]*.gif")))
-    return [name for name in names if (run_dir / name).exists() and not (name == CONFIG and _is_written(run_dir))]
+    return [name for name in names if (run_dir / name).is_file() and not (name == CONFIG and _is_written(run_dir))]
 
 
 def _is_written(run_dir: Path) -> bool:

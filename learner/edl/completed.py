@@ -18,6 +18,7 @@ from coop.learner.edl.backprop import Subspace
 from coop.learner.edl.polar import inverse_root
 
 _EXACT = 2**18  # numbers in a layer's T up to which its Gram matrices are computed in float64
+_ROUNDING = 1e-12  # of projections' entries, at most
 _SHORT = 1e-3  # of the longest row: what a row's length counts as, at least
 
 
@@ -92,6 +93,7 @@ class _Layer:
             inside = basis @ reach.basis.to(basis)
             self._inside = (inside @ inside.mT).double()
             outside = _units(self._gram) - self._inside
+            outside = outside * (outside.abs() > _ROUNDING)  # or the rows of a T of 0 would seem to be independent
             # The root of a sum of two matrices on orthogonal subspaces acts on T like that of G alone.
             self._gram = self._gram + _mean_square(self._gram) * outside
 
