@@ -204,7 +204,8 @@ class Checks:
         if request.incarnation != self._learner or core is not self._counting:
             follows = core._learners[-1:] == [request.incarnation]
             self._learner, self._counting = request.incarnation, core
-            self._counted = max(request.base, core.drawn if follows else 0)
+            self._counted = core.drawn if follows else 0
+        self._counted = max(self._counted, request.base)
         self._bases[request.incarnation] = max(self._bases.get(request.incarnation, 0), request.base)
 
     def drawn(self, core: Any, request: DrawRequest, reply: Reply, known: bool) -> None:  # noqa: ANN401
