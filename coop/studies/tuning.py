@@ -67,7 +67,7 @@ def tune(
         storage: URL of Optuna's storage; SQLite in the folder if None.
 
     Raises:
-        UsageError: Optuna is not installed, the grid is invalid, or the folder holds a run or a search with other settings.
+        UsageError: Optuna is not installed, the grid is invalid, or the folder holds a run or a search of another kind.
         RunError: the storage can't be read or written.
     """
     check_extra("coop.tune", "optuna", "optuna")
