@@ -274,10 +274,13 @@ def test_no_learner(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["coop-actor", "coop-replay", "coop-eval", "coop-limits", "coop-watch"])
-@pytest.mark.parametrize(("flag", "words"), [("--join-timeout", "nan"), ("--patience", "-1")])
+@pytest.mark.parametrize(("flag", "words"), [("--join-timeout", "nan"), ("--patience", "-1.0")])
 def test_what_is_no_time_to_wait(name: str, flag: str, words: str) -> None:
     done = run(name, "--connect", "tcp/127.0.0.1:9", f"{flag}={words}")
-    assert (done.returncode, done.stderr) == (2, f"{name}: error: {flag} {words}: must be at least 0\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"{name}: error: {flag} = {words}: must be a number of seconds from 0 on\n",
+    )
 
 
 def test_bad_flags_of_a_command() -> None:

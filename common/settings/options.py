@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from coop.common.errors import UsageError
+from coop.common.arguments import check_seconds
 from coop.common.imports import permit
 from coop.common.process.flags import HttpAddress
 from coop.common.process.untrusted import check_run
@@ -19,11 +19,10 @@ class HealthOptions:
     """Answer HTTP on this PORT or HOST:PORT whether this process works, for container engines: GET / and GET /ready."""
 
 
-def check_seconds(join_timeout: float, patience: float) -> None:
+def check_waits(join_timeout: float, patience: float) -> None:
     """Raise UsageError for what is no time to wait; infinity is."""
-    for flag, seconds in (("--join-timeout", join_timeout), ("--patience", patience)):
-        if not seconds >= 0:
-            raise UsageError(f"{flag} {seconds:g}: must be at least 0")
+    check_seconds("--join-timeout", join_timeout)
+    check_seconds("--patience", patience)
 
 
 @dataclass(frozen=True)
@@ -48,5 +47,5 @@ class RoleOptions:
     def __post_init__(self) -> None:
         """Raise UsageError for a name that no run has, and for what is no time to wait; permit the modules."""
         check_run(self.run)
-        check_seconds(self.join_timeout, self.patience)
+        check_waits(self.join_timeout, self.patience)
         permit(self.allow_import)

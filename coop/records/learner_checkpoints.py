@@ -126,11 +126,13 @@ def load_learner(path: Path) -> dict[str, Any]:
 
 
 def check_spec(checkpoint: Whole, spec: EnvSpec) -> None:
-    """Raise UsageError if the environment is another one than the run was trained in; old checkpoints don't say."""
+    """Raise UsageError if the environment is another one than the run was trained in; old checkpoints don't say.
+
+    Called within `fitting`, for what is no spec.
+    """
     if (saved := checkpoint.state.get("spec")) is None:
         return
-    with fitting(checkpoint.path):
-        was = replace(msgspec.convert(saved, EnvSpec), env_id=spec.env_id)
+    was = replace(msgspec.convert(saved, EnvSpec), env_id=spec.env_id)
     if found := first_difference(msgspec.structs.asdict(spec), msgspec.structs.asdict(was)):
         name, here, there = found
         raise UsageError(

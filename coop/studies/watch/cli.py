@@ -22,7 +22,7 @@ from coop.common.process.flags import HttpAddress
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.process.output import out
 from coop.common.process.untrusted import check_links, check_run
-from coop.common.settings.options import check_seconds
+from coop.common.settings.options import check_waits
 from coop.common.settings.tables import CONFIG
 from coop.monitor.screen import RunScreen
 from coop.monitor.watch import Display, Followed, RunStatus, live_page, report
@@ -61,7 +61,7 @@ class WatchOptions:
     def __post_init__(self) -> None:
         """Raise UsageError for a name that no run has, and for what is no time to wait."""
         check_run(self.run)
-        check_seconds(self.join_timeout, self.patience)
+        check_waits(self.join_timeout, self.patience)
 
 
 def main() -> None:
