@@ -1,29 +1,45 @@
 """Mutation testing of the algorithm: `make mutants`; `mutants.py 'coop.learner.trainer*'` tests a part of it.
 
-mutmut (extra `mutants`) changes one place at a time of the files named in pyproject.toml and runs the tests that reach
-it; texts of errors stay. For each file the table gives the mutants made, killed, and killed by their time limit. A
-survivor that does what the original does is justified in `benchmarks/equivalent_mutants.toml`, by the line that it
-changes; the others are listed.
+mutmut (extra `mutants`) makes the mutants: it changes one place at a time of the files that pyproject.toml names; texts
+of errors stay. The tests are collected once. A first pass notes which test calls which function and how long it takes;
+then each mutant is a fork in which the tests that call its function run, quickest first, until one fails. What has been
+killed stays so until its function changes; survivors and what has not run meet the tests at each call.
+
+For each file the table gives the mutants made, killed, and killed by their time limit. A survivor that does what the
+original does is justified in `benchmarks/equivalent_mutants.toml`, by the line that it changes; the others are listed.
 Exit status 1 where less than 95 % of a file's mutants, the justified ones left out, were killed.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import fnmatch
 import json
-import subprocess
+import os
+import signal
 import sys
+import time
 import tomllib
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NoReturn
 
+import pytest
+from _pytest.runner import runtestprotocol
+from mutmut.__main__ import copy_also_copy_files, copy_src_dir, create_mutants, setup_source_paths
+from mutmut.configuration import config
+from mutmut.mutation.data import SourceFileMutationData
 from mutmut.mutation.diff_apply import get_diff_for_mutant
+from mutmut.mutation.trampoline import set_mutant_under_test
+from mutmut.state import state
+from mutmut.utils.format_utils import mangled_name_from_mutant_name
 
 REQUIRED = 0.95
-TIMED_OUT = {36, 24, 152, 255, -24, -9}
-KILLED = {1, 3, -11, *TIMED_OUT}  # by a test, by a crash or by its time limit
-NOT_RUN = {None, 2}
+SURVIVED, KILLED, TIMED_OUT, NO_TEST = 0, 1, 36, 33  # as mutmut notes them
+LIMIT = 15.0, 4.0  # seconds that a mutant's tests may take: so many, and so many times what they take without it
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.toml")
 Change = tuple[str, str]  # a line as it was and as the mutant has it
 
@@ -44,6 +60,155 @@ class Tally:
         return self.killed / max(1, self.made - self.justified)
 
 
+class Mutants:
+    """The mutants of every file, with the status of those that have run."""
+
+    def __init__(self) -> None:
+        paths = sorted(Path("mutants").rglob("*.py.meta"))
+        self.files = [SourceFileMutationData(path=path.relative_to("mutants").with_suffix("")) for path in paths]
+        self.by_name: dict[str, SourceFileMutationData] = {}
+        for file in self.files:
+            file.meta_path = file.meta_path.absolute()
+            file.load()
+            self.by_name |= dict.fromkeys(file.exit_code_by_key, file)
+
+    def left(self, patterns: list[str]) -> list[str]:
+        """Names of those that no test has killed."""
+        return [
+            name
+            for name, file in self.by_name.items()
+            if file.exit_code_by_key[name] not in (KILLED, TIMED_OUT)
+            and (not patterns or any(fnmatch.fnmatch(name, pattern) for pattern in patterns))
+        ]
+
+    def note(self, name: str, status: int) -> None:
+        """Keep how the tests of a mutant ended."""
+        self.by_name[name].exit_code_by_key[name] = status
+        self.by_name[name].save()
+
+
+class Runner:
+    """A plugin of pytest that runs the collected tests on mutants, in place of once."""
+
+    def __init__(self, mutants: Mutants, names: list[str], at_once: int) -> None:
+        self.mutants, self.names, self.at_once = mutants, names, at_once
+        self.items: list[pytest.Item] = []
+        self.reached: dict[str, list[int]] = defaultdict(list)  # by function: its tests, quickest first
+        self.seconds: list[float] = []
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Run what is left."""
+        import torch._dynamo  # noqa: F401, PLC0415 - PyTorch's optimizers load it at their first step; here, once for all
+
+        self.items = session.items
+        self._look()
+        running: dict[int, tuple[str, float]] = {}
+        started = time.monotonic()
+        for count, name in enumerate(self.names, 1):
+            while len(running) >= self.at_once:
+                self._reap(running)
+            tests = self.reached[mangled_name_from_mutant_name(name)]
+            if not tests:
+                self.mutants.note(name, NO_TEST)
+                continue
+            limit = LIMIT[0] + LIMIT[1] * sum(self.seconds[test] for test in tests)
+            running[_fork(lambda name=name, tests=tests: self._try(name, tests))] = name, time.monotonic() + limit
+            if count % 50 == 0:
+                print(f"{count} of {len(self.names)} mutants, {time.monotonic() - started:.0f} s", file=sys.stderr)
+        while running:
+            self._reap(running)
+        return True
+
+    def _look(self) -> None:
+        """Note which test calls which function, and how long it takes."""
+        read, write = os.pipe()
+        child = _fork(lambda: self._note_calls(write))
+        os.close(write)
+        with os.fdopen(read, encoding="utf-8") as pipe:
+            told = pipe.read()
+        if os.waitpid(child, 0)[1] or not told:
+            sys.exit(f"without a mutant, a test fails: {told}")
+        calls = json.loads(told)
+        self.seconds = [seconds for seconds, _ in calls]
+        for test in sorted(range(len(calls)), key=self.seconds.__getitem__):
+            for function in calls[test][1]:
+                self.reached[function].append(test)
+
+    def _note_calls(self, pipe: int) -> NoReturn:
+        set_mutant_under_test("stats")
+        calls = []
+        for test, failed in self._run(range(len(self.items))):
+            if failed:
+                os.write(pipe, self.items[test].nodeid.encode())
+                os._exit(1)
+            calls.append((self._took, sorted(state()._stats)))
+            state()._stats.clear()
+        with os.fdopen(pipe, "w", encoding="utf-8") as out:
+            json.dump(calls, out)
+        os._exit(0)
+
+    def _try(self, name: str, tests: list[int]) -> NoReturn:
+        set_mutant_under_test(name)
+        os._exit(KILLED if any(failed for _, failed in self._run(tests)) else SURVIVED)
+
+    def _run(self, tests: Iterable[int]) -> Iterator[tuple[int, bool]]:
+        """Run tests by their places; yield each with whether it failed."""
+        order = list(tests)
+        for test, following in zip(order, [*order[1:], None], strict=True):
+            started = time.monotonic()
+            after = None if following is None else self.items[following]
+            failed = any(report.failed for report in runtestprotocol(self.items[test], log=False, nextitem=after))
+            self._took = time.monotonic() - started
+            yield test, failed
+
+    def _reap(self, running: dict[int, tuple[str, float]]) -> None:
+        """Wait until one that runs has ended, or has to."""
+        while True:
+            for child, (name, end) in running.items():
+                late = time.monotonic() > end
+                if late:
+                    os.killpg(child, signal.SIGKILL)
+                ended, code = os.waitpid(child, 0 if late else os.WNOHANG)
+                if ended:
+                    self.mutants.note(name, TIMED_OUT if late else KILLED if code else SURVIVED)
+                    del running[child]
+                    return
+            time.sleep(0.01)
+
+
+def _fork(action: Callable[[], NoReturn]) -> int:
+    """A child, in a group of its own, that says nothing."""
+    child = os.fork()
+    if child:
+        return child
+    try:
+        os.setpgid(0, 0)
+        for stream in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+        action()
+    finally:
+        os._exit(KILLED)
+
+
+def run(patterns: list[str], at_once: int) -> None:
+    """Make the mutants, and run the tests on those that are left."""
+    set_mutant_under_test("mutant_generation")
+    Path("mutants").mkdir(exist_ok=True)
+    with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stdout(nowhere):  # what it prints for each file
+        copy_src_dir()
+        copy_also_copy_files()
+        create_mutants(at_once)
+    mutants = Mutants()
+    names = mutants.left(patterns)
+    set_mutant_under_test("")
+    setup_source_paths()
+    home = Path.cwd()
+    os.chdir("mutants")
+    arguments = ["--rootdir=.", "-s", *config().pytest_add_cli_args, *config().pytest_add_cli_args_test_selection]
+    pytest.main(arguments, plugins=[Runner(mutants, names, at_once)])
+    os.chdir(home)
+
+
 def show(name: str) -> Change:
     """The line that a mutant changes, before and after."""
     shown = get_diff_for_mutant(name).splitlines()
@@ -52,28 +217,20 @@ def show(name: str) -> Change:
     return " ".join(was), " ".join(now)
 
 
-def results() -> Iterator[tuple[str, dict[str, int | None]]]:
-    """Each mutated file, and the exit status of the tests by mutant."""
-    for meta in sorted(Path("mutants").rglob("*.py.meta")):
-        statuses = json.loads(meta.read_text(encoding="utf-8"))["exit_code_by_key"]
-        if statuses:
-            yield str(meta.relative_to("mutants/coop")).removesuffix(".meta"), statuses
-
-
 def tally(file: str, statuses: dict[str, int | None], justified: set[Change]) -> Tally:
     """Count the mutants of a file that were run."""
     counted = Tally()
     for name, status in statuses.items():
-        if status in NOT_RUN:
+        if status is None:
             continue
         counted.made += 1
-        if status in KILLED:
+        if status in (KILLED, TIMED_OUT):
             counted.killed += 1
-            counted.timed_out += status in TIMED_OUT
+            counted.timed_out += status == TIMED_OUT
         elif (change := show(name)) in justified:
             counted.justified += 1
         else:
-            counted.survivors.append(f"{file}: {change[0]}  ->  {change[1]}")
+            counted.survivors.append(f"{name.rpartition('.')[2]} of {file}: {change[0]}  ->  {change[1]}")
     return counted
 
 
@@ -81,19 +238,17 @@ def main() -> None:
     """Run the mutants and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="mutants to run, such as 'coop.learner.trainer*'; all if not given")
-    parser.add_argument("--max-children", default="2", help="processes at a time (default %(default)s)")
+    parser.add_argument("--max-children", type=int, default=2, help="processes at a time (default %(default)s)")
     parser.add_argument("--report", action="store_true", help="print the table of what has been run before")
     options = parser.parse_args()
     if not options.report:
-        command = ["mutmut", "run", *options.names, "--max-children", options.max_children]
-        done = subprocess.run(command, check=False)
-        if done.returncode:
-            sys.exit(done.returncode)
+        run(options.names, options.max_children)
     entries = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))
     survivors, low = [], []
     print(f"{'file':32}{'made':>6}{'killed':>8}{'by time':>9}{'justified':>11}{'killed of the rest':>20}")
-    for file, statuses in results():
-        counted = tally(file, statuses, {(entry["was"], entry["now"]) for entry in entries.get(file, [])})
+    for data in Mutants().files:
+        file = str(Path(data.path).relative_to("coop"))
+        counted = tally(file, data.exit_code_by_key, {(entry["was"], entry["now"]) for entry in entries.get(file, [])})
         if counted.made:
             numbers = (
                 f"{counted.made:6}{counted.killed:8}{counted.timed_out:9}{counted.justified:11}{counted.share:20.1%}"

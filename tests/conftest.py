@@ -1,7 +1,6 @@
 """Fixtures of real Zenoh sessions, and the check that a test session leaves nothing behind."""
 
 import gc
-import json
 import os
 import shutil
 import signal
@@ -54,21 +53,11 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("coop")
 
-STATS_OF_MUTMUT = Path("mutmut-stats.json")  # only where it runs mutants
 SETTLE = 10.0  # seconds that threads and processes get to end
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with longer limits come first, so that no worker begins one of them while the others end.
-
-    A mutant meets the quickest tests first, as most are killed by one of these.
-    """
-    if STATS_OF_MUTMUT.exists():
-        import torch._dynamo  # noqa: F401, PLC0415 - PyTorch's optimizers load it at their first step; here, once for all mutants
-
-        durations = json.loads(STATS_OF_MUTMUT.read_text(encoding="utf-8"))["duration_by_test"]
-        items.sort(key=lambda item: durations.get(item.nodeid, 0.0))
-        return
+    """Files with longer limits come first, so that no worker begins one of them while the others end."""
     limits: dict[Path, float] = {}
     for item in items:
         limit = item.get_closest_marker("timeout")
