@@ -73,13 +73,15 @@ class Mutants:
             self.by_name |= dict.fromkeys(file.exit_code_by_key, file)
 
     def left(self, patterns: list[str]) -> list[str]:
-        """Names of those that no test has killed."""
-        return [
+        """Names of those that no test has killed, first those that have not run."""
+        status = {name: file.exit_code_by_key[name] for name, file in self.by_name.items()}
+        left = [
             name
-            for name, file in self.by_name.items()
-            if file.exit_code_by_key[name] not in (KILLED, TIMED_OUT)
+            for name in status
+            if status[name] not in (KILLED, TIMED_OUT)
             and (not patterns or any(fnmatch.fnmatch(name, pattern) for pattern in patterns))
         ]
+        return sorted(left, key=lambda name: status[name] is not None)
 
     def note(self, name: str, status: int) -> None:
         """Keep how the tests of a mutant ended."""

@@ -12,7 +12,7 @@ from samples import await_service, until
 
 from coop.actors.policy import EpsilonGreedy
 from coop.actors.weights import WeightsFollower, make_policy
-from coop.common.errors import JoinError
+from coop.common.errors import JoinError, UsageError
 from coop.common.messaging.keys import role_key, weights_key
 from coop.common.messaging.messages.control import JoinReply
 from coop.common.messaging.messages.weights import Role, Weights
@@ -21,7 +21,7 @@ from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message
 from coop.common.networks.network import FlatNetwork, build_network
 from coop.common.settings.config import NetworkSettings, RunConfig
-from coop.common.types import EnvSpec
+from coop.common.types import Array, EnvSpec
 from coop.learner.agent import Agent
 from coop.learner.broadcast import Broadcaster
 
@@ -160,14 +160,79 @@ def test_an_actor_that_has_everything_asks_for_nothing(
     Broadcaster(learner, Agent(CONFIG, spec))
     follower = WeightsFollower(actor, own_policy(spec))
     refresh_until(follower, 0)
+    until(lambda: follower.ready)
     monkeypatch.setattr("coop.actors.weights.GRACE", 0.02)
-    monkeypatch.setattr(follower, "fetch", lambda: pytest.fail("asked"))
+    monkeypatch.setattr(follower, "fetching", lambda: pytest.fail("asked"))
     end = time.monotonic() + 0.06
     while time.monotonic() < end:
         follower.refresh()
 
 
-def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
+class Answering:
+    """A learner that answers with the same weights and role; asked: the keys by which it was."""
+
+    def __init__(self, learner: Node, versions: tuple[int, int], role: Role, flat: Array) -> None:
+        self.asked: list[str] = []
+        self.keys = [weights_key(learner, 1), weights_key(learner, 2), role_key(learner)]
+        weights = [Weights(number, versions[number - 1], flat).encode(learner.run) for number in (1, 2)]
+        for key, answer in zip(self.keys, [*weights, role.encode(learner.run)], strict=True):
+            learner.serve(key, lambda _, key=key, answer=answer: self._answer(key, answer))  # type: ignore[misc]
+
+    def _answer(self, key: str, answer: bytearray) -> bytearray:
+        self.asked.append(key)
+        return answer
+
+
+def test_what_a_role_names_and_nobody_sent_is_asked_for_once_in_a_while(
+    nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner, actor = nodes
+    policy = own_policy(spec)
+    answering = Answering(learner, (3, 3), Role(1, (4, 3), 4, 0), policy.networks[0].snapshot())
+    for key in answering.keys:
+        await_service(actor, key)
+    follower, now = WeightsFollower(actor, policy), 100.0
+    monkeypatch.setattr(actor, "now", lambda: now)
+    assert follower.fetch() is True
+    assert (follower.ready, follower.settled, follower.version) == (True, False, 3)
+    for _ in range(2):
+        answering.asked.clear()
+        follower.refresh()
+        now += GRACE / 2
+        follower.refresh()
+        assert answering.asked == []
+        now += GRACE / 2
+        follower.refresh()
+        assert answering.asked == answering.keys
+
+
+@pytest.mark.parametrize("broadcast", [3, 5])
+def test_the_newest_of_an_answer_and_a_broadcast_meanwhile_is_loaded(
+    broadcast: int, nodes: tuple[Node, Node], spec: EnvSpec
+) -> None:
+    learner, actor = nodes
+    policy = own_policy(spec)
+    flats = {version: policy.networks[0].snapshot() + np.float32(version) for version in (3, 4, 5)}
+    follower, key = WeightsFollower(actor, policy), weights_key(learner, 1)
+    heard = actor.latest(key)
+
+    def answer(message: Message) -> bytearray:
+        learner.publish(key, Weights(1, broadcast, flats[broadcast]).encode(learner.run))
+        until(lambda: heard.poll() is not None)
+        return Weights(1, 4, flats[4]).encode(learner.run)
+
+    learner.serve(key, answer)
+    await_service(actor, key)
+    assert follower.fetch() is False, "nobody answers for the second network"
+    assert follower.version == max(broadcast, 4)
+    np.testing.assert_array_equal(policy.networks[0].snapshot(), flats[max(broadcast, 4)])
+    follower.refresh()
+    assert follower.version == max(broadcast, 4)
+
+
+def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(
+    nodes: tuple[Node, Node], spec: EnvSpec, capsys: pytest.CaptureFixture[str]
+) -> None:
     learner, actor = nodes
     agent = Agent(CONFIG, spec)
     Broadcaster(learner, agent)
@@ -183,6 +248,9 @@ def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(nodes: tuple[No
         time.sleep(0.01)
     assert policy.acting == 0
     assert_equal(policy, agent)
+    refused = capsys.readouterr().out
+    assert f"refused a message at {actor.key('role')}: " in refused
+    assert f"refused a message at {actor.key('weights')}: " in refused
 
 
 @pytest.mark.parametrize("silent", ["weights", "role"])
@@ -215,10 +283,30 @@ def test_an_actor_does_not_wait_long_for_a_learner_that_is_silent(
 def test_a_layout_that_differs_is_refused(spec: EnvSpec) -> None:
     layout = Agent(CONFIG, spec).networks[0].layout_digest()
     reply = JoinReply(CONFIG, spec, layout, 0, [], 5, 0)
-    first, second = make_policy(reply, (), np.random.default_rng(0)).networks
+    policy = make_policy(reply, (), np.random.default_rng(0))
+    first, second = policy.networks
     assert first.layout_digest() == second.layout_digest() == layout
     with pytest.raises(JoinError, match=f"network layout here {layout}, the learner's 0123"):
         make_policy(changed(reply, layout="0123"), (), np.random.default_rng(0))
     wider = replace(CONFIG, network=NetworkSettings(hidden=(9,)))
     with pytest.raises(JoinError, match="network layout here"):
         make_policy(changed(reply, config=wider), (), np.random.default_rng(0))
+
+
+def test_a_policy_has_the_generator_and_the_device_that_it_is_given(spec: EnvSpec) -> None:
+    reply = JoinReply(CONFIG, spec, Agent(CONFIG, spec).networks[0].layout_digest(), 0, [], 5, 0)
+    policy = make_policy(reply, (), np.random.default_rng(3))
+    obs = np.zeros((40, *spec.obs_shape), spec.frame_dtype)
+    expected = EpsilonGreedy(policy.networks, spec, np.random.default_rng(3)).act(obs, 0.5)
+    np.testing.assert_array_equal(policy.act(obs, 0.5), expected)
+    with pytest.raises(RuntimeError, match="nowhere"):
+        make_policy(reply, (), np.random.default_rng(3), "nowhere")
+
+
+def test_a_run_of_a_module_that_may_not_be_imported_here_is_refused(spec: EnvSpec) -> None:
+    config = replace(CONFIG, network=NetworkSettings(kind="elsewhere.nets:Net"))
+    reply = JoinReply(config, spec, "0123", 0, [], 5, 0)
+    with pytest.raises(JoinError, match=r"^network\.kind = 'elsewhere\.nets:Net': this process may not import"):
+        make_policy(reply, ("other",), np.random.default_rng(0))
+    with pytest.raises(UsageError, match="elsewhere"):  # allowed, but there is none
+        make_policy(reply, ("elsewhere",), np.random.default_rng(0))
