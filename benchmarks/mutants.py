@@ -211,28 +211,28 @@ def run(patterns: list[str], at_once: int) -> None:
     os.chdir(home)
 
 
-def show(name: str) -> Change:
-    """The line that a mutant changes, before and after."""
-    shown = get_diff_for_mutant(name).splitlines()
+def show(name: str, path: Path) -> Change:
+    """The line that a mutant of this file changes, before and after."""
+    shown = get_diff_for_mutant(name, path=path).splitlines()
     was = [line[1:].strip() for line in shown if line.startswith("-") and not line.startswith("---")]
     now = [line[1:].strip() for line in shown if line.startswith("+") and not line.startswith("+++")]
     return " ".join(was), " ".join(now)
 
 
-def tally(file: str, statuses: dict[str, int | None], justified: set[Change]) -> Tally:
+def tally(file: SourceFileMutationData, justified: set[Change]) -> Tally:
     """Count the mutants of a file that were run."""
     counted = Tally()
-    for name, status in statuses.items():
+    for name, status in file.exit_code_by_key.items():
         if status is None:
             continue
         counted.made += 1
         if status in (KILLED, TIMED_OUT):
             counted.killed += 1
             counted.timed_out += status == TIMED_OUT
-        elif (change := show(name)) in justified:
+        elif (change := show(name, Path(file.path))) in justified:
             counted.justified += 1
         else:
-            counted.survivors.append(f"{name.rpartition('.')[2]} of {file}: {change[0]}  ->  {change[1]}")
+            counted.survivors.append(f"{name}: {change[0]}  ->  {change[1]}")
     return counted
 
 
@@ -250,7 +250,7 @@ def main() -> None:
     print(f"{'file':32}{'made':>6}{'killed':>8}{'by time':>9}{'justified':>11}{'killed of the rest':>20}")
     for data in Mutants().files:
         file = str(Path(data.path).relative_to("coop"))
-        counted = tally(file, data.exit_code_by_key, {(entry["was"], entry["now"]) for entry in entries.get(file, [])})
+        counted = tally(data, {(entry["was"], entry["now"]) for entry in entries.get(file, [])})
         if counted.made:
             numbers = (
                 f"{counted.made:6}{counted.killed:8}{counted.timed_out:9}{counted.justified:11}{counted.share:20.1%}"

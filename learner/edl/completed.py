@@ -2,8 +2,8 @@
 
 The polar factor of T [A, n] is P = G^(-1/2) T with G = T T^T. Where T lacks rank, or nearly so, G^(-1/2) would be
 noise. There T is completed: P is that of T' = T + delta D R, where R [A, n] has a 1 in each row, in the first A
-columns, and D [A, A] the lengths of T's rows. So P is a polar factor to about delta, and always has orthonormal rows. A
-mask picks the samples; G' = T' T'^T takes nothing but G and the first columns of T.
+columns, and D [A, A] the lengths of T's rows. So P is a polar factor to about delta, in float32 to a hundredth, and
+always has orthonormal rows. A mask picks the samples; G' = T' T'^T takes nothing but G and the first columns of T.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ class Jacobians:
             return kernels.feedback(self._ts, e, s)
         layers, roots, completions = self._solve(e[None, :, :, None].double())
         sigmas = []
-        for i, (t, layer) in enumerate(zip(self._ts, layers, strict=True)):
-            white, rest = (part[i, :, :, 0].to(e.dtype) for part in (roots, completions))
+        for i, layer in enumerate(layers):
+            t = layer.t
+            white, rest = roots[i, :, :, 0].to(t.dtype), completions[i, :, :, 0].to(e.dtype)
             weights = e + s * white
-            sigma = weights @ t[0] if len(t) < len(e) else torch.bmm(weights.unsqueeze(1), t).squeeze(1)
+            sigma = (weights @ t[0] if len(t) < len(e) else torch.bmm(weights.unsqueeze(1), t).squeeze(1)).to(e.dtype)
             if layer.completable:
                 sigma[:, : rest.shape[1]] += s * rest
             sigmas.append(sigma)
@@ -56,7 +57,7 @@ class Jacobians:
         layers, roots, completions = self._solve(units[None, None])
         found = []
         for i, (t, layer) in enumerate(zip(self._ts, layers, strict=True)):
-            b = t + s * (roots[i].mT.to(t.dtype) @ t)
+            b = t + s * (roots[i].mT.to(layer.t.dtype) @ layer.t).to(t.dtype)
             if layer.completable:
                 b[:, :, : completions.shape[2]] += s * completions[i].mT.to(t.dtype)
             found.append(b)
@@ -75,13 +76,13 @@ class Jacobians:
 class _Layer:
     """T of one layer.
 
-    completable: T can be completed to more rank.
+    completable: T can be completed to more rank. t: T, in float64 where it can't: what G^(-1/2) makes of the directions
+    that T lacks is a million times as long, and only cancels there.
     """
 
     def __init__(self, t: Tensor, reach: Subspace | None, basis: Tensor) -> None:
         actions, width = t.shape[1:]
         exact = t.dtype == torch.float64 or t.numel() <= _EXACT
-        self._t = t
         # The rounding of G's entries, relative to the rows' lengths, is far below delta^2, the limit and the ridge.
         self._delta, self._limit, self._ridge = (1e-5, 1e-8, 1e-13) if exact else (1e-2, 1e-4, 1e-6)
         wide = t.double() if exact else t
@@ -96,6 +97,7 @@ class _Layer:
             outside = outside * (outside.abs() > _ROUNDING)  # or the rows of a T of 0 would seem to be independent
             # The root of a sum of two matrices on orthogonal subspaces acts on T like that of G alone.
             self._gram = self._gram + _mean_square(self._gram) * outside
+        self.t = t if self.completable else t.double()
 
     def completed(self) -> tuple[Tensor, Tensor]:
         """G' of each sample, and delta D where T is completed, 0 elsewhere: float64 [batch or 1, A, A] each."""
@@ -112,7 +114,7 @@ class _Layer:
             mixing = longest[:, :, None] * self._inside
         # (independent rows)
         mixing = delta * mixing * ~independent(gram, self._limit)[:, None, None]
-        crossed = self._t[:, :, : gram.shape[1]].double() @ mixing.mT
+        crossed = self.t[:, :, : gram.shape[1]].double() @ mixing.mT
         return gram + crossed + crossed.mT + mixing @ mixing.mT, mixing
 
 
