@@ -97,7 +97,7 @@ def test_the_thin_factor_of_a_narrow_layer(batch: int, dtype: torch.dtype, withi
 def test_a_layer_that_reaches_a_part_of_the_actions(width: int, dead: bool) -> None:
     """Of rank 2 in the subspace of three actions whose sum is 0: P has two singular values of 1, and stays in it."""
     basis = torch.linalg.qr(torch.eye(3, dtype=DOUBLE)[:, :2] - 1 / 3)[0]
-    reach = Subspace(basis, torch.eye(3, dtype=DOUBLE) - basis @ basis.mT, 2)
+    reach = Subspace(basis, 2)
     t = basis @ torch.randn(4, 2, width, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
     t = torch.zeros_like(t) if dead else t
     p = factor(t.float(), reach=reach)

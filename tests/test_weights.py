@@ -246,6 +246,11 @@ def test_a_broadcast_that_is_none_changes_nothing_and_is_counted(
         assert time.monotonic() < deadline
         follower.refresh()
         time.sleep(0.01)
+    learner.publish(role_key(learner), Weights(1, 9, policy.networks[0].snapshot()).encode("test"))
+    while actor.bad_messages < 3:
+        assert time.monotonic() < deadline
+        follower.refresh()
+        time.sleep(0.01)
     assert policy.acting == 0
     assert_equal(policy, agent)
     refused = capsys.readouterr().out

@@ -40,12 +40,11 @@ class Tape(Generic[ArrayT]):
 class Subspace:
     """The actions' directions that one layer reaches, where its T(i) [A, n] lacks rank for every input and weight.
 
-    basis: [A, k], orthonormal columns, whose span holds every T(i)'s. outside: [A, A], the projection on its
-    complement. rank: the largest rank of T(i), at most k.
+    basis: float64 [A, k], orthonormal columns, whose span holds every T(i)'s. rank: the largest rank of T(i), at most
+    k.
     """
 
     basis: torch.Tensor
-    outside: torch.Tensor
     rank: int
 
 

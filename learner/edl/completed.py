@@ -25,8 +25,8 @@ _SHORT = 1e-3  # of the longest row: what a row's length counts as, at least
 class Jacobians:
     """T(i) of several layers.
 
-    ts: <float>[batch or 1, A, n] of each layer, contiguous. ranges: that of each T. basis: [A, A], the orthogonal Q by
-    which the rows have been multiplied. batch: number of samples.
+    ts: <float>[batch or 1, A, n] of each layer, contiguous. ranges: that of each T. basis: float64 [A, A], the orthogonal
+    Q by which the rows have been multiplied. batch: number of samples.
     """
 
     def __init__(self, ts: Sequence[Tensor], ranges: Sequence[Subspace | None], basis: Tensor, batch: int) -> None:
@@ -53,7 +53,7 @@ class Jacobians:
 
     def matrices(self, s: float) -> list[Tensor]:
         """T + s P of each layer: [batch, A, n]."""
-        units = torch.eye(self._basis.shape[0], dtype=torch.float64, device=self._basis.device)
+        units = torch.eye(len(self._basis), dtype=torch.float64, device=self._basis.device)
         layers, roots, completions = self._solve(units[None, None])
         found = []
         for i, (t, layer) in enumerate(zip(self._ts, layers, strict=True)):
@@ -91,8 +91,8 @@ class _Layer:
         self.completable = reach is None and width >= actions
         if reach is not None:
             self.completable = reach.rank == reach.basis.shape[1] and width >= actions
-            inside = basis @ reach.basis.to(basis)
-            self._inside = (inside @ inside.mT).double()
+            inside = basis @ reach.basis
+            self._inside = inside @ inside.mT
             outside = _units(self._gram) - self._inside
             outside = outside * (outside.abs() > _ROUNDING)  # or the rows of a T of 0 would seem to be independent
             # The root of a sum of two matrices on orthogonal subspaces acts on T like that of G alone.

@@ -148,8 +148,7 @@ def _range(trials: Sequence[_Trial], layer: FeedbackLayer) -> Subspace | None:
     rank, (actions, width) = int(ranks.max()), ts.shape[1:]
     if basis.shape[1] == actions and rank == min(actions, width):
         return None
-    outside = torch.eye(actions).to(basis) - basis @ basis.mT
-    return Subspace(basis.to(layer.module.weight), outside.to(layer.module.weight), rank)
+    return Subspace(basis.to(layer.module.weight.device), rank)
 
 
 def _named(layer: FeedbackLayer) -> str:

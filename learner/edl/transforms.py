@@ -111,7 +111,7 @@ class Transforms(Generic[ArrayT]):
 
     def _jacobians(self) -> Jacobians:
         ts: Any = self._ts
-        basis: Any = self._basis
+        basis = _mean_first(self._actions, torch.float64, ts[0].device)
         return Jacobians(ts, self._ranges, basis, self._batch)
 
     def _grams(self) -> ArrayT:
