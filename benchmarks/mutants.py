@@ -3,10 +3,13 @@
 mutmut (extra `mutants`) makes the mutants: it changes one place at a time of the files that pyproject.toml names; texts
 of errors stay. The tests are collected once. A first pass notes which test calls which function and how long it takes;
 then each mutant is a fork in which the tests that call its function run, quickest first, until one fails. What has been
-killed stays so until its function changes; survivors and what has not run meet the tests at each call.
+killed stays so until its function changes; what has not run and survivors meet the tests at each call, but for those
+that are justified.
 
 For each file the table gives the mutants made, killed, and killed by their time limit. A survivor that does what the
-original does is justified in `benchmarks/equivalent_mutants.toml`, by the line that it changes; the others are listed.
+original does is justified in `benchmarks/equivalent_mutants.toml`, by the line that it changes, or by the rule that a
+tensor's `device` is the same for all where there is no GPU, and that the `strict` of a zip of equal lengths changes
+nothing; the others are listed.
 Exit status 1 where less than 95 % of a file's mutants, the justified ones left out, were killed.
 """
 
@@ -17,6 +20,7 @@ import contextlib
 import fnmatch
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -41,7 +45,7 @@ REQUIRED = 0.95
 SURVIVED, KILLED, TIMED_OUT, NO_TEST = 0, 1, 36, 33  # as mutmut notes them
 LIMIT = 15.0, 4.0  # seconds that a mutant's tests may take: so many, and so many times what they take without it
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.toml")
-Change = tuple[str, str]  # a line as it was and as the mutant has it
+EQUAL_VALUES = re.compile(r",? *\b(strict|device)=[\w.]*")
 
 
 @dataclass
@@ -71,17 +75,51 @@ class Mutants:
             file.meta_path = file.meta_path.absolute()
             file.load()
             self.by_name |= dict.fromkeys(file.exit_code_by_key, file)
+        self.entries = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))
 
     def left(self, patterns: list[str]) -> list[str]:
-        """Names of those that no test has killed, first those that have not run."""
+        """Names of those that no test has killed and nothing justifies, first those that have not run."""
         status = {name: file.exit_code_by_key[name] for name, file in self.by_name.items()}
         left = [
             name
             for name in status
             if status[name] not in (KILLED, TIMED_OUT)
             and (not patterns or any(fnmatch.fnmatch(name, pattern) for pattern in patterns))
+            and not (status[name] == SURVIVED and self.justified(name))
         ]
         return sorted(left, key=lambda name: status[name] is not None)
+
+    def change(self, name: str) -> tuple[str, str]:
+        """The line that a mutant changes, before and after."""
+        shown = get_diff_for_mutant(name, path=self.by_name[name].path).splitlines()
+        was = [line[1:].strip() for line in shown if line.startswith("-") and not line.startswith("---")]
+        now = [line[1:].strip() for line in shown if line.startswith("+") and not line.startswith("+++")]
+        return " ".join(was), " ".join(now)
+
+    def justified(self, name: str) -> bool:
+        """Whether a mutant does what the original does."""
+        was, now = self.change(name)
+        if EQUAL_VALUES.sub("", was) == EQUAL_VALUES.sub("", now).replace(", )", ")"):
+            return True
+        return any(
+            (entry["was"], entry["now"]) == (was, now) for entry in self.entries.get(place(self.by_name[name]), [])
+        )
+
+    def tally(self, file: SourceFileMutationData) -> Tally:
+        """Count the mutants of a file that were run."""
+        counted = Tally()
+        for name, status in file.exit_code_by_key.items():
+            if status is None:
+                continue
+            counted.made += 1
+            if status in (KILLED, TIMED_OUT):
+                counted.killed += 1
+                counted.timed_out += status == TIMED_OUT
+            elif self.justified(name):
+                counted.justified += 1
+            else:
+                counted.survivors.append("{}: {}  ->  {}".format(name, *self.change(name)))
+        return counted
 
     def note(self, name: str, status: int) -> None:
         """Keep how the tests of a mutant ended."""
@@ -211,29 +249,9 @@ def run(patterns: list[str], at_once: int) -> None:
     os.chdir(home)
 
 
-def show(name: str, path: Path) -> Change:
-    """The line that a mutant of this file changes, before and after."""
-    shown = get_diff_for_mutant(name, path=path).splitlines()
-    was = [line[1:].strip() for line in shown if line.startswith("-") and not line.startswith("---")]
-    now = [line[1:].strip() for line in shown if line.startswith("+") and not line.startswith("+++")]
-    return " ".join(was), " ".join(now)
-
-
-def tally(file: SourceFileMutationData, justified: set[Change]) -> Tally:
-    """Count the mutants of a file that were run."""
-    counted = Tally()
-    for name, status in file.exit_code_by_key.items():
-        if status is None:
-            continue
-        counted.made += 1
-        if status in (KILLED, TIMED_OUT):
-            counted.killed += 1
-            counted.timed_out += status == TIMED_OUT
-        elif (change := show(name, Path(file.path))) in justified:
-            counted.justified += 1
-        else:
-            counted.survivors.append(f"{name}: {change[0]}  ->  {change[1]}")
-    return counted
+def place(file: SourceFileMutationData) -> str:
+    """A file's path from the top of the repository."""
+    return str(Path(file.path).relative_to("coop"))
 
 
 def main() -> None:
@@ -245,19 +263,16 @@ def main() -> None:
     options = parser.parse_args()
     if not options.report:
         run(options.names, options.max_children)
-    entries = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))
+    mutants = Mutants()
     survivors, low = [], []
     print(f"{'file':32}{'made':>6}{'killed':>8}{'by time':>9}{'justified':>11}{'killed of the rest':>20}")
-    for data in Mutants().files:
-        file = str(Path(data.path).relative_to("coop"))
-        counted = tally(data, {(entry["was"], entry["now"]) for entry in entries.get(file, [])})
+    for file in mutants.files:
+        counted = mutants.tally(file)
         if counted.made:
-            numbers = (
-                f"{counted.made:6}{counted.killed:8}{counted.timed_out:9}{counted.justified:11}{counted.share:20.1%}"
-            )
-            print(f"{file:32}{numbers}")
+            numbers = f"{counted.made:6}{counted.killed:8}{counted.timed_out:9}{counted.justified:11}"
+            print(f"{place(file):32}{numbers}{counted.share:20.1%}")
             survivors += counted.survivors
-            low += [file] if counted.share < REQUIRED else []
+            low += [place(file)] if counted.share < REQUIRED else []
     print("\n".join(survivors))
     if low:
         sys.exit(f"below {REQUIRED:.0%}: {', '.join(low)}")

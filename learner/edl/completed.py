@@ -25,8 +25,8 @@ _SHORT = 1e-3  # of the longest row: what a row's length counts as, at least
 class Jacobians:
     """T(i) of several layers.
 
-    ts: <float>[batch or 1, A, n] of each layer, contiguous. ranges: that of each T. basis: float64 [A, A], the orthogonal
-    Q by which the rows have been multiplied. batch: number of samples.
+    ts: <float>[batch or 1, A, n] of each layer, contiguous. ranges: that of each T. basis: float64 [A, A], the
+    orthogonal Q by which the rows have been multiplied. batch: number of samples.
     """
 
     def __init__(self, ts: Sequence[Tensor], ranges: Sequence[Subspace | None], basis: Tensor, batch: int) -> None:
