@@ -7,7 +7,17 @@ import pytest
 import torch
 
 from coop.common.types import Array
-from coop.learner.edl.polar import polar, polar_by_svd, polar_of_product, whitened
+from coop.learner.edl.polar import (
+    SCALES,
+    _paired,
+    _scales,
+    inverse_root,
+    newton_schulz,
+    polar,
+    polar_by_svd,
+    polar_of_product,
+    whitened,
+)
 
 LIBRARIES = pytest.mark.parametrize("library", [np.asarray, torch.as_tensor])
 
@@ -19,6 +29,15 @@ def _pair(cosine: float, scale: float = 1.0) -> Array:
 def _triple(cosine: float) -> Array:
     """Two rows of this cosine, and a third orthogonal to both."""
     return np.block([[_pair(cosine), np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+
+
+def _alike(size: int, cosine: float) -> Array:
+    return (1 - cosine) * np.eye(size) + np.full((size, size), cosine)
+
+
+def _beside(corner: Array) -> Array:
+    """Two rows, and two that are orthogonal to all others."""
+    return np.block([[corner, np.zeros((2, 2))], [np.zeros((2, 2)), np.eye(2)]])
 
 
 @LIBRARIES
@@ -35,6 +54,72 @@ def test_whitened(size: int, dtype: type, library: Any) -> None:
     assert doubtful is None
     assert white.dtype == gram.dtype
     np.testing.assert_allclose(white, expected, rtol=1e-4 if dtype is np.float32 else 1e-10, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_whitened_to_float64(size: int, scale: float) -> None:
+    rng = np.random.default_rng(0)
+    rows = scale * rng.standard_normal((500, size, size)) * rng.uniform(0.3, 1, (500, size, 1))
+    gram, e = rows @ rows.swapaxes(1, 2), rng.standard_normal(size)
+    white, doubtful = whitened(gram, e)
+    assert doubtful is None or doubtful.mean() < 0.02
+    values, vectors = np.linalg.eigh(gram)
+    expected = np.einsum("bij,bj,bkj,k->bi", vectors, values**-0.5, vectors, e)
+    away = np.linalg.norm(white - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    inflation = np.einsum("bii,bii->b", gram, np.linalg.inv(gram))
+    sound = np.ones(500, bool) if doubtful is None else ~doubtful
+    assert (away / inflation)[sound].max() < 1e-13
+
+
+def _grams(*smallest: float) -> torch.Tensor:
+    """Gram matrices of 4 x 4, whose smallest eigenvalue is this share of the largest."""
+    generator = torch.Generator().manual_seed(0)
+    vectors = torch.linalg.qr(torch.randn(len(smallest), 4, 4, generator=generator, dtype=torch.float64))[0]
+    values = torch.tensor([[each, 0.2, 0.7, 1.0] for each in smallest], dtype=torch.float64)
+    return (vectors * values[:, None]) @ vectors.mT
+
+
+@pytest.mark.parametrize("root", [inverse_root, newton_schulz])
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_inverse_roots(root: Any, scale: float) -> None:
+    grams = scale * _grams(0.5, 1e-3, 1e-6, 4e-10).reshape(2, 2, 4, 4)
+    found = root(grams)
+    units = torch.eye(4, dtype=torch.float64).expand(2, 2, 4, 4)
+    torch.testing.assert_close(found, found.mT, rtol=1e-5, atol=1e-5 * scale**-0.5)
+    whole = found @ grams @ found
+    torch.testing.assert_close(whole[0], units[0], rtol=0, atol=1e-8)
+    torch.testing.assert_close(whole[1, 0], units[0, 0], rtol=0, atol=1e-7)
+    torch.testing.assert_close(whole[1, 1], units[0, 0], rtol=0, atol=1e-4)
+
+
+def test_a_gram_matrix_that_is_not_finite_has_no_inverse_root() -> None:
+    grams = _grams(0.5, 0.4, 0.3, 0.2).reshape(2, 2, 4, 4)
+    expected = inverse_root(grams)
+    grams[0, 1, 2, 3] = torch.nan
+    found = inverse_root(grams)
+    assert found[0, 1].isnan().all()
+    torch.testing.assert_close(found[0, 0], expected[0, 0])
+    torch.testing.assert_close(found[1], expected[1])
+
+
+def test_the_scales_bring_every_root_to_1() -> None:
+    """Each is the best for the smallest of the roots, as long as it is stable; one fewer would not be enough."""
+    assert _scales() == SCALES
+
+    def after(x: Array, scales: list[float]) -> Array:
+        for rho in scales:
+            x = 0.5 * rho * x * (3 - rho**2 * x**2)
+        return x
+
+    roots = np.geomspace(1e-5, 1, 1000)
+    assert np.abs(after(roots, SCALES) - 1).max() < 1e-12
+    assert np.abs(after(roots, SCALES[:-2]) - 1).max() > 1e-9
+    assert max(SCALES) == 1.6977
+    assert SCALES[-1] == 1
+    for k, rho in enumerate(SCALES[:-1]):
+        smallest = after(roots[:1], SCALES[:k])[0]
+        assert rho == min((3 / (1 + smallest + smallest**2)) ** 0.5, 1.6977)
 
 
 @LIBRARIES
@@ -61,6 +146,17 @@ def test_whitened(size: int, dtype: type, library: Any) -> None:
         (np.diag([0.8e-11, 0.8e-11, 1.0]), False),
         (np.full((2, 2), np.nan), False),
         (np.full((3, 3), np.nan), False),
+        # Three rows that are all nearly parallel.
+        (_alike(3, 0.992), True),
+        (_alike(3, 0.990), True),
+        (_alike(3, 0.994), False),
+        # More rows, by eigenvalues.
+        (_beside(_pair((1 - 0.0075) ** 0.5)), True),
+        (_beside(_pair((1 - 0.0060) ** 0.5)), False),
+        (_beside(np.diag([1.0, 1.2e-11])), True),
+        (4 * _beside(np.diag([1.0, 0.8e-11])), False),
+        (_beside(np.diag([0.8e-31, 1.0])), False),
+        (_beside(np.full((2, 2), np.nan)), False),
     ],
 )
 def test_what_float32_is_too_coarse_for_is_named_and_left_at_0(gram: Array, accurate: bool, library: Any) -> None:
@@ -125,8 +221,33 @@ def test_polar_factors_by_svd(rank: int | None, dtype: torch.dtype) -> None:
     torch.testing.assert_close(broken[[0, 2]], expected[[0, 2]])
 
 
-def test_a_matrix_on_which_lapack_fails_is_decomposed_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    matrices = torch.randn(3, 6, 5, dtype=torch.float64)
+def test_a_matrix_of_0_gets_a_factor_by_chance() -> None:
+    def factors(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+        rng = np.random.default_rng(seed)
+        return polar(torch.zeros(3, 5), rng), polar_of_product(torch.zeros(2, 3), torch.zeros(2, 5), rng)
+
+    for one, other in zip(factors(0), factors(1), strict=True):
+        assert not torch.equal(one, other)
+        torch.testing.assert_close(one @ one.t(), torch.eye(3))
+
+
+def test_each_null_direction_has_a_sign_of_its_own() -> None:
+    rng = np.random.default_rng(0)
+    seen = set()
+    for _ in range(50):
+        paired = _paired(3, 4, 1, rng)
+        assert paired[0].tolist() == [1, 0, 0, 0]
+        seen.add(tuple(paired[1:].sum(1).tolist()))
+    assert seen == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("batch", [2, 3])
+def test_a_matrix_on_which_lapack_fails_is_decomposed_all_the_same(
+    batch: int, scale: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    matrices = scale * torch.randn(batch, 6, 5, generator=generator, dtype=torch.float64)
     true_svd = torch.linalg.svd
 
     def failing(matrix: torch.Tensor, full_matrices: bool) -> tuple[torch.Tensor, ...]:
@@ -138,5 +259,5 @@ def test_a_matrix_on_which_lapack_fails_is_decomposed_all_the_same(monkeypatch: 
     plain = polar_by_svd(matrices)
     monkeypatch.setattr(torch.linalg, "svd", failing)
     factors = polar_by_svd(matrices)
-    torch.testing.assert_close(factors[[0, 2]], plain[[0, 2]], rtol=0, atol=1e-14)
+    torch.testing.assert_close(factors[::2], plain[::2], rtol=0, atol=1e-14)
     torch.testing.assert_close(factors[1], plain[1], rtol=0, atol=1e-11)
