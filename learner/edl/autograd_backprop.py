@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from coop.learner.edl.backprop import Backprop, Subspace, Tape, UnsupportedLayerError
-from coop.learner.edl.torch_backprop import TorchBackprop
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +101,8 @@ class AutogradBackprop(Backprop[Tensor]):
             root.detach(), [step.input.detach() for step in steps], root, [step.output for step in steps], x, self
         )
 
-    def cotangents(
-        self, tape: Tape[Tensor], cotangent: Tensor, dtype: torch.dtype | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
-        """As `Backprop.cotangents`, in the network's dtype, with outputs flattened: [b, k, n]."""
+    def cotangents(self, tape: Tape[Tensor], cotangent: Tensor) -> Iterator[tuple[int, Tensor]]:
+        """As `Backprop.cotangents`, with outputs flattened: [b, k, n]."""
         tape = _recorded(tape)
         inner = self.parametrised
         if self._ends:
@@ -142,9 +139,6 @@ class AutogradBackprop(Backprop[Tensor]):
     def range_of(self, index: int) -> Subspace | None:
         """The range of T of layer `index`."""
         return self._layers[index].range
-
-    gram = staticmethod(TorchBackprop.gram)
-    combine = staticmethod(TorchBackprop.combine)
 
 
 def _recorded(tape: Tape[Tensor]) -> GraphTape:

@@ -67,13 +67,11 @@ class Backprop(ABC, Generic[ArrayT]):
         """Run the network on x, <float>[batch, *input]."""
 
     @abstractmethod
-    def cotangents(
-        self, tape: Tape[ArrayT], cotangent: ArrayT, dtype: torch.dtype | None = None
-    ) -> Iterator[tuple[int, ArrayT]]:
+    def cotangents(self, tape: Tape[ArrayT], cotangent: ArrayT) -> Iterator[tuple[int, ArrayT]]:
         """Propagate cotangents of the output to every pre-activation: (step, [b, k, *output of step]), last first.
 
         cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
-        share. dtype: of the computation, the network's if None.
+        share.
         """
 
     @abstractmethod
@@ -89,13 +87,3 @@ class Backprop(ABC, Generic[ArrayT]):
     def range_of(self, index: int) -> Subspace | None:
         """The range of T of step `index`; None if some weights and inputs give it full rank."""
         return None
-
-    @staticmethod
-    @abstractmethod
-    def gram(t: ArrayT) -> ArrayT:
-        """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
-
-    @staticmethod
-    @abstractmethod
-    def combine(weights: ArrayT, t: ArrayT) -> ArrayT:
-        """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""

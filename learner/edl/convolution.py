@@ -19,10 +19,8 @@ class ConvolutionBackprop(NumpyBackprop):
     The convolution comes first, so nothing is propagated through it. The tape holds `ConvolutionNetwork.activations`.
     """
 
-    def cotangents(
-        self, tape: Tape[Array], cotangent: Array, dtype: torch.dtype | None = None
-    ) -> Iterator[tuple[int, Array]]:
-        """As `TorchBackprop.cotangents`, in the network's dtype: (layer, cotangents [b, k, n] of its outputs)."""
+    def cotangents(self, tape: Tape[Array], cotangent: Array) -> Iterator[tuple[int, Array]]:
+        """As `TorchBackprop.cotangents`: (layer, cotangents [b, k, n] of its outputs)."""
         rows = cotangent
         for index in reversed(self.parametrised):
             yield index, rows

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-import torch
 
 from coop.common.networks.convolution import Dense
 from coop.common.types import Array
@@ -30,10 +29,8 @@ class NumpyBackprop(Backprop[Array]):
         *inputs, output = self._network.activations(x)
         return Tape(output, inputs)
 
-    def cotangents(
-        self, tape: Tape[Array], cotangent: Array, dtype: torch.dtype | None = None
-    ) -> Iterator[tuple[int, Array]]:
-        """As `TorchBackprop.cotangents`, in the network's dtype: (layer, cotangents [b, k, n] of its outputs)."""
+    def cotangents(self, tape: Tape[Array], cotangent: Array) -> Iterator[tuple[int, Array]]:
+        """As `TorchBackprop.cotangents`: (layer, cotangents [b, k, n] of its outputs)."""
         rows = cotangent
         for index in reversed(self.parametrised):
             yield index, rows

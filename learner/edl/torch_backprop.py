@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from coop.common.networks.folding import fold, folds, unfold
 from coop.common.networks.network import layer_functions
-from coop.learner.edl.arrays import in_dtype
 from coop.learner.edl.backprop import Backprop, Tape, UnsupportedLayerError
 
 Parametrised = nn.Linear | nn.Conv2d
@@ -54,13 +53,11 @@ class TorchBackprop(Backprop[Tensor]):
                 x = function(x)
         return Tape(x, inputs)
 
-    def cotangents(
-        self, tape: Tape[Tensor], cotangent: Tensor, dtype: torch.dtype | None = None
-    ) -> Iterator[tuple[int, Tensor]]:
+    def cotangents(self, tape: Tape[Tensor], cotangent: Tensor) -> Iterator[tuple[int, Tensor]]:
         """Propagate cotangents of the output to every pre-activation: (step, [b, k, *output of step]), last first.
 
         cotangent: [b, k, actions], k cotangents for each sample; b is the batch, or 1 for cotangents that all samples
-        share, and then stays 1 until a ReLU makes samples differ. dtype: of the computation, the network's if None.
+        share, and then stays 1 until a ReLU makes samples differ.
         """
         rows = cotangent
         fresh = False  # whether `rows` may be overwritten
@@ -71,7 +68,6 @@ class TorchBackprop(Backprop[Tensor]):
                 yield index, rows
                 if index == first:
                     return
-                weight = in_dtype(weight, dtype)
                 rows = _transposed(step, rows, weight, h) if isinstance(step, nn.Conv2d) else rows @ weight
                 fresh = True
             elif isinstance(step, nn.ReLU):
@@ -103,21 +99,6 @@ class TorchBackprop(Backprop[Tensor]):
             out[name + "weight"].copy_(unfold(weight_grad, across) if folded else weight_grad)
             if bias is not None:
                 out[name + "bias"].copy_(bias_grad)
-
-    @staticmethod
-    def gram(t: Tensor) -> Tensor:
-        """Products t t^T of each sample: [b, A, n] -> [b, A, A]."""
-        return torch.bmm(t, t.mT)
-
-    @staticmethod
-    def combine(weights: Tensor, t: Tensor) -> Tensor:
-        """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch or 1, A, n] -> [batch, n]."""
-        if len(t) < len(weights):
-            return weights @ t[0]
-        if weights.shape[1] == 2:
-            (v, w), (first, second) = weights.unsqueeze(-1).unbind(1), t.unbind(1)
-            return torch.addcmul(v * first, w, second)
-        return torch.bmm(weights.unsqueeze(1), t).squeeze(1)
 
 
 def _masked(rows: Tensor, activation: Tensor, in_place: bool) -> Tensor:

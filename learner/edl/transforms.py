@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any, Generic
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from coop.learner.edl.arrays import ArrayT, Namespace, at_least_float32, convert_like, in_dtype, namespace, widened
+from coop.learner.edl.arrays import ArrayT, at_least_float32, convert_like, in_dtype, widened
 from coop.learner.edl.backprop import Backprop, Tape
 from coop.learner.edl.completed import Jacobians
 from coop.learner.edl.polar import polar_by_svd, whitened
@@ -72,66 +73,38 @@ class Transforms(Generic[ArrayT]):
             for (index, shape), one in zip(self._layers, sigmas, strict=True):
                 yield index, in_dtype(_shaped(one, shape), self._dtype)
             return
-        white, doubtful = whitened(self._grams(), e)
+        backprop: Any = self._backprop
+        grams: Any = np.concatenate([backprop.gram(t) for t in self._ts])
+        white, doubtful = whitened(grams.reshape(-1, self._batch, self._actions, self._actions), e)
         # (weights of T)
         weights = e + s * white
-        for i, (index, shape) in enumerate(self._layers):
+        for i, (index, _) in enumerate(self._layers):
             # (sigma)
-            sigma = self._backprop.combine(weights[i], self._ts[i])
+            sigma = backprop.combine(weights[i], self._ts[i])
             if doubtful is not None and doubtful[i].any():
                 where = doubtful[i]
                 # (by SVD)
-                sigma[where] += s * (e[where][:, None] @ self._by_svd(i, where))[:, 0]
-            yield index, in_dtype(_shaped(sigma, shape), self._dtype)
+                factors = convert_like(polar_by_svd(torch.as_tensor(self._ts[i][where])), e)
+                sigma[where] += s * (e[where][:, None] @ factors)[:, 0]
+            yield index, sigma
 
-    def matrices(self, s: float) -> list[tuple[int, ArrayT]]:
-        """(step, B(i) = T(i) + s U V^T), last first: [batch, A, n_i], images with channels first."""
-        found = []
-        units = convert_like(torch.eye(self._actions), self._basis)
+    def matrices(self, s: float) -> list[tuple[int, Tensor]]:
+        """(step, B(i) = T(i) + s U V^T), last first: [batch, A, n_i], images with channels first; of tensors only."""
+        found: list[tuple[int, Tensor]] = []
+        basis: Any = self._basis
         if self._linear_end is not None:
-            whole = (self._batch, self._actions, self._actions)
-            found.append((self._linear_end, namespace(units).broadcast_to(units * (1 + s), whole)))
-        if not self._ts:
-            return found
-        wholes: list[Any] = []
-        if isinstance(units, Tensor):
-            wholes += self._jacobians().matrices(s)
-        else:
-            roots, doubtful = whitened(self._grams()[:, :, None], units)
-            for i, t in enumerate(self._ts):
-                b = t + s * (roots[i] @ t)
-                if doubtful is not None:
-                    where = doubtful[i, :, 0]
-                    b[where] += s * self._by_svd(i, where)
-                wholes.append(b)
-        for (index, shape), whole in zip(self._layers, wholes, strict=True):
-            b = self._basis.mT @ whole
-            found.append((index, _shaped(b, shape).reshape(b.shape)))
+            units = torch.eye(self._actions).to(basis)
+            found.append((self._linear_end, (units * (1 + s)).expand(self._batch, -1, -1)))
+        if self._ts:
+            for (index, shape), whole in zip(self._layers, self._jacobians().matrices(s), strict=True):
+                b = basis.mT @ whole
+                found.append((index, _shaped(b, shape).reshape(b.shape)))
         return found
 
     def _jacobians(self) -> Jacobians:
         ts: Any = self._ts
         basis = _mean_first(self._actions, torch.float64, ts[0].device)
         return Jacobians(ts, self._ranges, basis, self._batch)
-
-    def _grams(self) -> ArrayT:
-        """G(i) = T(i) T(i)^T of every layer held: [layers, batch, A, A]."""
-        xp: Namespace[ArrayT] = namespace(self._basis)
-        shape = (self._batch, self._actions, self._actions)
-        grams = [self._gram(i) for i in range(len(self._ts))]
-        whole = [gram if len(gram) == self._batch else xp.broadcast_to(gram, shape) for gram in grams]
-        return xp.concatenate(whole).reshape(-1, *shape)
-
-    def _gram(self, i: int) -> ArrayT:
-        """G of the i-th layer held: [batch or 1, A, A]."""
-        gram: ArrayT = self._backprop.gram(self._ts[i])
-        return gram
-
-    def _by_svd(self, i: int, where: ArrayT) -> ArrayT:
-        """Polar factors of those samples of the i-th T [batch or 1, A, n] for which `where` is true: [k, A, n]."""
-        t: ArrayT = self._ts[i]
-        chosen = namespace(t).broadcast_to(t, (self._batch, *t.shape[1:]))[where]
-        return convert_like(polar_by_svd(torch.as_tensor(chosen)), t)
 
 
 def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
@@ -147,9 +120,9 @@ def _basis(output_weight: ArrayT | None, output: ArrayT) -> ArrayT:
         return convert_like(SUM_AND_DIFFERENCE, output)
     if actions == 3 or output_weight is None:
         return convert_like(_reflection(actions), output)
-    xp, w = namespace(output), widened(output_weight)
+    w: Any = widened(output_weight)
     gram = w @ w.T
-    _, vectors = xp.linalg.eigh(gram if xp.isfinite(gram).all() else xp.zeros_like(gram))
+    _, vectors = np.linalg.eigh(gram if np.isfinite(gram).all() else np.zeros_like(gram))
     return convert_like(vectors.T, output)
 
 
