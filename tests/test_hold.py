@@ -31,6 +31,7 @@ def test_the_grid_is_the_plans() -> None:
         assert config.swap_period == {"half": 50, "slow": 200}.get(variant, 100)
         assert config.method == {"one-actor": "g-coop"}.get(variant, variant if variant in methods else "dqn")
         assert cell.player == {"copy-acts": 1, "one-actor": 0}.get(variant)
+    assert sum(cell.kept for cell in grid.cells) == 32 + 16
     begun = [cell.name for cell in grid.cells[:12]]
     assert all("-reservoir-" in name and name.endswith("-double") for name in begun)
 

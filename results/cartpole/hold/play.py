@@ -45,6 +45,7 @@ from results.cartpole.edl.packed import registered, summary
 HERE = Path("results/cartpole/hold")
 PLAN, GRID, FILE = HERE / "plan.md", HERE / "grid.toml", HERE / "hold.parquet"
 SEAL = b"hold"
+SIZES = (100, 300, 1000, 5000)  # with double targets: what the plan's changes leave of the grid
 _KEPT = ("update", "policy_churn", "q_abs_mean", "q_bound")  # of metrics.jsonl
 
 
@@ -68,6 +69,11 @@ class HoldCell:
     def name(self) -> str:
         """Of its files."""
         return cell_name(self.variant, self.eviction, self.capacity, self.double)
+
+    @property
+    def kept(self) -> bool:
+        """Whether the plan's changes leave it."""
+        return self.double and self.capacity in SIZES
 
 
 @dataclass(frozen=True)
@@ -247,7 +253,7 @@ def _run() -> None:
         return
     stop = Stop()
     stop.on_signals()
-    play(grid, args.out, stop, packed=packed_rows())
+    play(replace(grid, cells=tuple(cell for cell in grid.cells if cell.kept)), args.out, stop, packed=packed_rows())
     if stop.is_set():
         stop.raise_for_status()
 
