@@ -28,6 +28,7 @@ import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -45,6 +46,7 @@ REQUIRED = 0.95
 SURVIVED, KILLED, TIMED_OUT, NO_TEST = 0, 1, 36, 33  # as mutmut notes them
 LIMIT = 15.0, 4.0  # seconds that a mutant's tests may take: so many, and so many times what they take without it
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.toml")
+# What a mutant may change without a difference, as the text above says.
 EQUAL_VALUES = re.compile(r",? *\b(strict|device)=[\w.]*")
 
 
@@ -136,8 +138,10 @@ class Runner:
         self.reached: dict[str, list[int]] = defaultdict(list)  # by function: its tests, quickest first
         self.seconds: list[float] = []
 
-    def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        """Run what is left."""
+    def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
+        """Run what is left; pytest ends itself where tests can't be collected."""
+        if session.testsfailed:
+            return None
         import torch._dynamo  # noqa: F401, PLC0415 - PyTorch's optimizers load it at their first step; here, once for all
 
         self.items = session.items
@@ -152,7 +156,7 @@ class Runner:
                 self.mutants.note(name, NO_TEST)
                 continue
             limit = LIMIT[0] + LIMIT[1] * sum(self.seconds[test] for test in tests)
-            running[_fork(lambda name=name, tests=tests: self._try(name, tests))] = name, time.monotonic() + limit
+            running[_fork(partial(self._try, name, tests))] = name, time.monotonic() + limit
             if count % 50 == 0:
                 print(f"{count} of {len(self.names)} mutants, {time.monotonic() - started:.0f} s", file=sys.stderr)
         while running:
@@ -162,12 +166,12 @@ class Runner:
     def _look(self) -> None:
         """Note which test calls which function, and how long it takes."""
         read, write = os.pipe()
-        child = _fork(lambda: self._note_calls(write))
+        child = _fork(partial(self._note_calls, write))
         os.close(write)
         with os.fdopen(read, encoding="utf-8") as pipe:
             told = pipe.read()
         if os.waitpid(child, 0)[1] or not told:
-            sys.exit(f"without a mutant, a test fails: {told}")
+            pytest.exit(f"without a mutant, a test fails: {told}", returncode=1)
         calls = json.loads(told)
         self.seconds = [seconds for seconds, _ in calls]
         for test in sorted(range(len(calls)), key=self.seconds.__getitem__):
@@ -177,11 +181,11 @@ class Runner:
     def _note_calls(self, pipe: int) -> NoReturn:
         set_mutant_under_test("stats")
         calls = []
-        for test, failed in self._run(range(len(self.items))):
+        for test, seconds, failed in self._run(range(len(self.items))):
             if failed:
                 os.write(pipe, self.items[test].nodeid.encode())
                 os._exit(1)
-            calls.append((self._took, sorted(state()._stats)))
+            calls.append((seconds, sorted(state()._stats)))
             state()._stats.clear()
         with os.fdopen(pipe, "w", encoding="utf-8") as out:
             json.dump(calls, out)
@@ -189,17 +193,16 @@ class Runner:
 
     def _try(self, name: str, tests: list[int]) -> NoReturn:
         set_mutant_under_test(name)
-        os._exit(KILLED if any(failed for _, failed in self._run(tests)) else SURVIVED)
+        os._exit(KILLED if any(failed for _, _, failed in self._run(tests)) else SURVIVED)
 
-    def _run(self, tests: Iterable[int]) -> Iterator[tuple[int, bool]]:
-        """Run tests by their places; yield each with whether it failed."""
+    def _run(self, tests: Iterable[int]) -> Iterator[tuple[int, float, bool]]:
+        """Run tests by their places; yield each with its seconds and whether it failed."""
         order = list(tests)
         for test, following in zip(order, [*order[1:], None], strict=True):
             started = time.monotonic()
             after = None if following is None else self.items[following]
             failed = any(report.failed for report in runtestprotocol(self.items[test], log=False, nextitem=after))
-            self._took = time.monotonic() - started
-            yield test, failed
+            yield test, time.monotonic() - started, failed
 
     def _reap(self, running: dict[int, tuple[str, float]]) -> None:
         """Wait until one that runs has ended, or has to."""
@@ -245,8 +248,10 @@ def run(patterns: list[str], at_once: int) -> None:
     home = Path.cwd()
     os.chdir("mutants")
     arguments = ["--rootdir=.", "-s", *config().pytest_add_cli_args, *config().pytest_add_cli_args_test_selection]
-    pytest.main(arguments, plugins=[Runner(mutants, names, at_once)])
+    status = pytest.main(arguments, plugins=[Runner(mutants, names, at_once)])
     os.chdir(home)
+    if status:
+        sys.exit(int(status))
 
 
 def place(file: SourceFileMutationData) -> str:

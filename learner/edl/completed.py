@@ -97,7 +97,7 @@ class _Layer:
             outside = outside * (outside.abs() > _ROUNDING)  # or the rows of a T of 0 would seem to be independent
             # The root of a sum of two matrices on orthogonal subspaces acts on T like that of G alone.
             self._gram = self._gram + _mean_square(self._gram) * outside
-        self.t = t if self.completable else t.double()
+        self.t = t if self.completable else wide.double()
 
     def completed(self) -> tuple[Tensor, Tensor]:
         """G' of each sample, and delta D where T is completed, 0 elsewhere: float64 [batch or 1, A, A] each."""
