@@ -189,9 +189,12 @@ def test_a_resumed_run_keeps_the_lines_up_to_its_checkpoint(tmp_path: Path) -> N
         assert directory.evaluated == 300
     with (tmp_path / "evaluations.csv").open("a") as file:
         file.write("150,2,1,10,1,1,0,1")  # torn by a kill, in its last number
+    before = (tmp_path / "evaluations.csv").open()
     found = Survey(tmp_path, (Whole(tmp_path, Manifest(5, 7, {}, sealed)),))
     with RunDirectory(tmp_path, config, found, 7, 200) as directory:
         assert directory.evaluated == 200
+        with before:
+            assert before.read().count("\n") == 4, "a kill while the file is cut back loses no line"
         directory.evaluation(msgspec.structs.replace(RESULT, env_step=250, return_mean=1234567.25))
     assert [row["env_step"] for row in rows(tmp_path)] == ["100", "200", "250"]
     assert rows(tmp_path)[-1]["return_mean"] == "1234567.25"

@@ -17,6 +17,7 @@ from commands import Command, run_command
 from coop.common.process.processes import command
 from coop.lockstep.lockstep import Lockstep
 from coop.monitor.live_page import LivePage
+from coop.records.following import Following
 from coop.records.growing import GrowingTable
 from coop.records.locks import RunLock
 from coop.records.run_directory import RunDirectory
@@ -55,6 +56,30 @@ def test_rows_are_read_once_when_they_are_whole_and_anew_after_a_resumption(tmp_
     path.write_text("a,b\n9,9\n")
     assert list(table.rows()) == [{"a": "9", "b": "9"}]
     assert table.restarted
+    path.write_text("a,b\n8,8\n7,7\n")
+    assert list(table.rows()) == [{"a": "8", "b": "8"}, {"a": "7", "b": "7"}], "longer than before, with other lines"
+    assert table.restarted
+    path.write_text("")
+    assert list(table.rows()) == []
+    path.write_text("c\n6\n")
+    assert list(table.rows()) == [{"c": "6"}], "emptied before its header was written"
+
+
+@pytest.mark.parametrize("between", ["", "env_step,upd"])
+def test_rows_are_followed_through_a_file_that_is_emptied_and_written_again(between: str, tmp_path: Path) -> None:
+    path = tmp_path / "evaluations.csv"
+    following = Following(tmp_path, path.name)
+    assert following.rows() == []
+    path.write_text(between)
+    assert following.rows() == []
+    header = "env_step,update,network,episodes,return_mean,return_sd,epsilon,seconds\n"
+    row = "{},150,1,4,12.5,1,0,1\n"
+    path.write_text(header + row.format(200) + row.format(300))
+    assert [found["env_step"] for found in following.rows()] == [200, 300]
+    path.write_text(between)
+    assert following.rows() == []
+    path.write_text(header + row.format(200) + row.format(250) + row.format(400))
+    assert [found["env_step"] for found in following.rows()] == [400], "each step once"
 
 
 def test_a_run_by_its_files_while_they_grow(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ class Following:
     def __init__(self, run_dir: Path, name: str) -> None:
         """name: one of episodes.csv, metrics.jsonl and evaluations.csv, which need not exist yet."""
         self._file, self._name = GrowingFile(run_dir / name), name
-        self._begun, self._newest = False, -1
+        self._newest = -1
 
     def rows(self) -> list[Row]:
         """The rows since the last call, numbers as such; raises RunError for a line that can't be read."""
@@ -39,15 +39,13 @@ class Following:
             lines = self._file.raw_lines()
         except FileNotFoundError:
             return []
-        first = self._file.restarted or not self._begun  # a learner that was killed has gone back to its checkpoint
-        self._begun = self._begun or bool(lines)
+        if self._name != METRICS and self._file.from_start:
+            lines = lines[1:]  # the header
         found = []
-        for number, line in enumerate(lines):
-            if self._name == METRICS or number or not first:  # the others begin with a header
-                row = self._parse(line)
-                if row[_KEYS[self._name]] > self._newest:
-                    self._newest = row[_KEYS[self._name]]
-                    found.append(row)
+        for row in map(self._parse, lines):
+            if row[_KEYS[self._name]] > self._newest:  # else the run has gone back to a checkpoint
+                self._newest = row[_KEYS[self._name]]
+                found.append(row)
         return found
 
     def _parse(self, line: bytes) -> Row:

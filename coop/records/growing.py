@@ -15,33 +15,37 @@ from coop.records.checkpoints import EVALUATIONS
 
 MOST = 1 << 24  # bytes of one reading
 TAIL = 1 << 16  # bytes, more than any row of metrics.jsonl
+COMPARED = 256  # bytes of the newest lines, which a file that only grows keeps
 
 
 class GrowingFile:
     """The lines of a file that grows, as far as they are whole.
 
-    restarted: at the last reading the file was shorter than before, or another one: what had been read is no longer
-        true, as after a resumption from a checkpoint, and it was read anew.
+    restarted: at the last reading the file was shorter than before, another one, or had other lines: what had been read
+        is no longer true, as after a resumption from a checkpoint, and it was read anew.
+    from_start: the last reading began at the file's first line.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.restarted = False
+        self.restarted, self.from_start = False, True
         self._read = 0
-        self._inode = 0
+        self._newest = b""  # the end of what has been read
 
     def raw_lines(self) -> list[bytes]:
         """The whole lines since the last call; raises OSError while the file is not there or can't be read."""
         self.restarted = False
         with self.path.open("rb") as file:
-            found = os.fstat(file.fileno())
-            if self._read and (found.st_ino != self._inode or found.st_size < self._read):
-                self._read, self.restarted = 0, True
-            self._inode = found.st_ino
+            if self._read:
+                file.seek(self._read - len(self._newest))
+                if file.read(len(self._newest)) != self._newest:
+                    self._read, self._newest, self.restarted = 0, b"", True
+            self.from_start = not self._read
             lines: list[bytes] = []
             file.seek(self._read)
             while whole := file.read(MOST).rpartition(b"\n")[0]:
                 self._read += len(whole) + 1
+                self._newest = whole[-COMPARED:] + b"\n"
                 lines += whole.split(b"\n")
                 file.seek(self._read)
             return lines

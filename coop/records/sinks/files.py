@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import shutil
 import time
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from typing import Any
 from coop.common.messaging.messages.evaluate import EvaluationRow
 from coop.common.numbers import exact, strict_json
 from coop.common.process.console import say
-from coop.common.process.files import FileDigest, LineFile, aside_folder
+from coop.common.process.files import FileDigest, LineFile, aside_folder, write_atomic
 from coop.common.process.untrusted import read_bytes
 from coop.common.types import EpisodeRow
 from coop.records.checkpoints import EVALUATIONS, RECORDS
@@ -104,21 +105,18 @@ class EvaluationsFile(LineFile):
             to = aside_folder(folder)
             shutil.copy2(path, to / EVALUATIONS)
             say(f"{path}: line {bad[0]} can't be read, and is left out; the file as it was is in {to}")
-        super().__init__(path, go_on=False)
-        self.newest = 0
+        content = io.StringIO()
+        csv.writer(content, lineterminator="\n").writerows([FIELDS, *kept])
+        write_atomic(path, content.getvalue().encode())  # who follows the file, or a kill, finds no half of it
+        super().__init__(path, go_on=True)
+        self.newest = max((int(row[0]) for row in kept), default=0)
         self._csv = csv.writer(self, lineterminator="\n")
-        self._csv.writerow(FIELDS)
-        for row in kept:
-            self._write(row)
 
     def add(self, row: EvaluationRow) -> None:
         """Add a line."""
         values = [getattr(row, name) for name in FIELDS]
-        self._write([exact(value) if isinstance(value, float) else str(value) for value in values])
-
-    def _write(self, row: list[str]) -> None:
-        self._csv.writerow(row)
-        self.newest = max(self.newest, int(row[0]))
+        self._csv.writerow([exact(value) if isinstance(value, float) else str(value) for value in values])
+        self.newest = max(self.newest, row.env_step)
 
 
 def _rows(path: Path, env_step: int) -> tuple[list[list[str]], list[int]]:
