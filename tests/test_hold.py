@@ -1,5 +1,6 @@
 """The study of two networks on CartPole: its cells are the plan's, and its rules say what the plan says."""
 
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from scipy.stats import binomtest
 
 from coop.common.process.lifecycle import Stop
 from results.cartpole.hold import play, verdict
+from results.cells import claimed, play_cell, sealed
 
 SEEDS = range(500, 530)
 
@@ -57,9 +59,9 @@ def test_the_packed_cells_are_of_this_plan_and_grid(tmp_path: Path) -> None:
     assert all(len(found) == len(SEEDS) for found in rows.values())
     other, text = tmp_path / "grid.toml", play.GRID.read_text()
     other.write_text(f"# said in other words\n{text}")
-    assert play.sealed(grid=other) == play.sealed()
+    assert sealed(play.PLAN, other) == sealed(play.PLAN, play.GRID)
     other.write_text(text.replace("529]", "528]"))
-    assert play.sealed(grid=other) != play.sealed()
+    assert sealed(play.PLAN, other) != sealed(play.PLAN, play.GRID)
 
 
 @pytest.mark.parametrize(
@@ -131,8 +133,12 @@ def test_a_study_goes_on_where_it_stopped_and_is_packed(tmp_path: Path) -> None:
     cells = (by_name["copy-acts-reservoir-300-double"], by_name["half-fifo-300-single"])
     grid, stop = play.HoldGrid(cells, (500, 501)), Stop()
     stop.set("stopped")
-    play.play_cell(cells[0], cells[0].config, grid.seeds, tmp_path, stop)
-    assert not list(tmp_path.glob("*.npz")), "no run is over"
+    configs = {500: replace(cells[0].config, total_steps=450, seed=500)}
+    assert not play_cell(cells[0].name, configs, tmp_path, stop, lambda runs, *_: runs[0].play(stop), play.PROGRAM)
+    with claimed(tmp_path, cells[0].name) as mine:
+        assert mine
+        play.play(replace(grid, cells=cells[:1]), tmp_path, Stop(), steps=450)
+    assert not list(tmp_path.glob("*.npz")), "another process plays the cell"
     play.play(grid, tmp_path, Stop(), steps=450)
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{cell.name}.npz" for cell in cells]
     assert play.pack(grid, tmp_path, tmp_path / "packed.parquet") == 2

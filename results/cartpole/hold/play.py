@@ -3,22 +3,21 @@
     python -m results.cartpole.hold.play runs/hold     # plays what is not there yet, and goes on where it stopped
     python -m results.cartpole.hold.play runs/hold --pack results/cartpole/hold/hold.parquet     # adds what is complete
 
-The seeds of a cell are played side by side, each in a run directory as `coop-lockstep` leaves it; once all are over,
-they become one file of the cell. A packed row is a run, with all its returns; a return of CartPole is the length of its
-episode. The schema's metadata hold the SHA-256 of the plan, and of the grid.
+Several processes may play at once. The seeds of a cell are played side by side, each in a run directory as
+`coop-lockstep` leaves it; once all are over, they become one file of the cell. A packed row is a run, with all its
+returns; a return of CartPole is the length of its episode. The schema's metadata hold the SHA-256 of the plan, and of
+the grid.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import math
-import shutil
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from coop.common.errors import RunError, UsageError
+from coop.common.errors import UsageError
 from coop.common.process.console import say
 from coop.common.process.lifecycle import Stop, run_main
 from coop.common.settings.config import RunConfig
@@ -38,13 +37,14 @@ from coop.common.settings.tables import load_tables, resolve
 from coop.lockstep.compiled.together import play_together
 from coop.lockstep.run import LockstepRun
 from coop.records.reading import read_csv, read_jsonl
-from coop.records.resumption import Start
 from coop.records.summaries import read_summary
-from results.cartpole.edl.packed import registered, summary
+from results.cartpole.edl.packed import summary
+from results.cells import Progress, claimed, play_cell, remove_runs, sealed
 
 HERE = Path("results/cartpole/hold")
 PLAN, GRID, FILE = HERE / "plan.md", HERE / "grid.toml", HERE / "hold.parquet"
 SEAL = b"hold"
+PROGRAM = "results.cartpole.hold.play"
 SIZES = (100, 300, 1000, 5000)  # with double targets: what the plan's changes leave of the grid
 _KEPT = ("update", "policy_churn", "q_abs_mean", "q_bound")  # of metrics.jsonl
 
@@ -103,44 +103,27 @@ def read_grid(path: Path = GRID) -> HoldGrid:
 
 
 def play(grid: HoldGrid, out: Path, stop: Stop, steps: int | None = None, packed: Collection[str] = ()) -> None:
-    """Play every cell that has no file yet and is not packed; steps: of each run, in place of the grid's."""
-    out.mkdir(parents=True, exist_ok=True)
+    """Play every cell that has no file yet, is not packed, and that no other process plays.
+
+    steps: of each run, in place of the grid's.
+    """
     for cell in grid.cells:
         if stop.is_set():
             return
-        if cell.name not in packed and not (out / f"{cell.name}.npz").exists():
-            config = cell.config if steps is None else replace(cell.config, total_steps=steps)
-            play_cell(cell, config, grid.seeds, out, stop)
+        file = out / f"{cell.name}.npz"
+        if cell.name in packed or file.exists():
+            continue
+        config = cell.config if steps is None else replace(cell.config, total_steps=steps)
+        configs = {seed: replace(config, seed=seed) for seed in grid.seeds}
+        player = partial(_together, cell.player)
+        with claimed(out, cell.name) as mine:
+            if mine and not file.exists() and play_cell(cell.name, configs, out, stop, player, PROGRAM):
+                _write(file, [_kept(seed, out / cell.name / f"seed-{seed}") for seed in grid.seeds])
+                remove_runs(out, cell.name)
 
 
-def play_cell(cell: HoldCell, config: RunConfig, seeds: tuple[int, ...], out: Path, stop: Stop) -> None:
-    """Play a cell's seeds, and write its file if all of them are over."""
-    folder = out / cell.name
-    paths = {seed: folder / f"seed-{seed}" for seed in seeds}
-    with ExitStack() as stack:
-        runs = []
-        for seed, path in paths.items():
-            if not _over(path):
-                path.mkdir(parents=True, exist_ok=True)
-                run = LockstepRun(replace(config, seed=seed), path, "results.cartpole.hold.play", Start(resume=True))
-                stack.callback(run.close)
-                runs.append(run)
-        if runs:
-            play_together(runs, stop, cell.player, lambda line: say(f"{cell.name}: {line}"))
-    if not all(map(_over, paths.values())):
-        say(f"{cell.name}: stopped; the same command goes on")
-        return
-    _write(out / f"{cell.name}.npz", [_kept(seed, path) for seed, path in paths.items()])
-    shutil.rmtree(folder)
-    say(f"{cell.name}: done")
-
-
-def _over(path: Path) -> bool:
-    """Whether a run has ended for good."""
-    try:
-        return str(read_summary(path).get("exit", "")).startswith(("complete", "diverged"))
-    except RunError:
-        return False
+def _together(player: int | None, runs: Sequence[LockstepRun], stop: Stop, progress: Progress) -> None:
+    play_together(runs, stop, player, progress)
 
 
 def _kept(seed: int, path: Path) -> dict[str, Any]:
@@ -196,12 +179,6 @@ def _of(statistic: Callable[[Any], Any], values: NDArray[np.float32]) -> float:
     return float(statistic(found)) if len(found) else math.nan
 
 
-def sealed(plan: Path = PLAN, grid: Path = GRID) -> dict[str, str]:
-    """The SHA-256 of the plan as it began, and of the grid's tables."""
-    tables = json.dumps(tomllib.loads(grid.read_text(encoding="utf-8")), sort_keys=True)
-    return {"plan": registered(plan), "grid": hashlib.sha256(tables.encode()).hexdigest()}
-
-
 def pack(grid: HoldGrid, out: Path, path: Path) -> int:
     """Add the complete cells of the folder `out` to a Parquet file; return the number that it then holds.
 
@@ -215,7 +192,8 @@ def pack(grid: HoldGrid, out: Path, path: Path) -> int:
     rows = before | {cell.name: list(rows_of(cell, out / f"{cell.name}.npz")) for cell in done}
     frame = pd.DataFrame([row for cell in grid.cells for row in rows.get(cell.name, ())])
     frame = frame.astype(dict.fromkeys(("area", "last", "churn", "q_share"), np.float32))
-    table = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata({SEAL: json.dumps(sealed())})
+    seal = {SEAL: json.dumps(sealed(PLAN, GRID))}
+    table = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata(seal)
     pq.write_table(table, path, compression="zstd", compression_level=22)
     return len(rows)
 
@@ -228,7 +206,7 @@ def packed_rows(path: Path = FILE) -> dict[str, list[dict[str, Any]]]:
     if not path.exists():
         return {}
     table = pq.read_table(path)
-    if json.loads((table.schema.metadata or {}).get(SEAL, b"{}")) != sealed():
+    if json.loads((table.schema.metadata or {}).get(SEAL, b"{}")) != sealed(PLAN, GRID):
         raise UsageError(f"{path}: of another plan or grid")
     found: dict[str, list[dict[str, Any]]] = {}
     for row in table.to_pylist():
@@ -239,11 +217,11 @@ def packed_rows(path: Path = FILE) -> dict[str, list[dict[str, Any]]]:
 
 def main() -> None:
     """Entry point."""
-    run_main("results.cartpole.hold.play", _run)
+    run_main(PROGRAM, _run)
 
 
 def _run() -> None:
-    parser = argparse.ArgumentParser("python -m results.cartpole.hold.play", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(f"python -m {PROGRAM}", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("out", type=Path, help="folder of the cells")
     parser.add_argument("--pack", type=Path, metavar="FILE", help="write the complete cells as Parquet, and play none")
     args = parser.parse_args()

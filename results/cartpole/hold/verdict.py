@@ -23,7 +23,8 @@ from scipy.stats import binomtest
 
 from coop.studies.report.intervals import over_seeds
 from results.cartpole.edl.verdict import holm, printed
-from results.cartpole.hold.play import FILE, SEAL, SIZES, sealed
+from results.cartpole.hold.play import FILE, GRID, PLAN, SEAL, SIZES
+from results.cells import sealed
 
 ENDS_WELL, LEVEL, MARGIN = 195, 0.05, 0.25  # the margin in settings of four
 EVICTIONS = ("fifo", "reservoir")
@@ -43,7 +44,7 @@ Floats = NDArray[np.float64]
 def load(path: Path = FILE) -> pd.DataFrame:
     """A row for each run, with `well`: it ends well. Raises ValueError if plan or grid are not those of the file."""
     table = pq.read_table(path)
-    if json.loads(table.schema.metadata[SEAL]) != sealed():
+    if json.loads(table.schema.metadata[SEAL]) != sealed(PLAN, GRID):
         raise ValueError(f"{path}: of another plan or grid; changes of the plan go below its last heading")
     runs: pd.DataFrame = table.to_pandas()
     return runs.assign(well=runs["last"] >= ENDS_WELL, collapsed=runs["collapses"] > 0)

@@ -1,0 +1,81 @@
+"""The cells of a registered plan: the seeds of each are lockstep runs, and become one file once all are over."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import shutil
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from coop.common.errors import RunError
+from coop.common.process.console import say
+from coop.common.process.lifecycle import Stop
+from coop.common.settings.config import RunConfig
+from coop.lockstep.run import LockstepRun
+from coop.records.resumption import Start
+from coop.records.summaries import read_summary
+from results.cartpole.edl.packed import registered
+
+Progress = Callable[[str], None]
+Player = Callable[[Sequence[LockstepRun], Stop, Progress], object]
+
+
+def play_cell(name: str, configs: Mapping[int, RunConfig], out: Path, stop: Stop, player: Player, program: str) -> bool:
+    """Play a cell's seeds in the folder `out`/name, and go on with those that have begun; True once all are over."""
+    paths = {seed: out / name / f"seed-{seed}" for seed in configs}
+    with ExitStack() as stack:
+        runs = []
+        for seed, path in paths.items():
+            if not over(path):
+                path.mkdir(parents=True, exist_ok=True)
+                run = LockstepRun(configs[seed], path, program, Start(resume=True))
+                stack.callback(run.close)
+                runs.append(run)
+        if runs:
+            player(runs, stop, lambda line: say(f"{name}: {line}"))
+    if not all(map(over, paths.values())):
+        say(f"{name}: stopped; the same command goes on")
+        return False
+    return True
+
+
+def over(path: Path) -> bool:
+    """Whether a run has ended for good."""
+    try:
+        return str(read_summary(path).get("exit", "")).startswith(("complete", "diverged"))
+    except RunError:
+        return False
+
+
+def remove_runs(out: Path, name: str) -> None:
+    """Delete the runs of a cell whose file is there."""
+    shutil.rmtree(out / name)
+    _lock(out, name).unlink()
+    say(f"{name}: done")
+
+
+@contextmanager
+def claimed(out: Path, name: str) -> Iterator[bool]:
+    """Whether this process alone plays the cell while within: several may play the cells of one folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    with _lock(out, name).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+            return
+        yield True
+
+
+def _lock(out: Path, name: str) -> Path:
+    return out / f".{name}.lock"
+
+
+def sealed(plan: Path, grid: Path) -> dict[str, str]:
+    """The SHA-256 of a plan as it began, and of its grid's tables."""
+    tables = json.dumps(tomllib.loads(grid.read_text(encoding="utf-8")), sort_keys=True)
+    return {"plan": registered(plan), "grid": hashlib.sha256(tables.encode()).hexdigest()}

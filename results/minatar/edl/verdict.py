@@ -1,0 +1,153 @@
+"""The rules of results/minatar/edl/plan.md on the outcome of the study, applied to its packed runs.
+
+`python -m results.minatar.edl.verdict` prints, as Markdown, what the phases before it decided, as far as they are over,
+and the study's tables once all of its cells are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.special import stdtr
+
+from coop.studies.report.intervals import over_seeds
+from results.cartpole.edl.verdict import holm, printed
+from results.minatar.edl import rules
+from results.minatar.edl.play import FILE, EdlGrid, due, rows_of
+
+LARGE = 100_000  # transitions
+MARGIN, LEVEL = 5.0, 0.05  # points: percent of dqn's mean area with LARGE in the same game
+PAIRS = {
+    "H1, equal updates in all": ("coop", "edql"),
+    "H1, equal updates of a network": ("coop-2", "edql"),
+    "H2, equal updates in all": ("g-coop", "dqn"),
+    "H2, equal updates of a network": ("g-coop-2", "dqn"),
+    "H3, one network": ("edql", "dqn"),
+    "H3, two networks": ("coop", "g-coop"),
+}
+FOR, EQUIVALENT, AGAINST, UNDECIDED = "for the claim", "equivalent", "against", "undecided"
+
+Floats = NDArray[np.float64]
+
+
+class Decision(NamedTuple):
+    """A mean over seeds in points with its 95 % t interval, which of the three outcomes is nearest, and its p value.
+
+    p is below LEVEL where the interval lies in the outcome's range.
+    """
+
+    points: float
+    low: float
+    high: float
+    p: float
+    nearest: str
+    seeds: int
+
+
+def decide(values: Floats) -> Decision:
+    """The rule on the values of one pair, one of each seed."""
+    count = len(values)
+    mean, low, high = (float(each) for each in over_seeds(values))
+    error = float(values.std(ddof=1)) / math.sqrt(count)
+    beyond, short = (mean - MARGIN) / error, (mean + MARGIN) / error
+    found = {
+        FOR: stdtr(count - 1, -beyond),
+        EQUIVALENT: max(stdtr(count - 1, beyond), stdtr(count - 1, -short)),
+        AGAINST: stdtr(count - 1, short),
+    }
+    nearest = min(found, key=lambda name: found[name])
+    return Decision(mean, low, high, min(1.0, 2 * float(found[nearest])), nearest, count)
+
+
+def scores(rows: pd.DataFrame) -> pd.DataFrame:
+    """The runs of the study with `points`."""
+    runs = rows[rows["phase"] == "study"]
+    large = runs[(runs["variant"] == "dqn") & (runs["capacity"] == LARGE)].groupby("game")["area"].mean()
+    return runs.assign(points=100 * runs["area"] / runs["game"].map(large))
+
+
+def differences(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each pair, game and seed: the pair's difference with each capacity, and `points`, small minus large."""
+    table = scores(rows).pivot_table("points", ["game", "seed"], ["variant", "capacity"])
+    found = []
+    for name, (one, other) in PAIRS.items():
+        by_size = table[one] - table[other]
+        small = min(by_size.columns)
+        part = pd.DataFrame({"small": by_size[small], "large": by_size[LARGE]}).reset_index()
+        found.append(part.assign(pair=name, points=part["small"] - part["large"]))
+    return pd.concat(found, ignore_index=True)
+
+
+def by_game(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rule on each pair in each game, by itself."""
+    groups = differences(rows).groupby(["pair", "game"], sort=False)["points"]
+    return _ruled({key: decide(values.to_numpy()) for key, values in groups}, ["pair", "game"])
+
+
+def pooled(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rule on each pair, means over games of each seed; p by Holm over the pairs."""
+    means = differences(rows).groupby(["pair", "seed"], sort=False)["points"].mean()
+    decisions = {(pair,): decide(values.to_numpy()) for pair, values in means.groupby("pair", sort=False)}
+    return _ruled(decisions, ["pair"], together=True)
+
+
+def _ruled(found: Mapping[Any, Decision], names: list[str], *, together: bool = False) -> pd.DataFrame:
+    table = pd.DataFrame([dict(zip(names, key, strict=True)) | each._asdict() for key, each in found.items()])
+    if together:
+        table["p"] = holm(table["p"])
+    sign = np.where(table["low"] > 0, ", above 0", np.where(table["high"] < 0, ", below 0", ""))
+    undecided = [UNDECIDED + each for each in sign]
+    table["outcome"] = np.where(table["p"] < LEVEL, table["nearest"], undecided)
+    return table.drop(columns="nearest")
+
+
+def answer(table: pd.DataFrame) -> str:
+    """Through what the buffer gets by with less, from the table of `pooled`."""
+    by_hypothesis = table.groupby(table["pair"].str[:2])["outcome"].agg(set).to_dict()
+    holds = {name for name, outcomes in by_hypothesis.items() if outcomes == {FOR}}
+    if all(outcomes <= {EQUIVALENT, AGAINST} for outcomes in by_hypothesis.values()):
+        return "none"
+    found = [text for name, text in (("H2", "two networks"), ("H3", "error-driven learning")) if name in holds]
+    if not found and "H1" in holds:
+        found = ["both together"]
+    return " and ".join(found) or "undecided"
+
+
+def areas(rows: pd.DataFrame) -> pd.DataFrame:
+    """Mean area of each variant, game and capacity with its standard deviation over seeds, and runs that diverged."""
+    groups = scores(rows).groupby(["game", "capacity", "variant", "feedback", "rate"], sort=False)
+    table = groups["area"].agg(["mean", "std", "count"])
+    return table.assign(diverged=groups["finite"].agg(lambda finite: int((~finite).sum()))).reset_index()
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(
+        "python -m results.minatar.edl.verdict", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("--file", type=Path, default=FILE)
+    rows = rows_of(None, parser.parse_args().file)
+    over = set(rows["phase"]) if len(rows) else set()
+    left = due(EdlGrid(), rows)
+    before = {cell.phase for cell in left}
+    tables = {"pilot": rules.driven, "double": rules.targets, "rates": rules.rates}
+    for name, rule in tables.items():
+        if name in over and name not in before:
+            print(f"\n{name}\n\n{printed(rule(rows))}")
+    if left:
+        print(f"\n{len(left)} cells of the phase {left[0].phase} are left")
+        return
+    for name, table in {"areas": areas(rows), "by game": by_game(rows), "pooled": pooled(rows)}.items():
+        print(f"\n{name}\n\n{printed(table)}")
+    print(f"\nThe buffer gets by with less through: {answer(pooled(rows))}.")
+
+
+if __name__ == "__main__":
+    main()
