@@ -9,7 +9,8 @@ import numpy as np
 
 from coop.common.transitions import Batch, Segment
 from coop.common.types import Array, EnvSpec
-from coop.replay.table.table import Table, _reuse_histogram
+from coop.replay.table.put import reuse_histogram
+from coop.replay.table.table import Table
 
 
 def make_spec(stack: int, dtype: str = "float32", shape: tuple[int, ...] = (2, 3)) -> EnvSpec:
@@ -143,7 +144,7 @@ def check_references(table: Table, pinned: Array | None = None) -> None:
     tails = table._tails.slots()
     named: list[Array] = [tails[tails >= 0]]
     named += [table._columns.slots[: len(table)].reshape(-1), *([] if pinned is None else [pinned])]
-    references = table._frames.references
+    references = table._frames.references[: table._frames.used]
     expected = np.bincount(np.concatenate(named).astype(np.intp), minlength=len(references))
     np.testing.assert_array_equal(references, expected)
     assert table._frames.held == np.count_nonzero(references)
@@ -192,6 +193,6 @@ def table_stats(table: Table) -> TableStats:
         frames_held=table._frames.held,
         bytes_held=table._frames.bytes_held + size * table._columns.row_bytes,
         reuse_mean=float(reuse.mean()) if size else 0.0,
-        reuse_held=tuple(_reuse_histogram(reuse).tolist()),
+        reuse_held=tuple(reuse_histogram(reuse).tolist()),
         reuse_evicted=tuple(table._reuse_evicted.tolist()),
     )

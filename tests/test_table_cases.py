@@ -16,7 +16,8 @@ from coop.common.settings.capacity import estimated_bytes
 from coop.common.transitions import Segment
 from coop.common.types import EnvSpec
 from coop.replay.table import streams
-from coop.replay.table.table import Table, _reuse_histogram
+from coop.replay.table.put import reuse_histogram
+from coop.replay.table.table import Table
 
 
 def test_terminal_transitions_are_counted_as_they_come_and_go(spec: EnvSpec) -> None:
@@ -128,7 +129,7 @@ def test_reuse_histograms() -> None:
 
 
 def test_the_last_bucket_is_open() -> None:
-    histogram = _reuse_histogram(np.array([0, 1, 2, 3, 4, 2**14, 2**15, 2**31 - 1], np.int32))
+    histogram = reuse_histogram(np.array([0, 1, 2, 3, 4, 2**14, 2**15, 2**31 - 1], np.int32))
     assert histogram.tolist() == [1, 1, 2, 1, *[0] * 11, 3]
 
 

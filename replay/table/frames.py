@@ -32,18 +32,19 @@ class FrameStore:
 
     Attributes:
         shared_memory: its address, see `SharedMemory`; empty if it is private.
+        used: slots ever used; those above were never written. stored: frames ever stored.
+        references, numbers_of: of each slot, its references, and the number of its frame, see `numbers`.
+        free, free_count: a stack of free slots below `used`, and its height.
     """
 
     def __init__(self, frame_shape: tuple[int, ...], frame_dtype: str, *, shared_memory: bool = False) -> None:
         self.frame_shape = frame_shape
         self.dtype = np.dtype(frame_dtype)
         self.frame_bytes = math.prod(frame_shape) * self.dtype.itemsize
-        self._used = 0  # slots ever used; those above were never written
-        self._free_count = 0
-        self._stored = 0  # frames ever stored
-        self._numbers = np.zeros(FIRST_SLOTS, np.int64)  # of the frame in each slot, in the order in which they came
-        self._references = np.zeros(FIRST_SLOTS, np.int32)
-        self._free = np.zeros(FIRST_SLOTS, np.int32)  # a stack of free slots below `_used`
+        self.used = self.free_count = self.stored = 0
+        self.numbers_of = np.zeros(FIRST_SLOTS, np.int64)
+        self.references = np.zeros(FIRST_SLOTS, np.int32)
+        self.free = np.zeros(FIRST_SLOTS, np.int32)
         self._mark = np.zeros(FIRST_SLOTS, np.int32)  # scratch of `unique`
         self.shared_memory, memory = "", None
         if shared_memory:
@@ -56,54 +57,57 @@ class FrameStore:
     @property
     def held(self) -> int:
         """Frames with at least one reference."""
-        return self._used - self._free_count
-
-    @property
-    def references(self) -> NDArray[np.int32]:
-        """References of each slot ever used: int32 [slots], a copy."""
-        return self._references[: self._used].copy()
+        return self.used - self.free_count
 
     @property
     def bytes_held(self) -> int:
         """Bytes of the held frames, and of the three counters and the frame's number of every slot ever used."""
-        return self.held * self.frame_bytes + self._used * (3 * self._references.itemsize + self._numbers.itemsize)
+        return self.held * self.frame_bytes + self.used * (3 * self.references.itemsize + self.numbers_of.itemsize)
 
     def add(self, frames: Array, references: NDArray[np.intp]) -> Slots:
         """Store frames [n, *frame_shape] with references intp [n] (>= 1) each; return their slots, intp [n]."""
         count = len(frames)
-        recycled = min(count, self._free_count)
+        recycled = min(count, self.free_count)
         fresh = count - recycled
-        if self._used + fresh > len(self._references):
-            self._grow(self._used + fresh)
+        self.reserve(fresh)
         slots = np.empty(count, np.intp)
-        self._free_count -= recycled
-        slots[:recycled] = self._free[self._free_count : self._free_count + recycled]
+        self.free_count -= recycled
+        slots[:recycled] = self.free[self.free_count : self.free_count + recycled]
         if fresh:
-            slots[recycled:] = np.arange(self._used, self._used + fresh)
-            self._used += fresh
-        self._rows.view[slots] = self._items(frames)
-        self._references[slots] = references
-        self._numbers[slots] = np.arange(self._stored + 1, self._stored + count + 1)
-        self._stored += count
+            slots[recycled:] = np.arange(self.used, self.used + fresh)
+            self.used += fresh
+        self.write(slots, frames)
+        self.references[slots] = references
+        self.numbers_of[slots] = np.arange(self.stored + 1, self.stored + count + 1)
+        self.stored += count
         return slots
+
+    def reserve(self, fresh: int) -> None:
+        """Make room for so many slots more than have ever been used."""
+        if self.used + fresh > len(self.references):
+            self._grow(self.used + fresh)
+
+    def write(self, slots: Slots, frames: Array) -> None:
+        """Copy frames [n, *frame_shape] to slots."""
+        self._rows.view[slots] = self._items(frames)
 
     def numbers(self, slots: Slots) -> NDArray[np.int64]:
         """The numbers, from 1, of the frames in `slots`, int64 [n]: each frame that is stored gets the next one."""
-        return self._numbers[slots]
+        return self.numbers_of[slots]
 
     def hold(self, slots: Slots, references: NDArray[np.intp] | int = 1) -> None:
         """Add references to distinct slots that are already held."""
-        self._references[slots] += references
+        self.references[slots] += references
 
     def drop(self, slots: Slots) -> None:
         """Remove one reference for each occurrence of a slot; slots without references become free."""
-        np.subtract.at(self._references, slots, np.int32(1))  # a Python 1 would be an int64, and take six times as long
-        gone = slots[self._references[slots] == 0]
+        np.subtract.at(self.references, slots, np.int32(1))  # a Python 1 would be an int64, and take six times as long
+        gone = slots[self.references[slots] == 0]
         if len(gone):
             if len(gone) > 1:
                 gone, _ = self._distinct(gone)
-            self._free[self._free_count : self._free_count + len(gone)] = gone
-            self._free_count += len(gone)
+            self.free[self.free_count : self.free_count + len(gone)] = gone
+            self.free_count += len(gone)
 
     def unique(self, slots: Slots) -> tuple[Slots, NDArray[np.int32]]:
         """The distinct slots among `slots`, and the index of each slot among them, in the shape of `slots`.
@@ -140,11 +144,11 @@ class FrameStore:
         return np.ascontiguousarray(frames).reshape(-1).view(self._rows.dtype)
 
     def _grow(self, needed: int) -> None:
-        slots = max(needed, int(len(self._references) * GROWTH))
-        for name in ("_references", "_free", "_mark", "_numbers"):
+        slots = max(needed, int(len(self.references) * GROWTH))
+        for name in ("references", "free", "_mark", "numbers_of"):
             array = getattr(self, name)
             larger = np.zeros(slots, array.dtype)  # zeros are committed only when written
-            larger[: self._used] = array[: self._used]
+            larger[: self.used] = array[: self.used]
             setattr(self, name, larger)
         self._rows.grow(slots)
 

@@ -12,6 +12,7 @@ from coop.common.transitions import Segment
 from coop.replay.table.frames import FrameStore, Slots, as_slice
 
 MAX_STREAMS = 4096
+_NONE = np.empty(0, np.intp)
 PRELOADED = bounds.MAX_STREAMS - 1  # the stream of the transitions that a table begins with; no emulator's
 
 
@@ -37,23 +38,33 @@ class StreamTails:
         references = np.bincount(index.reshape(-1), minlength=count)
         slots = np.empty(count, np.intp)
         slots.fill(-1)
-        stream = (segment.incarnation, segment.stream)
-        sequence, previous = self._tails.pop(stream, (-1, slots[:0]))
-        shared = min(segment.carried, len(previous)) if sequence == segment.sequence - 1 else 0
+        previous, shared = self.take(segment)
         slots[segment.carried - shared : segment.carried] = previous[len(previous) - shared :]
         known = slots >= 0
         wanted = references > 0
-        tail = max(0, count - max(self._stack, segment.carried))
+        tail = self.begin(segment)
         wanted[tail:] |= known[tail:]
         references[tail:] += wanted[tail:]
         again = (wanted & known).nonzero()[0]
         self._frames.hold(slots[again], references[again])
         new = (wanted > known).nonzero()[0]
         slots[new] = self._frames.add(segment.frames[as_slice(new)], references[new])
-        self._tails[stream] = segment.sequence, slots[tail:].copy()
-        if len(self._tails) > MAX_STREAMS:
-            previous = np.concatenate((previous, self._tails.popitem(last=False)[1][1]))
-        return slots, previous[previous >= 0]
+        dropped = np.concatenate((previous, self.keep(segment, slots[tail:])))
+        return slots, dropped[dropped >= 0]
+
+    def take(self, segment: Segment) -> tuple[Slots, int]:
+        """Remove the tail of a segment's stream; returns its slots, and how many of the last the segment repeats."""
+        sequence, previous = self._tails.pop((segment.incarnation, segment.stream), (-1, _NONE))
+        return previous, min(segment.carried, len(previous)) if sequence == segment.sequence - 1 else 0
+
+    def begin(self, segment: Segment) -> int:
+        """The first of a segment's frames that its stream is to keep."""
+        return max(0, len(segment.frames) - max(self._stack, segment.carried))
+
+    def keep(self, segment: Segment, slots: Slots) -> Slots:
+        """Keep the slots of a segment's last frames; returns those of a stream that is forgotten for them."""
+        self._tails[segment.incarnation, segment.stream] = segment.sequence, slots.copy()
+        return _NONE if len(self._tails) <= MAX_STREAMS else self._tails.popitem(last=False)[1][1]
 
     def slots(self) -> Slots:
         """The slots of all tails, stream by stream."""

@@ -19,10 +19,10 @@ from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFram
 from coop.replay.table.numbering import EPISODES, EpisodeNumbers
 from coop.replay.table.own_policies import OwnEviction, make_policies
 from coop.replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, Incoming, TableView
+from coop.replay.table.put import REUSE_BUCKETS, Placed, Put, compiled_put, put
 from coop.replay.table.streams import StreamTails
 
-REUSE_BUCKETS = 16
-_BUCKETS = 2 ** np.arange(REUSE_BUCKETS - 1, dtype=np.int32)  # the fewest draws of each bucket but the first
+WORTH_COMPILING = 20_000  # segments inserted: loading compiled loops takes as long as they save in 15,000
 
 
 class PinnedBatch(NamedTuple):
@@ -102,7 +102,8 @@ class Table:
         self._columns = seen = Columns(capacity, spec, prioritized=self._prioritized)
         self._max_priority = 1.0
         self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
-        self._held = 0
+        self._held = self._inserts = 0
+        self._compiled: Put | None = None
         self._episodes = EpisodeNumbers(capacity) if evicts.episodes or draws.episodes else None
         named = (seen.named[name] for name in ("rewards", "terminated", "actions"))
         numbers = np.empty(0, np.int64) if self._episodes is None else self._episodes.of_rows
@@ -176,20 +177,18 @@ class Table:
             rows, kept = self._admitted(segment)
         else:
             rows, kept = self._eviction.place(first, segment.steps)
-        index = np.concatenate((segment.obs_index[kept], segment.next_index[kept]), axis=1)
-        slots, dropped = self._tails.store(segment, index)
-        replaced = rows[rows < size]
-        self._reuse_evicted += _reuse_histogram(self._columns.reuse[replaced])
+        placed = Placed(segment, rows, kept, first, size)
+        self._inserts += 1
+        if self._inserts == WORTH_COMPILING:
+            self._compiled = compiled_put()
+        place = self._compiled or put
+        replaced = () if self._row_of is None else self._columns.ids[rows[rows < size]].tolist()
+        self._held += place(self._frames, self._tails, self._columns, self._reuse_evicted, placed)
         self._reuse_evicted[0] += segment.steps - len(rows)
-        old = self._columns.slots.take(replaced, axis=0).ravel()
-        if self._row_of is not None:
-            for number in self._columns.ids[replaced].tolist():
-                del self._row_of[number]
-        self._columns.write(rows, segment, kept, first, slots[index])
-        self._frames.drop(np.concatenate((old, dropped)))
         self.inserted += segment.steps
-        self._held = size + len(rows) - len(replaced)
         if self._row_of is not None:
+            for number in replaced:
+                del self._row_of[number]
             self._row_of.update(zip(self._columns.ids[rows].tolist(), rows.tolist(), strict=True))
         if self._prioritized:
             self._set_priorities(rows, np.full(len(rows), self._max_priority))
@@ -362,8 +361,3 @@ def _read_only(array: Array) -> Array:
     view = array.view()
     view.flags.writeable = False
     return view
-
-
-def _reuse_histogram(reuse: NDArray[np.int32]) -> NDArray[np.intp]:
-    """Transitions by the bit length of their draws: int [REUSE_BUCKETS], the last entry open-ended."""
-    return np.bincount(_BUCKETS.searchsorted(reuse, "right"), minlength=REUSE_BUCKETS)
