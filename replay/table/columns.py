@@ -22,7 +22,7 @@ class Columns:
     def __init__(self, capacity: int, spec: EnvSpec, *, prioritized: bool) -> None:
         self.slots = np.zeros((capacity, 2 * spec.stack), np.int32)
         fields = columns_of(KEPT, spec)
-        self._written = [name for name in columns_of(IN_SEGMENT, spec) if name in fields and name != "terminated"]
+        self._written = [name for name in columns_of(IN_SEGMENT, spec) if name in fields]
         self._read = [name for name in columns_of(IN_BATCH, spec) if name in fields]
         self.named: dict[str, Array] = {
             name: np.zeros((capacity, *field.row_shape(spec)), field.dtype) for name, field in fields.items()
@@ -40,14 +40,13 @@ class Columns:
         """Put transitions `kept` of a segment, whose first one has the number `first`, into `rows`, never drawn yet."""
         self.terminal -= int(np.count_nonzero(self._terminated[rows]))
         self.slots[rows] = slots
-        self.write_others(rows, segment, kept)
-        self._terminated[rows] = segment.terminated[kept]
+        self.write_given(rows, segment, kept)
         self.terminal += int(np.count_nonzero(segment.terminated[kept]))
         self.ids[rows] = np.arange(first, first + segment.steps)[kept]
         self.reuse[rows] = 0
 
-    def write_others(self, rows: slice | Slots, segment: Segment, kept: slice | Slots) -> None:
-        """Write what only the environment and the actor decide: all but slots, ids, reuse and `terminated`."""
+    def write_given(self, rows: slice | Slots, segment: Segment, kept: slice | Slots) -> None:
+        """Write what a segment brings: all but slots, ids and reuse."""
         for name in self._written:
             self.named[name][rows] = getattr(segment, name)[kept]
 

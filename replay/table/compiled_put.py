@@ -36,7 +36,7 @@ def put(
         columns.slots, columns.ids, columns.reuse, columns.named["terminated"], columns.terminal, reuse_evicted,
         frames.references, frames.free, frames.free_count,
     )  # fmt: skip
-    columns.write_others(as_slice(rows) if in_order else rows, segment, kept)
+    columns.write_given(as_slice(rows) if in_order else rows, segment, kept)
     forgotten = tails.keep(segment, slots[tail:])
     if len(forgotten):
         frames.drop(forgotten[forgotten >= 0])
@@ -140,7 +140,6 @@ def _write(
             held[row, j] = slots[obs_index[position, j]]
             held[row, stack + j] = slots[next_index[position, j]]
         terminal += int(ends[position])
-        terminated[row] = ends[position]
         ids[row] = first + position
         reuse[row] = 0
     for slot in previous:
