@@ -7,7 +7,7 @@ numpy's for these sizes; everything else costs less to call in numpy.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -66,6 +66,8 @@ class ConvolutionNetwork(Dense):
     """The forward pass of such a network, over the parameters in place.
 
     The convolution's weight is [out, channels * height * width].
+
+    kernel: of the convolution, height and width.
     """
 
     def __init__(self, module: nn.Module) -> None:
@@ -73,7 +75,7 @@ class ConvolutionNetwork(Dense):
         super().__init__(module)
         convolution = next(module.children())
         assert isinstance(convolution, nn.Conv2d)
-        self._kernel, self._stride = convolution.kernel_size, convolution.stride
+        self.kernel, self._stride = convolution.kernel_size, convolution.stride
         self._geometry = lru_cache(maxsize=16)(self._geometry_of)
 
     @staticmethod
@@ -139,9 +141,13 @@ class ConvolutionNetwork(Dense):
     def _geometry_of(self, shape: tuple[int, ...], strides: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The shape [channels, *kernel, *places, batch] of the view of all windows of pictures, and its strides."""
         (channels, *sides, batch), (plane, row, column, sample) = shape, strides
-        (down, right), steps = self._stride, zip(sides, self._kernel, self._stride, strict=True)
-        places = [(side - kernel) // stride + 1 for side, kernel, stride in steps]
+        down, right = self._stride
         return (
-            (channels, *self._kernel, *places, batch),
+            (channels, *self.kernel, *self.places(sides), batch),
             (plane, row, column, row * down, column * right, sample),
         )
+
+    def places(self, sides: Sequence[int]) -> tuple[int, ...]:
+        """Of the kernel in a picture of this height and width, down and across."""
+        steps = zip(sides, self.kernel, self._stride, strict=True)
+        return tuple((side - kernel) // stride + 1 for side, kernel, stride in steps)
