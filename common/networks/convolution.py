@@ -7,8 +7,8 @@ numpy's for these sizes; everything else costs less to call in numpy.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -57,9 +57,18 @@ def product(a: Array, b: Array, out: Array | None = None) -> Array:
     """The matrix product of a [m, k] and b [k, n], in `out` [m, n] if that is given."""
     if a.size * b.shape[1] < _SMALL:
         return np.dot(a, b, out)
-    place = None if out is None else torch.from_numpy(out)
-    result: Array = torch.mm(torch.from_numpy(a), torch.from_numpy(b), out=place).numpy()
+    if out is not None:
+        bound_product(a, b, out)()
+        return out
+    result: Array = torch.mm(torch.from_numpy(a), torch.from_numpy(b)).numpy()
     return result
+
+
+def bound_product(a: Array, b: Array, out: Array) -> Callable[[], object]:
+    """What computes `product` of arrays that stay where they are, as often as it is called."""
+    if a.size * b.shape[1] < _SMALL:
+        return partial(np.dot, a, b, out)
+    return partial(torch.mm, torch.from_numpy(a), torch.from_numpy(b), out=torch.from_numpy(out))
 
 
 class ConvolutionNetwork(Dense):

@@ -5,12 +5,13 @@ Networks and optimizers are those of the runs' agents, in place. Pictures come a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coop.common.networks.convolution import ConvolutionNetwork, product
+from coop.common.networks.convolution import ConvolutionNetwork, bound_product
 from coop.common.types import Array
 from coop.learner.agent import Agent
 from coop.learner.edl.backprop import Tape
@@ -21,6 +22,9 @@ from coop.learner.edl.polar import LIMITS
 from coop.lockstep.compiled import loops, picture_loops
 from coop.lockstep.compiled.passes import Doubles, Floats, loss_of
 from coop.lockstep.compiled.tables import Batches, Packing
+
+_Shared = dict[int, tuple[Floats, list[Floats]]]
+"""Arrays that both networks of a run write to, by the number of pictures; see `_hidden_arrays`."""
 
 
 class PictureNetworks:
@@ -33,7 +37,10 @@ class PictureNetworks:
         self._size, self._double, self._loss = config.learner.batch_size, config.learner.double, loss_of(config.learner)
         self.batches = Batches.room(Packing(spec), 1, self._size)
         self._error = np.zeros((1, spec.num_actions, self._size), np.float32)
-        self._passes = [[_Passes(agent, role) for role in (0, 1)] for agent in agents]
+        self._passes = []
+        for agent in agents:
+            shared: _Shared = {}
+            self._passes.append([_Passes(agent, role, shared) for role in (0, 1)])
 
     def finite(self, role: int) -> NDArray[np.bool_]:
         """Whether network `role` of each run is finite, bool [K]."""
@@ -58,7 +65,7 @@ class PictureNetworks:
             values, next_values, preferred, given.taken, given.rewards, given.discounts, *self._loss, errors,
             self._error,
         )  # fmt: skip
-        online.backward(tape.head(size), self._error[0].T, float(s[0]))
+        online.backward(tape.head(size) if self._double else tape, self._error[0].T, float(s[0]))
         self._agents[k].optimizers[role].step(rate)
         return bool(finite)
 
@@ -81,10 +88,30 @@ class PictureNetworks:
         return PictureNetworks([self._agents[k] for k in runs])
 
 
+@dataclass
+class _Room:
+    """Arrays of a forward pass of so many pictures, and the products that fill them.
+
+    windows: see `picture_loops.windows`. columns: [1, units, batch] of each layer. tape: views of them.
+    """
+
+    windows: Floats
+    columns: list[Floats]
+    products: list[Callable[[], object]]
+    tape: Tape[Array]
+
+
+def _hidden_arrays(form: ConvolutionNetwork, places: tuple[int, ...], count: int) -> tuple[Floats, list[Floats]]:
+    """What the kernel sees of so many pictures, and the outputs of the hidden layers, [units, count]."""
+    down, across = places
+    windows = np.ones((form.weights[0].shape[1] + 1, down, across * count), np.float32)
+    return windows, [np.empty((weight.shape[1], count), np.float32) for weight in form.weights[1:]]
+
+
 class _Passes(ConvolutionBackprop):
     """The passes of one network, whose pictures are rows of bits, uint8 [batch, width]."""
 
-    def __init__(self, agent: Agent, role: int) -> None:
+    def __init__(self, agent: Agent, role: int, shared: _Shared) -> None:
         network, config, spec = agent.networks[role], agent.config, agent.spec
         form = network.in_numpy
         assert isinstance(form, ConvolutionNetwork)
@@ -93,27 +120,44 @@ class _Passes(ConvolutionBackprop):
         self._rule = FeedbackRule(self, config.feedback)
         self._gradients = agent._networks[role]._trained.gradients
         self._geometry = np.array((*spec.frame_shape, *form.kernel))
-        self._shape = form.weights[0].shape[1] + 1, *form.places(spec.frame_shape[:2])
-        self._no_bias = np.zeros((1, form.weights[1].shape[1]), np.float32)
-        self._windows: dict[int, Floats] = {}
+        self._places = form.places(spec.frame_shape[:2])
+        self._kernel = np.empty((form.weights[0].shape[0], form.weights[0].shape[1] + 1), np.float32)
+        units = [weight.shape[1] for weight in form.weights[1:]]
+        self._biases = [np.zeros((1, units[0]), np.float32), *(bias.T for bias in form.biases[1:])]
+        self._shared, self._rooms = shared, dict[int, _Room]()
+
+    def _room(self, count: int) -> _Room:
+        """For so many pictures; both networks of a run write to the same arrays, except for their values."""
+        if count not in self._shared:
+            self._shared[count] = _hidden_arrays(self._form, self._places, count)
+        windows, hidden = self._shared[count]
+        columns = [*hidden, np.empty((len(self._form.weights[-1]), count), np.float32)]
+        seen = windows.reshape(len(windows), -1)
+        inputs, first = [seen, *hidden], columns[0].reshape(len(self._kernel), -1)
+        products = [
+            bound_product(weight, x, out)
+            for weight, x, out in zip(
+                (self._kernel, *self._form.weights[1:]), inputs, (first, *columns[1:]), strict=True
+            )
+        ]
+        tape = Tape(columns[-1].T, [windows.reshape(len(windows), -1, count).T, *(column.T for column in hidden)])
+        return _Room(windows, [column[None] for column in columns], products, tape)
 
     def forward(self, x: Array) -> Tape[Array]:
-        """As `ConvolutionBackprop.forward`; what the kernel sees stays until the next call with as many pictures."""
-        count, (entries, down, across), form = len(x), self._shape, self._form
-        if count not in self._windows:
-            self._windows[count] = np.ones((entries, down, across * count), np.float32)
-        windows = self._windows[count]
-        picture_loops.windows(x, self._geometry, windows)
-        kernel = np.concatenate((form.weights[0], form.biases[0]), axis=1)
-        column = product(kernel, windows.reshape(entries, -1)).reshape(-1, count)
-        loops.rectify(column[None], self._no_bias)
-        inputs = [windows.reshape(entries, -1, count).T, column.T]
-        for weight, bias in zip(form.weights[1:], form.biases[1:], strict=True):
-            column = product(weight, column)
-            last = weight is form.weights[-1]
-            (loops.shift if last else loops.rectify)(column[None], bias.T)
-            inputs.append(column.T)
-        return Tape(inputs.pop(), inputs)
+        """As `ConvolutionBackprop.forward`; the next call with as many pictures, of either network, overwrites it.
+
+        The values stay until the next call of this one.
+        """
+        count, form = len(x), self._form
+        if count not in self._rooms:
+            self._rooms[count] = self._room(count)
+        room = self._rooms[count]
+        picture_loops.windows(x, self._geometry, room.windows)
+        self._kernel[:, :-1], self._kernel[:, -1:] = form.weights[0], form.biases[0]
+        for work, column, bias in zip(room.products, room.columns, self._biases, strict=True):
+            work()
+            (loops.shift if bias is self._biases[-1] else loops.rectify)(column, bias)
+        return room.tape
 
     def backward(self, tape: Tape[Array], error: Array, s: float) -> None:
         """Write the gradient, as `QNetwork.backward`."""
