@@ -7,8 +7,8 @@ numpy's for these sizes; everything else costs less to call in numpy.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -57,15 +57,26 @@ def product(a: Array, b: Array, out: Array | None = None) -> Array:
     """The matrix product of a [m, k] and b [k, n], in `out` [m, n] if that is given."""
     if a.size * b.shape[1] < _SMALL:
         return np.dot(a, b, out)
-    place = None if out is None else torch.from_numpy(out)
-    result: Array = torch.mm(torch.from_numpy(a), torch.from_numpy(b), out=place).numpy()
+    if out is not None:
+        bound_product(a, b, out)()
+        return out
+    result: Array = torch.mm(torch.from_numpy(a), torch.from_numpy(b)).numpy()
     return result
+
+
+def bound_product(a: Array, b: Array, out: Array) -> Callable[[], object]:
+    """What computes `product` of arrays that stay where they are, as often as it is called."""
+    if a.size * b.shape[1] < _SMALL:
+        return partial(np.dot, a, b, out)
+    return partial(torch.mm, torch.from_numpy(a), torch.from_numpy(b), out=torch.from_numpy(out))
 
 
 class ConvolutionNetwork(Dense):
     """The forward pass of such a network, over the parameters in place.
 
     The convolution's weight is [out, channels * height * width].
+
+    kernel: of the convolution, height and width.
     """
 
     def __init__(self, module: nn.Module) -> None:
@@ -73,7 +84,7 @@ class ConvolutionNetwork(Dense):
         super().__init__(module)
         convolution = next(module.children())
         assert isinstance(convolution, nn.Conv2d)
-        self._kernel, self._stride = convolution.kernel_size, convolution.stride
+        self.kernel, self._stride = convolution.kernel_size, convolution.stride
         self._geometry = lru_cache(maxsize=16)(self._geometry_of)
 
     @staticmethod
@@ -139,9 +150,13 @@ class ConvolutionNetwork(Dense):
     def _geometry_of(self, shape: tuple[int, ...], strides: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The shape [channels, *kernel, *places, batch] of the view of all windows of pictures, and its strides."""
         (channels, *sides, batch), (plane, row, column, sample) = shape, strides
-        (down, right), steps = self._stride, zip(sides, self._kernel, self._stride, strict=True)
-        places = [(side - kernel) // stride + 1 for side, kernel, stride in steps]
+        down, right = self._stride
         return (
-            (channels, *self._kernel, *places, batch),
+            (channels, *self.kernel, *self.places(sides), batch),
             (plane, row, column, row * down, column * right, sample),
         )
+
+    def places(self, sides: Sequence[int]) -> tuple[int, ...]:
+        """Of the kernel in a picture of this height and width, down and across."""
+        steps = zip(sides, self.kernel, self._stride, strict=True)
+        return tuple((side - kernel) // stride + 1 for side, kernel, stride in steps)

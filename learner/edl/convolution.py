@@ -28,13 +28,29 @@ class ConvolutionBackprop(NumpyBackprop):
                 return
             weight, h = self._network.weights[index], tape.inputs[index]
             if rows.shape[1] == 1:
-                column = product(weight.T, rows[:, 0].T)
-                rows = (column * (h.T > 0)).T[:, None]
+                rows = self._muted(np.dot(weight.T, rows[:, 0].T), h.T).T[:, None]
             else:  # samples one after another, as Gram matrices read them
                 b, k, n = rows.shape
-                rows = product(rows.swapaxes(0, 1).reshape(k * b, n), weight).reshape(k, b, -1)
-                mask = np.ascontiguousarray(h > 0).astype(h.dtype)
-                rows = (np.multiply(rows, mask, out=rows) if b == len(mask) else rows * mask).swapaxes(0, 1)
+                rows = self._muted_rows(product(rows.swapaxes(0, 1).reshape(k * b, n), weight).reshape(k, b, -1), h)
+                rows = rows.swapaxes(0, 1)
+
+    @staticmethod
+    def _muted(column: Array, h: Array) -> Array:
+        """Column * (h > 0), [n, batch] each; may overwrite `column`."""
+        muted: Array = column * (h > 0)
+        return muted
+
+    @staticmethod
+    def _muted_rows(rows: Array, h: Array) -> Array:
+        """Rows [k, batch or 1, n] * (h > 0), h [batch, n], with the batch last in memory; may overwrite `rows`."""
+        mask = np.ascontiguousarray(h > 0).astype(h.dtype)
+        muted: Array = np.multiply(rows, mask, out=rows) if rows.shape[1] == len(mask) else rows * mask
+        return muted
+
+    @staticmethod
+    def _turned(delta: Array) -> Array:
+        """Cotangents [batch, n] with the batch last in memory: [n, batch], contiguous."""
+        return np.ascontiguousarray(delta.T)
 
     def write_gradients(self, tape: Tape[Array], index: int, delta: Array, out: Mapping[str, Array]) -> None:
         """Write the gradients of layer `index`'s parameters, given delta [batch, n] at its pre-activation."""
@@ -45,7 +61,7 @@ class ConvolutionBackprop(NumpyBackprop):
             np.add.reduce(delta, 0, out=bias)
         else:
             inputs = h.shape[2]
-            gradient = product(h.T.reshape(inputs, -1), delta.T.reshape(len(bias), -1).T)
+            gradient = product(h.T.reshape(inputs, -1), self._turned(delta).reshape(len(bias), -1).T)
             weight.reshape(len(bias), -1)[...] = gradient[:-1].T
             bias[...] = gradient[-1]
 

@@ -9,6 +9,7 @@ import numpy as np
 from coop.common.networks.convolution import Dense
 from coop.common.types import Array
 from coop.learner.edl.backprop import Backprop, Tape
+from coop.learner.edl.polar import whitened
 
 
 class NumpyBackprop(Backprop[Array]):
@@ -59,3 +60,8 @@ class NumpyBackprop(Backprop[Array]):
         """Sums w_1 t_1 + ... + w_A t_A of each sample: [batch, A], [batch, A, n] -> [batch, n]."""
         sums: Array = np.matmul(weights[:, None], t)[:, 0]
         return sums
+
+    @staticmethod
+    def whitened(grams: Array, e: Array) -> tuple[Array, Array | None]:
+        """See `coop.learner.edl.polar.whitened`."""
+        return whitened(grams, e)

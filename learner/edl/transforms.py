@@ -13,7 +13,7 @@ from torch import Tensor
 from coop.learner.edl.arrays import ArrayT, at_least_float32, convert_like, in_dtype, widened
 from coop.learner.edl.backprop import Backprop, Tape
 from coop.learner.edl.completed import Jacobians
-from coop.learner.edl.polar import polar_by_svd, whitened
+from coop.learner.edl.polar import polar_by_svd
 
 SUM_AND_DIFFERENCE = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64) * 0.5**0.5
 
@@ -75,7 +75,7 @@ class Transforms(Generic[ArrayT]):
             return
         backprop: Any = self._backprop
         grams: Any = np.concatenate([backprop.gram(t) for t in self._ts])
-        white, doubtful = whitened(grams.reshape(-1, self._batch, self._actions, self._actions), e)
+        white, doubtful = backprop.whitened(grams.reshape(-1, self._batch, self._actions, self._actions), e)
         # (weights of T)
         weights = e + s * white
         for i, (index, _) in enumerate(self._layers):

@@ -47,7 +47,7 @@ with tempfile.TemporaryDirectory() as folder:
         play = group.block
 
         def done() -> int:
-            return group.seeds.step
+            return group.step
 
     while done() < START + 100:
         play()

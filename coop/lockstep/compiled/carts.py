@@ -38,7 +38,7 @@ class Carts:
     """
 
     def __init__(
-        self, carts: Sequence[CartPoleEnv], lengths: Sequence[int], limit: int, limit_terminal: bool = False
+        self, carts: Sequence[CartPoleEnv], lengths: NDArray[np.int64], limit: int, limit_terminal: bool = False
     ) -> None:
         """Go on from where the carts are.
 
@@ -47,8 +47,13 @@ class Carts:
         self._carts, self._limit, self._limit_terminal = list(carts), limit, limit_terminal
         self.state = np.array([cart.state for cart in carts], np.float64)
         self.obs = self.state.astype(np.float32)
-        self.lengths = np.array(lengths, np.int64)
+        self.lengths = lengths
         self._physics = np.array([float(getattr(carts[0], name)) for name in _PHYSICS])
+
+    @property
+    def returns(self) -> NDArray[np.float64]:
+        """Of the present episodes, float64 [K]."""
+        return self.lengths.astype(np.float64)
 
     def push(
         self,
@@ -56,12 +61,18 @@ class Carts:
         chosen: NDArray[np.int64],
         actions: NDArray[np.int64],
         obs: NDArray[np.float32],
+        rewards: NDArray[np.float32],
+        raw_rewards: NDArray[np.float64],
         terminal: NDArray[np.bool_],
         over: NDArray[np.bool_],
     ) -> bool:
-        """Play a step of each run; the arguments are those of `loops.push`. Returns whether an episode is over."""
+        """Play a step of each run; the arguments are those of `loops.push`. Returns whether an episode is over.
+
+        rewards, raw_rewards: [K], written.
+        """
         theta = self.state[:, 2]
         self.obs = obs
+        rewards[:] = raw_rewards[:] = 1
         return loops.push(
             self.state, np.cos(theta), np.sin(theta), values, chosen, self._physics, self._limit, self._limit_terminal,
             self.lengths, actions, obs, terminal, over,
@@ -77,6 +88,6 @@ class Carts:
     def kept(self, runs: NDArray[np.intp]) -> Carts:
         """The carts of these runs alone."""
         carts = [self._carts[k] for k in runs]
-        found = Carts(carts, self.lengths[runs].tolist(), self._limit, self._limit_terminal)
+        found = Carts(carts, self.lengths[runs], self._limit, self._limit_terminal)
         found.state, found.obs = self.state[runs], self.obs[runs]
         return found

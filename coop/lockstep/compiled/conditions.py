@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
+from coop.common.errors import UsageError
 from coop.common.settings.config import RunConfig
 from coop.common.settings.environment import EnvSettings
 
-CARTPOLE = "gymnasium.envs.classic_control.cartpole:CartPoleEnv"
+CARTPOLE, MINATAR = "gymnasium.envs.classic_control.cartpole:CartPoleEnv", "minatar.gym:BaseEnv"
 METHODS = ("dqn", "edql", "g-coop", "coop")
 
 
@@ -15,14 +16,19 @@ def why_not(config: RunConfig) -> str:
     """Why compiled loops can't play runs of this config; empty if they can."""
     if find_spec("numba") is None:
         return "numba is not installed: pip install 'coop-rl[fast]'"
-    learner, replay, env = config.learner, config.replay, config.env
+    learner, replay, env, network = config.learner, config.replay, config.env, config.network
     plain = EnvSettings(env.id, max_episode_steps=env.max_episode_steps, time_limit_terminal=env.time_limit_terminal)
+    pictures = env.id.startswith("MinAtar/")
+    played = env.stack == 1 if pictures else env.id in ("CartPole-v0", "CartPole-v1") and env == plain
+    kinds = (network.kind == "minatar", "minatar") if pictures else (
+        network.kind == "mlp" and bool(network.hidden), "mlp with hidden layers"
+    )  # fmt: skip
     wanted = (
-        ("env", env.id in ("CartPole-v0", "CartPole-v1") and env == plain, "CartPole without further settings"),
+        ("env", played, "CartPole without further settings, and MinAtar without stacks"),
         ("method", config.method in METHODS, ", ".join(METHODS)),
         ("edl.feedback", config.feedback in ("none", "transform"), "transform"),
-        ("network.kind", config.network.kind == "mlp" and bool(config.network.hidden), "mlp with hidden layers"),
-        ("network.dtype", config.network.dtype == "float32", "float32"),
+        ("network.kind", *kinds),
+        ("network.dtype", network.dtype == "float32", "float32"),
         ("replay.sampling", replay.sampling == "uniform" and replay.replacement, "uniform, with replacement"),
         ("replay.eviction", replay.eviction in ("fifo", "reservoir"), "fifo, reservoir"),
         ("replay.ratio", replay.ratio <= 1, "at most 1"), ("replay.n_step", replay.n_step == 1, "1"),
@@ -38,8 +44,11 @@ def why_not(config: RunConfig) -> str:
     )  # fmt: skip
     if refused := next((f"{name}: only {allowed}" for name, fits, allowed in wanted if not fits), ""):
         return refused
-    import gymnasium  # noqa: PLC0415 (takes a while, and most who ask have their answer)
+    from coop.common.envs.registry import find_registered  # noqa: PLC0415 (takes a while, and most have their answer)
 
-    spec = gymnasium.spec(env.id)
-    own = spec.entry_point != CARTPOLE or spec.kwargs or spec.additional_wrappers
-    return f"env: {env.id} is registered as something else" if own else ""
+    try:
+        spec = find_registered(env)
+    except UsageError as error:
+        return str(error)
+    own = spec.entry_point != MINATAR if pictures else spec.entry_point != CARTPOLE or spec.kwargs
+    return f"env: {env.id} is registered as something else" if own or spec.additional_wrappers else ""

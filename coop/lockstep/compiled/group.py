@@ -54,60 +54,71 @@ def _align(run: Lockstep, directory: RunDirectory) -> None:
 class Group:
     """Runs that are equally far, at the end of a segment.
 
-    seeds: plays them. summaries: of the runs that are over. failed: what could not be completed.
+    summaries: of the runs that are over. failed: what could not be completed.
     """
 
     def __init__(
         self, runs: Sequence[Lockstep], files: Mapping[Lockstep, RunDirectory], player: int | None = None
     ) -> None:
-        self._files = files
-        self.seeds = Seeds(runs, player)
+        self._files, self._config = files, runs[0].config
+        # Networks of pictures fill a processor's cache: each run plays a block before the next one.
+        parts = [runs] if self._config.network.kind == "mlp" else [[run] for run in runs]
+        self._parts = [Seeds(part, player) for part in parts]
         self._looked = 0.0
         self.summaries: list[Summary] = []
         self.failed: list[str] = []
 
+    @property
+    def step(self) -> int:
+        """Environment steps done, of each."""
+        return max(seeds.step for seeds in self._parts)
+
+    def _running(self) -> list[tuple[Seeds, int, Lockstep]]:
+        """The runs that go on, each with its place."""
+        return [(seeds, k, run) for seeds in self._parts for k, run in enumerate(seeds.runs)]
+
     def play(self, stop: Stop, progress: Callable[[str], None]) -> None:
         """Play to the end."""
-        seeds, due = self.seeds, time.monotonic() + PROGRESS_EVERY
-        total = seeds.config.total_steps
+        due, total = time.monotonic() + PROGRESS_EVERY, self._config.total_steps
         try:
-            while seeds.runs and seeds.step < total and not stop.is_set():
+            while self._running() and self.step < total and not stop.is_set():
                 self.block()
-                if seeds.runs and time.monotonic() >= due:
+                if self._running() and time.monotonic() >= due:
                     due = time.monotonic() + PROGRESS_EVERY
                     progress(self._progress())
         except BaseException as error:  # what a block has not told yet is in no file: the newest checkpoint stays
             outcome = "interrupted"
             if isinstance(error, Exception | SystemExit):
                 outcome = f"failed: {error if isinstance(error, CoopError) else first_line(error)}"
-            for run in seeds.runs:
+            for _, _, run in self._running():
                 self._conclude(run, outcome)
             raise
-        for k, run in enumerate(seeds.runs):
+        for seeds, k, run in self._running():
             seeds.save_into(k)
             self._end(run, stop.reason if seeds.step < total else run.trainer.outcome())
 
     def _progress(self) -> str:
-        seeds = self.seeds
-        if len(seeds.runs) == 1:
-            seeds.save_counters(0)
-            return seeds.runs[0].progress()
-        return f"step {seeds.step:,}/{seeds.config.total_steps:,} of {len(seeds.runs)} runs"
+        running = self._running()
+        if len(running) == 1:
+            seeds, k, run = running[0]
+            seeds.save_counters(k)
+            return run.progress()
+        return f"step {self.step:,}/{self._config.total_steps:,} of {len(running)} runs"
 
     def block(self) -> None:
         """Play a block of steps, write what it tells, and save what is due."""
-        seeds = self.seeds
-        for block in seeds.play(MOST):
-            directory = self._files[block.run]
-            directory.record(block.episodes, None)
-            for row in block.metrics:
-                directory.record((), row)
-            if block.run.trainer.diverged:
-                self._end(block.run, block.run.trainer.diverged)
+        for seeds in self._parts:
+            for block in seeds.play(MOST) if seeds.runs else ():
+                directory = self._files[block.run]
+                directory.record(block.episodes, None)
+                for row in block.metrics:
+                    directory.record((), row)
+                if block.run.trainer.diverged:
+                    self._end(block.run, block.run.trainer.diverged)
         look = time.monotonic() >= self._looked
         if look:
             self._looked = time.monotonic() + LOOK_EVERY
-        for k, run in enumerate(seeds.runs):
+        for seeds, k, run in self._running():
             if look and take_request(self._files[run].path):
                 run.trainer.ask_checkpoint()
             if run.trainer.checkpoint_due() and seeds.step < run.config.total_steps:

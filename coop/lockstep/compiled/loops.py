@@ -68,6 +68,7 @@ def gather(
     obs: Array,
     next_obs: Array,
     actions: Array,
+    rewards: Array,
     terminated: Array,
     versions: Array,
     ids: Array,
@@ -76,16 +77,18 @@ def gather(
     powers: Array,
     x: Array,
     taken: Array,
+    gained: Array,
     discounts: Array,
     seen: Array,
+    largest: Array,
     now: Array,
 ) -> None:
     """Read a batch of each table, and count the draws.
 
-    obs, next_obs: [n, capacity, 4], and the other columns [n, capacity]. rows: int64 [n, batch]. x: [n, 2 batch, 4],
-    written, obs before next_obs. taken: int64 [n, batch], and discounts [n, batch], powers of gamma, written.
-    seen: int64 [n, 5, batch], written: ids, ages, draws, weight lags, terminations. now: int64 [2], transitions and
-    updates.
+    obs, next_obs: [n, capacity, width], and the other columns [n, capacity]. rows: int64 [n, batch]. x: [n, 2 batch,
+    width], written, obs before next_obs. taken: int64 [n, batch], gained, the rewards, and discounts [n, batch], powers
+    of gamma, written. seen: int64 [n, 5, batch], written: ids, ages, draws, weight lags, terminations. largest: [n],
+    raised to the largest |reward|. now: int64 [2], transitions and updates.
     """
     for k in range(rows.shape[0]):
         size = rows.shape[1]
@@ -93,10 +96,12 @@ def gather(
             reuse[k, rows[k, b]] += 1
         for b in range(size):
             row = rows[k, b]
-            for j in range(4):
+            for j in range(x.shape[2]):
                 x[k, b, j] = obs[k, row, j]
                 x[k, size + b, j] = next_obs[k, row, j]
             taken[k, b] = actions[k, row]
+            gained[k, b] = rewards[k, row]
+            largest[k] = max(largest[k], np.abs(rewards[k, row]))
             discounts[k, b] = powers[1] * (np.float32(0) if terminated[k, row] else np.float32(1))
             seen[k, 0, b] = ids[k, row]
             seen[k, 1, b] = now[0] - 1 - ids[k, row]
@@ -111,6 +116,7 @@ def insert(
     new_obs: Array,
     new_next: Array,
     new_actions: Array,
+    new_rewards: Array,
     terminal: Array,
     version: int,
     number: int,
@@ -118,6 +124,7 @@ def insert(
     obs: Array,
     next_obs: Array,
     actions: Array,
+    rewards: Array,
     terminated: Array,
     versions: Array,
     ids: Array,
@@ -127,8 +134,8 @@ def insert(
 ) -> None:
     """Put a transition of each run into its row, int64 [K], -1 for none; the columns are as `gather` has them.
 
-    new_obs, new_next: [K, 4]. new_actions, terminal: [K]. version, number: of the transition. evicted: int64 [K,
-    buckets], evicted transitions by the bit length of their draws. held: int64 [K], terminal transitions held.
+    new_obs, new_next: [K, width]. new_actions, new_rewards, terminal: [K]. version, number: of the transition. evicted:
+    int64 [K, buckets], evicted transitions by the bit length of their draws. held: int64 [K], terminal transitions.
     """
     for k in range(rows.shape[0]):
         row = rows[k]
@@ -142,10 +149,11 @@ def insert(
                 bucket += 1
             evicted[k, bucket] += 1
         held[k] += int(terminal[k]) - int(terminated[k, row])
-        for j in range(4):
+        for j in range(new_obs.shape[1]):
             obs[k, row, j] = new_obs[k, j]
             next_obs[k, row, j] = new_next[k, j]
         actions[k, row] = new_actions[k]
+        rewards[k, row] = new_rewards[k]
         terminated[k, row] = terminal[k]
         versions[k, row] = version
         ids[k, row] = number
@@ -207,27 +215,31 @@ def temporal(
     next_values: Array,
     preferred: Array,
     taken: Array,
+    rewards: Array,
     discounts: Array,
     bound: np.float32,
     loss: int,
     errors: Array,
     out: Array,
 ) -> bool:
-    """The TD errors [n, batch], and the output error [n, 2, batch], both written; returns whether all are finite.
+    """The TD errors [n, batch], and the output error [n, actions, batch], both written; returns if all are finite.
 
-    values, next_values, preferred: [n, 2, batch]. bound: of the values, 0: none. loss: 0 squared, 1 mse, 2 huber.
+    values, next_values, preferred: [n, actions, batch]. bound: of the values, 0: none. loss: 0 squared, 1 mse, 2 huber.
     """
     one, zero = np.float32(1), np.float32(0)
     size, finite = taken.shape[1], True
     count = np.float32(size)
     for k in range(taken.shape[0]):
         for b in range(size):
-            first, second = preferred[k, 0, b], preferred[k, 1, b]
-            best = 1 if second > first or (np.isnan(second) and not np.isnan(first)) else 0  # as argmax
+            best = 0
+            for a in range(1, preferred.shape[1]):  # as argmax
+                most, other = preferred[k, best, b], preferred[k, a, b]
+                if other > most or (np.isnan(other) and not np.isnan(most)):
+                    best = a
             value = next_values[k, best, b]
             if bound > zero:
                 value = -bound if value < -bound else bound if value > bound else value
-            error = values[k, taken[k, b], b] - (one + discounts[k, b] * value)
+            error = values[k, taken[k, b], b] - (rewards[k, b] + discounts[k, b] * value)
             errors[k, b] = error
             finite &= np.abs(error) <= LARGEST
             slope = error
@@ -235,8 +247,8 @@ def temporal(
                 slope = np.float32(2) * error
             elif loss == 2:
                 slope = -one if error < -one else one if error > one else error
-            out[k, 0, b] = zero
-            out[k, 1, b] = zero
+            for a in range(out.shape[1]):
+                out[k, a, b] = zero
             out[k, taken[k, b], b] = slope / count
     return finite
 

@@ -6,18 +6,21 @@ all of them before the next one, so that what it reads stays in the processor's 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from coop.common.settings.config import RunConfig
+from coop.common.settings.config import LearnerSettings
+from coop.learner.agent import Agent
 from coop.learner.edl.arrays import convert_like
 from coop.learner.edl.polar import LIMITS, polar_by_svd
 from coop.learner.edl.transforms import SUM_AND_DIFFERENCE
 from coop.learner.optimizers import TINY, Adam, make_optimizer
 from coop.lockstep.compiled import loops
+from coop.lockstep.compiled.tables import Batches, Packing
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -27,6 +30,11 @@ Views = list[tuple[Floats, Floats]]
 BLOCK = 4  # runs that pass through an update together
 LOSSES = {"squared": 0, "mse": 1, "huber": 2}
 INPUTS, ACTIONS = 4, 2
+
+
+def loss_of(learner: LearnerSettings) -> tuple[np.float32, int]:
+    """The bound of values and the loss, as `loops.temporal` has them."""
+    return np.float32(learner.value_bound or 0), LOSSES[learner.loss]
 
 
 def size_of(hidden: tuple[int, ...]) -> int:
@@ -51,12 +59,15 @@ class Networks:
 
     Attributes:
         theta: float32 [2, K, P]. buffers: the optimizers' running means by name, float32 [trained, K, P].
-        steps: that each optimizer has taken. finite: bool [K], whether the network last trained is finite.
-        x, taken, discounts: a block's batch for `update`: float32 [BLOCK, 2 batch, 4], the observations and then the
-            next ones; actions, int64 [BLOCK, batch]; float32 [BLOCK, batch], 0 for a terminal next state.
+        steps: that each optimizer has taken.
+        block: runs that pass through an update together. batches: theirs, for `update`.
     """
 
-    def __init__(self, config: RunConfig, count: int) -> None:
+    block = BLOCK
+
+    def __init__(self, agents: Sequence[Agent]) -> None:
+        """Begin with the networks of these agents."""
+        self._agents, count, config = list(agents), len(agents), agents[0].config
         self.config = config
         hidden, trained = config.network.hidden, 2 if config.two_networks else 1
         size = size_of(hidden)
@@ -64,18 +75,26 @@ class Networks:
         self.steps = [0] * trained
         probe = make_optimizer(config.learner, self.theta[0, 0], self.theta[0, 0])
         self.buffers = {name: np.zeros((trained, count, size), np.float32) for name in probe.buffers}
-        self.finite = np.ones(count, np.bool_)
+        self._finite = np.ones(count, np.bool_)
         self._adam = isinstance(probe, Adam)
         self._gradient = np.zeros((BLOCK, size), np.float32)
         self._parts = views_of(self._gradient, hidden)
         self._views: dict[tuple[int, int, int], Views] = {}
         self._flats: dict[tuple[int, int, int], tuple[Floats, dict[str, Floats]]] = {}
+        self.batches = Batches.room(Packing(agents[0].spec), BLOCK, config.learner.batch_size)
         self._make_buffers()
         learner, f = config.learner, np.float32
-        self._bound, self._loss = f(learner.value_bound or 0), LOSSES[learner.loss]
+        self._loss = loss_of(learner)
         self._decays = f(learner.beta1), f(1 - learner.beta1), f(learner.beta2), f(1 - learner.beta2)
         self._limits = f(2 / LIMITS[4].inflation), f(LIMITS[4].square)
         self._basis = convert_like(SUM_AND_DIFFERENCE, self.theta)
+        for k, agent in enumerate(agents):
+            for number, network in enumerate(agent.networks):
+                self.theta[number, k] = network.flat.numpy()
+            for number, optimizer in enumerate(agent.optimizers):
+                self.steps[number] = optimizer.steps
+                for name, buffer in self.buffers.items():
+                    buffer[number, k] = optimizer.buffers[name]
 
     def _make_buffers(self) -> None:
         """What an update of a block writes between its steps."""
@@ -85,7 +104,6 @@ class Networks:
         def room(*shape: int) -> Floats:
             return np.zeros((BLOCK, *shape), np.float32)
 
-        self.x, self.taken, self.discounts = room(2 * batch, INPUTS), np.zeros((BLOCK, batch), np.int64), room(batch)
         self._columns = [room(units, 2 * batch if learner.double else batch) for units in (*hidden, ACTIONS)]
         self._next = [room(units, batch) for units in (*hidden, ACTIONS)]
         self._h = [room(batch, units) for units in hidden]
@@ -113,8 +131,8 @@ class Networks:
             self._flats[key] = self.theta[role, runs], means
         return self._flats[key]
 
-    def values(self, role: int, runs: slice, obs: Floats) -> Floats:
-        """Q of one observation of each run, float32 [n, 4] -> [n, 2]."""
+    def values(self, role: int, runs: slice, obs: Floats, chosen: NDArray[np.int64]) -> Floats:
+        """Q of one observation of each run, float32 [n, 4] -> [n, 2]; of all, whatever is chosen."""
         column = obs[:, :, None]
         layers = self._layers(role, runs)
         for number, (weight, bias) in enumerate(layers, 1):
@@ -132,17 +150,18 @@ class Networks:
     ) -> bool:
         """Train network `role` of a block of runs with the batches given, towards the other one's targets.
 
-        `x`, `taken` and `discounts` hold the batches. s: [n]. errors: the TD errors before the update, [n, batch],
-        written. Returns whether all are finite.
+        `batches` holds theirs. s: [n]. errors: the TD errors before the update, [n, batch], written. Returns whether
+        all are finite.
         """
         n, size = errors.shape
-        layers, x, double = self._layers(role, runs), self.x[:n], self.config.learner.double
+        given = self.batches.first(n)
+        layers, x, double = self._layers(role, runs), given.x, self.config.learner.double
         next_values = self._target(self._layers(1 - role, runs), x[:, size:])
         h = self._forward(layers, x if double else x[:, :size])
         values, error, gradient = self._columns[-1][:n], self._error[:n], self._gradient[:n]
         preferred = values[:, :, size:] if double else next_values
         finite = loops.temporal(
-            values, next_values, preferred, self.taken[:n], self.discounts[:n], self._bound, self._loss, errors, error
+            values, next_values, preferred, given.taken, given.rewards, given.discounts, *self._loss, errors, error
         )  # fmt: skip
         parts = [(weight[:n], bias[:n]) for weight, bias in self._parts]
         if self.config.feedback == "transform" and s.any():
@@ -223,7 +242,7 @@ class Networks:
                 one = make_optimizer(learner, parameters, its)
                 one.buffers = {name: buffer[role, k] for name, buffer in self.buffers.items()}
                 one.step(rate)
-            self.finite[runs] = np.isfinite(theta).all(1)
+            self._finite[runs] = np.isfinite(theta).all(1)
             return
         correction, f = (1 - learner.beta2**steps) ** 0.5, np.float32
         torch.set_flush_denormal(True)  # as the optimizers do
@@ -231,7 +250,7 @@ class Networks:
             loops.adam(
                 theta, gradient, means["mean"], means["square"], *self._decays,
                 f(TINY), f(learner.eps * correction), f(rate * correction / (1 - learner.beta1**steps)),
-                self.finite[runs],
+                self._finite[runs],
             )  # fmt: skip
         finally:
             torch.set_flush_denormal(False)
@@ -240,9 +259,28 @@ class Networks:
         """Count an update of network `role` of every run."""
         self.steps[role] += 1
 
+    def finite(self, role: int) -> NDArray[np.bool_]:
+        """Whether network `role` of each run, the one trained last, is finite: bool [K]."""
+        return self._finite
+
+    def copy(self) -> None:
+        """Copy the first network of each run to its second one."""
+        self.theta[1] = self.theta[0]
+
+    def save(self, k: int) -> None:
+        """Write run k's networks into its agent."""
+        for network, flat in zip(self._agents[k].networks, self.theta[:, k], strict=True):
+            network.load(flat)
+
+    def save_means(self, k: int) -> None:
+        """Write the state of run k's optimizers into its agent."""
+        for number, optimizer in enumerate(self._agents[k].optimizers):
+            means = {name: torch.from_numpy(buffer[number, k]) for name, buffer in self.buffers.items()}
+            optimizer.load_state({"steps": self.steps[number], **means})
+
     def kept(self, runs: NDArray[np.intp]) -> Networks:
         """The networks of these runs alone."""
-        found = Networks(self.config, len(runs))
+        found = Networks([self._agents[k] for k in runs])
         found.theta[:] = self.theta[:, runs]
         for name, buffer in self.buffers.items():
             found.buffers[name][:] = buffer[:, runs]

@@ -24,19 +24,20 @@ import torch
 from numpy.typing import NDArray
 
 from coop.common.numbers import METRICS_EVERY
-from coop.common.types import EpisodeEnd, EpisodeRecord, EpisodeRow
+from coop.common.types import Array, EpisodeEnd, EpisodeRecord, EpisodeRow
 from coop.learner.agent import Agent
 from coop.learner.diagnostics import ARCHIVED
 from coop.lockstep.compiled.carts import Carts, cart_of
-from coop.lockstep.compiled.passes import BLOCK, Networks
-from coop.lockstep.compiled.tables import Tables
+from coop.lockstep.compiled.games import Games
+from coop.lockstep.compiled.passes import Networks
+from coop.lockstep.compiled.pictures import PictureNetworks
+from coop.lockstep.compiled.tables import Packing, Tables
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.memory import TableMemory
 
 Ints = NDArray[np.int64]
 
 MOST = 400  # steps of a block
-_SHOWN = np.dtype([("obs", np.float32, 4), ("reward", np.float64), ("terminated", np.bool_)])
 
 
 @dataclass(frozen=True)
@@ -82,20 +83,12 @@ class Seeds:
         self._agents = [run.agent for run in runs if isinstance(run.agent, Agent)]
         agent = self._agents[0]
         self.step, self.updates, self._role, self._versions = runs[0].step, agent.updates, agent.acting, agent.versions
-        carts, limits = zip(*(cart_of(run.env) for run in runs), strict=True)
-        lengths = [int(run._player._lengths[0]) for run in runs]
-        self._carts = Carts(carts, lengths, limits[0], self.config.env.time_limit_terminal)
         memories = [run.memory for run in runs]
         tables = [memory for memory in memories if isinstance(memory, TableMemory)]
         self._tables, self._due = Tables.of(tables, self.config), tables[0].due
-        self._nets = Networks(self.config, len(runs))
-        for k, agent in enumerate(self._agents):
-            for number, network in enumerate(agent.networks):
-                self._nets.theta[number, k] = network.flat.numpy()
-            for number, optimizer in enumerate(agent.optimizers):
-                self._nets.steps[number] = optimizer.steps
-                for name, buffer in self._nets.buffers.items():
-                    buffer[number, k] = optimizer.buffers[name]
+        self._games: Carts | Games
+        self._nets: Networks | PictureNetworks
+        self._games, self._nets = _parts(runs, self._agents, self._tables.packing)
         self._waiting: list[tuple[Any, ...]] = []  # steps since the last segment's end
 
     def play(self, most: int) -> list[PlayedBlock]:
@@ -118,7 +111,7 @@ class Seeds:
         self.runs, self._agents = [self.runs[k] for k in runs], [self._agents[k] for k in runs]
         if not self.runs:
             return
-        self._carts, self._tables, self._nets = self._carts.kept(runs), self._tables.kept(runs), self._nets.kept(runs)
+        self._games, self._tables, self._nets = self._games.kept(runs), self._tables.kept(runs), self._nets.kept(runs)
 
     def _length(self, most: int) -> int:
         """Steps of the next block."""
@@ -162,7 +155,7 @@ class Seeds:
                 batch[due, k] = self._tables.drawn(k, self.step, sum(due))
             for place, step in enumerate(steps):
                 if uniform() < epsilon[place]:
-                    action[place, k] = choose(2, size=1, dtype=np.int32)[0]
+                    action[place, k] = choose(agent.spec.num_actions, size=1, dtype=np.int32)[0]
                 if lengths[place]:
                     first = place + 1 - lengths[place]
                     rows[first : place + 1, k] = self._tables.rows(k, step - lengths[place], lengths[place])
@@ -186,27 +179,30 @@ class Seeds:
         return found
 
     def _play(self, block: _Block, episodes: list[list[EpisodeRow]], metrics: list[list[dict[str, Any]]]) -> None:
-        carts, nets, everyone = self._carts, self._nets, slice(0, len(self.runs))
-        count, size = len(block.due), self.config.learner.batch_size
-        reached = np.empty((count, len(self.runs), 4), np.float32)
-        terminated = np.empty((count, len(self.runs)), np.bool_)
+        games, nets, everyone = self._games, self._nets, slice(0, len(self.runs))
+        count, size, held = len(block.due), self.config.learner.batch_size, self._tables.packing
+        whole = count, len(self.runs)
+        reached, rewards = np.empty((*whole, held.width), held.dtype), np.empty(whole, np.float32)
+        raw_rewards, terminated = np.empty(whole, np.float64), np.empty(whole, np.bool_)
         over = np.empty(len(self.runs), np.bool_)
-        restarts: list[list[tuple[int, bytes]]] = [[] for _ in self.runs]
-        actions = np.empty((count, len(self.runs)), np.int64)
+        restarts: list[list[tuple[int, Array]]] = [[] for _ in self.runs]
+        actions = np.empty(whole, np.int64)
         self._errors = np.zeros((sum(block.due), len(self.runs), size), np.float32)
         self._seen = np.zeros((sum(block.due), len(self.runs), 5, size), np.int64)
         done = 0
         for place in range(count):
             player = self._role if self._player is None else self._player
-            obs, next_obs, action, terminal = carts.obs, reached[place], actions[place], terminated[place]
-            values = nets.values(player, everyone, obs)
-            some_over = carts.push(values, block.action[place], action, next_obs, terminal, over)
+            obs, next_obs, action, terminal = games.obs, reached[place], actions[place], terminated[place]
+            values = nets.values(player, everyone, obs, block.action[place])
+            some_over = games.push(
+                values, block.action[place], action, next_obs, rewards[place], raw_rewards[place], terminal, over
+            )
             self.step += 1
             ended = self._ended(over, next_obs, block.epsilon[place]) if some_over else []
-            self._waiting.append((block.rows[place], obs, next_obs, action, terminal, self.updates))
+            self._waiting.append((block.rows[place], obs, next_obs, action, rewards[place], terminal, self.updates))
             for k, _ in ended:
-                carts.restart(k)
-                restarts[k].append((place, carts.obs[k].tobytes()))
+                games.restart(k)
+                restarts[k].append((place, games.obs[k]))
             if block.cut[place]:
                 for transition in self._waiting:
                     self._tables.insert(*transition)
@@ -217,30 +213,28 @@ class Seeds:
             self._record(ended, episodes)
             if block.due[place] and self.updates % METRICS_EVERY == 0:
                 self._rows(done, metrics)
-        shown = np.empty(terminated.shape, _SHOWN)
-        shown["obs"], shown["reward"], shown["terminated"] = reached, 1, terminated
-        self._follow(actions, shown, restarts)
+        self._follow(actions, (reached, raw_rewards, terminated), restarts)
         self._push(done)
 
     def _ended(self, over: NDArray[np.bool_], obs: NDArray[np.float32], epsilon: float) -> list[tuple[int, EpisodeEnd]]:
         """The episodes that a step has ended, by run."""
         found = []
         for k in np.flatnonzero(over).tolist():
-            run, length = slice(k, k + 1), int(self._carts.lengths[k])
-            means = np.array([float(self._nets.values(role, run, obs[run]).mean()) for role in (0, 1)])
+            run, greedy = slice(k, k + 1), np.array([-1])
+            means = np.array([float(self._nets.values(role, run, obs[run], greedy).mean()) for role in (0, 1)])
             q1, q2 = np.nan_to_num(means).tolist()
-            found.append((k, EpisodeEnd(0, float(length), length, epsilon, q1, q2, self.updates)))
+            total, length = float(self._games.returns[k]), int(self._games.lengths[k])
+            found.append((k, EpisodeEnd(0, total, length, epsilon, q1, q2, self.updates)))
         return found
 
     def _update(self, block: _Block, place: int, number: int) -> None:
         """Do update `number` of the block, that of step `place`, in every run; change roles if it is time."""
         nets, learner, role = self._nets, self.config.learner, self._role
         rate, finite = self._agents[0]._learning_rate(), True
-        for start in range(0, len(self.runs), BLOCK):
-            runs = slice(start, min(start + BLOCK, len(self.runs)))
-            n = runs.stop - start
-            seen, rows = self._seen[number, runs], block.batch[place, runs]
-            self._tables.read(runs, rows, self.updates + 1, nets.x[:n], nets.taken[:n], nets.discounts[:n], seen)
+        for start in range(0, len(self.runs), nets.block):
+            runs = slice(start, min(start + nets.block, len(self.runs)))
+            given, seen = nets.batches.first(runs.stop - start), self._seen[number, runs]
+            self._tables.read(runs, block.batch[place, runs], self.updates + 1, given, seen)
             finite &= nets.update(role, runs, block.s[place, runs], rate, self._errors[number, runs])
         nets.count(role)
         self._tables.batches += 1
@@ -250,7 +244,7 @@ class Seeds:
         if swapped and self.config.two_networks:
             self._role = 1 - role
         elif swapped:
-            nets.theta[1] = nets.theta[0]
+            nets.copy()
             self._versions[1] = self.updates
         self._archive(block, place, number)
         for run, agent in zip(self.runs, self._agents, strict=True):
@@ -258,8 +252,8 @@ class Seeds:
                 agent.updates = self.updates
         if not finite:
             self._diverge(np.isfinite(self._errors[number]).all(1), "TD errors")
-        if (swapped or self.updates % learner.publish_every == 0) and not nets.finite.all():
-            self._diverge(nets.finite, "parameters")
+        if (swapped or self.updates % learner.publish_every == 0) and not (sound := nets.finite(role)).all():
+            self._diverge(sound, "parameters")
 
     def _diverge(self, finite: NDArray[np.bool_], what: str) -> None:
         for k in np.flatnonzero(~finite).tolist():
@@ -278,7 +272,6 @@ class Seeds:
                 return
             batch = self._tables.batch(k, block.batch[place, k], self._seen[number, k])
             telemetry.diagnostics.add(batch)
-            telemetry.largest_reward = 1.0
 
     def _record(self, ended: Sequence[tuple[int, EpisodeEnd]], episodes: list[list[EpisodeRow]]) -> None:
         """Number the episodes that have ended."""
@@ -296,44 +289,56 @@ class Seeds:
             if not run.trainer.diverged:
                 self.save_networks(k)
                 self.save_counters(k)
-                row = run.trainer._metrics(time.monotonic())
+                with torch.inference_mode(mode=False):  # where views of layers would not know what they are of
+                    row = run.trainer._metrics(time.monotonic())
                 metrics[k] += [] if row is None else [row]
                 run.step = self.step
 
     def _push(self, done: int) -> None:
         """Hand the updates of the block to the telemetry."""
         for k, run in enumerate(self.runs):
+            telemetry = run.trainer.telemetry
+            telemetry.largest_reward = max(telemetry.largest_reward, float(self._tables.largest[k]))
             for number in range(len(self._errors[:done])):
                 ids, age, reuse, lag, terminated = self._seen[number, k]
-                run.trainer.telemetry.add_errors(self._errors[number, k])
-                run.trainer.telemetry._batches.append((age, reuse, lag, terminated, ids))
+                telemetry.add_errors(self._errors[number, k])
+                telemetry._batches.append((age, reuse, lag, terminated, ids))
         self._errors, self._seen = self._errors[done:], self._seen[done:]
 
-    def _follow(self, actions: Ints, shown: NDArray[Any], restarts: Sequence[Sequence[tuple[int, bytes]]]) -> None:
-        """Note the actions of a block, and what the emulators answered, as `Lockstep` does step by step."""
+    def _follow(
+        self, actions: Ints, answers: tuple[Array, Array, Array], restarts: Sequence[Sequence[tuple[int, Array]]]
+    ) -> None:
+        """Note the actions of a block, and what the emulators answered, as `Lockstep` does step by step.
+
+        answers: observations, as rows, rewards and terminations: [count, K, ...]. restarts: of each run, the step that
+        ended an episode, and the row that the next one begins with.
+        """
+        held, spec = self._tables.packing, self._agents[0].spec
+        entries = [("obs", spec.frame_dtype, spec.obs_shape), ("reward", np.float64), ("terminated", np.bool_)]
+        shown = np.empty(len(actions), entries)
         for k, run in enumerate(self.runs):
+            shown["obs"] = held.obs(answers[0][:, k])
+            shown["reward"], shown["terminated"] = answers[1][:, k], answers[2][:, k]
             start, seen = 0, run._seen
             for place, first in restarts[k]:
-                seen = zlib.crc32(first, zlib.crc32(shown[start : place + 1, k].tobytes(), seen))
+                begun = held.obs(first[None]).tobytes()
+                seen = zlib.crc32(begun, zlib.crc32(shown[start : place + 1].tobytes(), seen))
                 start = place + 1
             run._actions += actions[:, k].tolist()
-            run._seen = zlib.crc32(shown[start:, k].tobytes(), seen)
+            run._seen = zlib.crc32(shown[start:].tobytes(), seen)
 
     def save_into(self, k: int) -> None:
         """Bring run k to where its seed is, so that `Lockstep.save` saves it; it is not to be played on otherwise."""
         run = self.runs[k]
         self.save_networks(k)
         self.save_counters(k)
-        run.memory = self._tables.memory(k, run.env.spec)
-        for number, optimizer in enumerate(self._agents[k].optimizers):
-            means = {name: torch.from_numpy(buffer[number, k]) for name, buffer in self._nets.buffers.items()}
-            optimizer.load_state({"steps": self._nets.steps[number], **means})
+        run.memory = self._tables.memory(k)
+        self._nets.save_means(k)
 
     def save_networks(self, k: int) -> None:
         """Write run k's networks and its role into its agent."""
+        self._nets.save(k)
         agent = self._agents[k]
-        for network, flat in zip(agent.networks, self._nets.theta[:, k], strict=True):
-            network.load(flat)
         agent.acting, agent.versions = self._role, list(self._versions)
 
     def save_counters(self, k: int) -> None:
@@ -344,3 +349,17 @@ class Seeds:
         run.trainer.drawn = msgspec.structs.replace(
             run.trainer.drawn, inserted=self.step, **self._tables.counters(k), episodes=()
         )  # fmt: skip
+
+
+def _parts(
+    runs: Sequence[Lockstep], agents: Sequence[Agent], packing: Packing
+) -> tuple[Carts, Networks] | tuple[Games, PictureNetworks]:
+    """The emulators and networks of some runs, where they are."""
+    config, players = runs[0].config, [run._player for run in runs]
+    lengths = np.concatenate([player._lengths for player in players])
+    if config.network.kind == "mlp":
+        carts, limits = zip(*(cart_of(run.env) for run in runs), strict=True)
+        return Carts(carts, lengths, limits[0], config.env.time_limit_terminal), Networks(agents)
+    obs = np.concatenate([packing.rows(player._obs) for player in players])
+    returns = np.concatenate([player._returns for player in players])
+    return Games([run.env for run in runs], obs, returns, lengths), PictureNetworks(agents)
