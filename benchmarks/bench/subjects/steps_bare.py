@@ -17,7 +17,7 @@ from coop.common.envs.make import make_vector_env
 from coop.common.networks import convolution
 from coop.common.process.limits import use_threads
 from coop.learner.edl import convolution as backward
-from coop.learner.edl import transforms
+from coop.learner.edl import numpy_backprop
 from coop.lockstep.lockstep import Lockstep
 
 use_threads(1)
@@ -27,17 +27,23 @@ run = Lockstep(config)
 for _ in range(START + 100):
     list(run.play())
 calls: list[Callable[[], object]] = []
+within: list[object] = []
 
 
 def recorded(function: Callable[..., object], *args: object) -> object:
-    calls.append(partial(function, *args))
-    return function(*args)
+    if not within:
+        calls.append(partial(function, *args))
+    within.append(function)
+    found = function(*args)
+    within.pop()
+    return found
 
 
 with (
     patch.object(convolution, "product", partial(recorded, convolution.product)),
     patch.object(backward, "product", partial(recorded, backward.product)),
-    patch.object(transforms, "whitened", partial(recorded, transforms.whitened)),
+    patch.object(numpy_backprop, "whitened", partial(recorded, numpy_backprop.whitened)),
+    patch.object(np, "dot", partial(recorded, np.dot)),
 ):
     run.agent.update(run.memory.table.sample(config.learner.batch_size))
 calls.append(partial(run.agent.optimizers[run.agent.acting].step, config.learner.learning_rate))
