@@ -133,6 +133,16 @@ def test_the_last_bucket_is_open() -> None:
     assert histogram.tolist() == [1, 1, 2, 1, *[0] * 11, 3]
 
 
+@pytest.mark.parametrize("eviction", ["reservoir", "prioritized"])
+def test_no_row_is_remembered_of_what_has_gone(eviction: str) -> None:
+    table = Table(make_spec(1), 4, eviction=eviction, sampling="prioritized", rng=np.random.default_rng(0))
+    stream = Stream(make_spec(1), 0, np.random.default_rng(0), 50)
+    for _ in range(20):
+        table.insert(stream.segment(3))
+    assert table._row_of is not None
+    assert len(table._row_of) == len(table) == 4
+
+
 @pytest.mark.parametrize("eviction", ["fifo", "reservoir", "prioritized"])
 def test_priorities_of_evicted_transitions_are_ignored(eviction: str) -> None:
     table = Table(make_spec(1), 4, eviction=eviction, sampling="prioritized", rng=np.random.default_rng(0))
