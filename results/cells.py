@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import hashlib
 import json
@@ -9,11 +10,17 @@ import shutil
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from coop.common.errors import RunError
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from coop.common.errors import RunError, UsageError
 from coop.common.process.console import say
-from coop.common.process.lifecycle import Stop
+from coop.common.process.lifecycle import Stop, run_main
 from coop.common.settings.config import RunConfig
 from coop.lockstep.run import LockstepRun
 from coop.records.resumption import Start
@@ -69,6 +76,54 @@ def claimed(out: Path, name: str) -> Iterator[bool]:
             yield False
             return
         yield True
+
+
+def command(
+    program: str, about: str | None, play: Callable[[Path, Stop], None], pack: Callable[[Path, Path], str]
+) -> None:
+    """A study's command: plays into a folder until a signal, or packs what is complete there; `pack` says what."""
+    parser = argparse.ArgumentParser(f"python -m {program}", description=(about or "").split("\n")[0])
+    parser.add_argument("out", type=Path, help="folder of the cells")
+    parser.add_argument("--pack", type=Path, metavar="FILE", help="write the complete cells as Parquet, and play none")
+    args = parser.parse_args()
+
+    def run() -> None:
+        if args.pack is not None:
+            say(f"{pack(args.out, args.pack)} in {args.pack}")
+            return
+        stop = Stop()
+        stop.on_signals()
+        play(args.out, stop)
+        if stop.is_set():
+            stop.raise_for_status()
+
+    run_main(program, run)
+
+
+@dataclass(frozen=True)
+class Packed:
+    """The packed file of a study, sealed with its plan and grid; key: of the seal in the schema's metadata."""
+
+    key: bytes
+    plan: Path
+    grid: Path
+
+    def table(self, path: Path) -> pa.Table:
+        """The file; raises UsageError if it is of another plan or grid."""
+        found = pq.read_table(path)
+        if json.loads((found.schema.metadata or {}).get(self.key, b"{}")) != sealed(self.plan, self.grid):
+            raise UsageError(f"{path}: of another plan or grid; changes of the plan go below its last heading")
+        return found
+
+    def rows(self, path: Path) -> list[dict[str, Any]]:
+        """The file's rows, none if there is no file; raises as `table`."""
+        return list(self.table(path).to_pylist()) if path.exists() else []
+
+    def write(self, path: Path, frame: pd.DataFrame) -> None:
+        """Write the rows."""
+        seal = {self.key: json.dumps(sealed(self.plan, self.grid))}
+        table = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata(seal)
+        pq.write_table(table, path, compression="zstd", compression_level=22)
 
 
 def _lock(out: Path, name: str) -> Path:

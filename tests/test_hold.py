@@ -1,5 +1,7 @@
 """The study of two networks on CartPole: its cells are the plan's, and its rules say what the plan says."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -155,3 +157,15 @@ def test_a_study_goes_on_where_it_stopped_and_is_packed(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["packed.parquet"], "packed cells are not played again"
     assert play.pack(grid, tmp_path, tmp_path / "packed.parquet") == 2
     assert verdict.load(tmp_path / "packed.parquet").equals(runs)
+
+
+@pytest.mark.parametrize(
+    "module", ["results.cartpole.hold.play", "results.minatar.edl.play", "coop.lockstep.compiled.together"]
+)
+def test_help_and_wrong_flags_end_as_in_other_commands(module: str) -> None:
+    pytest.importorskip("numba")
+    for flags, status in ((["--help"], 0), (["--no-such-flag"], 2)):
+        done = subprocess.run([sys.executable, "-m", module, *flags], capture_output=True, text=True, check=False)
+        assert done.returncode == status
+        assert "sys.exit" not in done.stderr
+        assert "usage: python -m " in done.stdout + done.stderr

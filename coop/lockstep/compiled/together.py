@@ -47,10 +47,6 @@ def alike(configs: Sequence[RunConfig]) -> bool:
 
 def main() -> None:
     """Entry point."""
-    run_main(PROGRAM, _run)
-
-
-def _run() -> None:
     parser = argparse.ArgumentParser(
         "python -m coop.lockstep.compiled.together", description=(__doc__ or "").split("\n")[0]
     )
@@ -58,6 +54,10 @@ def _run() -> None:
     parser.add_argument("--player", type=int, choices=(1, 2), help="the network that always acts")
     parser.add_argument("--log", default=DEFAULT_LOG, help="as of coop-lockstep")
     args = parser.parse_args()
+    run_main(PROGRAM, lambda: _run(args))
+
+
+def _run(args: argparse.Namespace) -> None:
     configs = [read_run_config(path) for path in args.directories]
     if not alike(configs):
         raise UsageError("the runs of these directories differ in more than their seeds")

@@ -11,8 +11,6 @@ the grid.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -24,13 +22,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from coop.common.errors import UsageError
-from coop.common.process.console import say
-from coop.common.process.lifecycle import Stop, run_main
+from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import merged
 from coop.common.settings.tables import load_tables, resolve
@@ -39,11 +34,11 @@ from coop.lockstep.run import LockstepRun
 from coop.records.reading import read_csv, read_jsonl
 from coop.records.summaries import read_summary
 from results.cartpole.edl.packed import summary
-from results.cells import Progress, claimed, play_cell, remove_runs, sealed
+from results.cells import Packed, Progress, claimed, command, play_cell, remove_runs
 
 HERE = Path("results/cartpole/hold")
 PLAN, GRID, FILE = HERE / "plan.md", HERE / "grid.toml", HERE / "hold.parquet"
-SEAL = b"hold"
+PACKED = Packed(b"hold", PLAN, GRID)
 PROGRAM = "results.cartpole.hold.play"
 SIZES = (100, 300, 1000, 5000)  # with double targets: what the plan's changes leave of the grid
 _KEPT = ("update", "policy_churn", "q_abs_mean", "q_bound")  # of metrics.jsonl
@@ -192,9 +187,7 @@ def pack(grid: HoldGrid, out: Path, path: Path) -> int:
     rows = before | {cell.name: list(rows_of(cell, out / f"{cell.name}.npz")) for cell in done}
     frame = pd.DataFrame([row for cell in grid.cells for row in rows.get(cell.name, ())])
     frame = frame.astype(dict.fromkeys(("area", "last", "churn", "q_share"), np.float32))
-    seal = {SEAL: json.dumps(sealed(PLAN, GRID))}
-    table = pa.Table.from_pandas(frame, preserve_index=False).replace_schema_metadata(seal)
-    pq.write_table(table, path, compression="zstd", compression_level=22)
+    PACKED.write(path, frame)
     return len(rows)
 
 
@@ -203,13 +196,8 @@ def packed_rows(path: Path = FILE) -> dict[str, list[dict[str, Any]]]:
 
     Raises UsageError if it is of another plan or grid.
     """
-    if not path.exists():
-        return {}
-    table = pq.read_table(path)
-    if json.loads((table.schema.metadata or {}).get(SEAL, b"{}")) != sealed(PLAN, GRID):
-        raise UsageError(f"{path}: of another plan or grid")
     found: dict[str, list[dict[str, Any]]] = {}
-    for row in table.to_pylist():
+    for row in PACKED.rows(path):
         name = cell_name(*(row[axis] for axis in ("variant", "eviction", "capacity", "double")))
         found.setdefault(name, []).append(row)
     return found
@@ -217,23 +205,14 @@ def packed_rows(path: Path = FILE) -> dict[str, list[dict[str, Any]]]:
 
 def main() -> None:
     """Entry point."""
-    run_main(PROGRAM, _run)
-
-
-def _run() -> None:
-    parser = argparse.ArgumentParser(f"python -m {PROGRAM}", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("out", type=Path, help="folder of the cells")
-    parser.add_argument("--pack", type=Path, metavar="FILE", help="write the complete cells as Parquet, and play none")
-    args = parser.parse_args()
     grid = read_grid()
-    if args.pack is not None:
-        say(f"{pack(grid, args.out, args.pack)} of {len(grid.cells)} cells in {args.pack}")
-        return
-    stop = Stop()
-    stop.on_signals()
-    play(replace(grid, cells=tuple(cell for cell in grid.cells if cell.kept)), args.out, stop, packed=packed_rows())
-    if stop.is_set():
-        stop.raise_for_status()
+    kept = replace(grid, cells=tuple(cell for cell in grid.cells if cell.kept))
+    command(
+        PROGRAM,
+        __doc__,
+        lambda out, stop: play(kept, out, stop, packed=packed_rows()),
+        lambda out, path: f"{pack(grid, out, path)} of {len(grid.cells)} cells",
+    )
 
 
 if __name__ == "__main__":

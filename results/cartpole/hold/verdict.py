@@ -7,7 +7,6 @@ cells are not says so. The plan and the grid must be those whose SHA-256 the pac
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Iterable
 from itertools import product
@@ -16,15 +15,13 @@ from typing import NamedTuple, TypeGuard
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.special import betaincinv, stdtr
 from scipy.stats import binomtest
 
 from coop.studies.report.intervals import over_seeds
 from results.cartpole.edl.verdict import holm, printed
-from results.cartpole.hold.play import FILE, GRID, PLAN, SEAL, SIZES
-from results.cells import sealed
+from results.cartpole.hold.play import FILE, PACKED, SIZES
 
 ENDS_WELL, LEVEL, MARGIN = 195, 0.05, 0.25  # the margin in settings of four
 EVICTIONS = ("fifo", "reservoir")
@@ -42,11 +39,8 @@ Floats = NDArray[np.float64]
 
 
 def load(path: Path = FILE) -> pd.DataFrame:
-    """A row for each run, with `well`: it ends well. Raises ValueError if plan or grid are not those of the file."""
-    table = pq.read_table(path)
-    if json.loads(table.schema.metadata[SEAL]) != sealed(PLAN, GRID):
-        raise ValueError(f"{path}: of another plan or grid; changes of the plan go below its last heading")
-    runs: pd.DataFrame = table.to_pandas()
+    """A row for each run, with `well`: it ends well. Raises UsageError if plan or grid are not those of the file."""
+    runs: pd.DataFrame = PACKED.table(path).to_pandas()
     return runs.assign(well=runs["last"] >= ENDS_WELL, collapsed=runs["collapses"] > 0)
 
 

@@ -9,7 +9,6 @@ over, it is a file of JSON, a row for each run. The schema's metadata hold the S
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import tomllib
@@ -21,14 +20,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from coop.common.errors import UsageError
 from coop.common.numbers import strict_json
-from coop.common.process.console import say
 from coop.common.process.files import write_atomic
-from coop.common.process.lifecycle import Stop, run_main
+from coop.common.process.lifecycle import Stop
 from coop.common.settings.config import RunConfig
 from coop.common.settings.overrides import merged
 from coop.common.settings.tables import load_tables, resolve
@@ -39,13 +35,13 @@ from coop.records.following import Callbacks
 from coop.records.reading import read_csv
 from coop.records.summaries import read_summary
 from results.cartpole.edl.packed import curve_of
-from results.cells import Progress, claimed, over, play_cell, remove_runs, sealed
+from results.cells import Packed, Progress, claimed, command, over, play_cell, remove_runs
 from results.minatar.edl import rules
 from results.minatar.edl.plain_steps import PlainSteps
 
 HERE = Path("results/minatar/edl")
 PLAN, GRID, FILE = HERE / "plan.md", HERE / "grid.toml", HERE / "edl.parquet"
-SEAL, PROGRAM = b"edl", "results.minatar.edl.play"
+PACKED, PROGRAM = Packed(b"edl", PLAN, GRID), "results.minatar.edl.play"
 MEASURES = "measures.json"  # of a run of the pilot
 CURVE, LAST = 40, 100  # moments of the running mean; episodes
 WAIT = 20.0  # seconds until the next look at the cells of other processes
@@ -235,12 +231,7 @@ def rows_of(out: Path | None, packed: Path = FILE) -> pd.DataFrame:
 
     Raises UsageError if the file is of another plan or grid.
     """
-    rows: list[dict[str, Any]] = []
-    if packed.exists():
-        table = pq.read_table(packed)
-        if json.loads((table.schema.metadata or {}).get(SEAL, b"{}")) != sealed(PLAN, GRID):
-            raise UsageError(f"{packed}: of another plan or grid")
-        rows = table.to_pylist()
+    rows = PACKED.rows(packed)
     there = {row["cell"] for row in rows}
     for file in sorted(out.glob("*.json")) if out is not None else ():
         if file.stem not in there:
@@ -253,33 +244,13 @@ def pack(out: Path, path: Path) -> int:
     rows = rows_of(out, path)
     if not len(rows):
         raise UsageError(f"{out}: no cell is complete")
-    frame = rows.astype({"area": np.float32, "last": np.float32})
-    table = pa.Table.from_pandas(frame, preserve_index=False)
-    pq.write_table(
-        table.replace_schema_metadata({SEAL: json.dumps(sealed(PLAN, GRID))}), path, compression="zstd",
-        compression_level=22,
-    )  # fmt: skip
+    PACKED.write(path, rows.astype({"area": np.float32, "last": np.float32}))
     return len(rows)
 
 
 def main() -> None:
     """Entry point."""
-    run_main(PROGRAM, _run)
-
-
-def _run() -> None:
-    parser = argparse.ArgumentParser(f"python -m {PROGRAM}", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("out", type=Path, help="folder of the cells")
-    parser.add_argument("--pack", type=Path, metavar="FILE", help="write the complete cells as Parquet, and play none")
-    args = parser.parse_args()
-    if args.pack is not None:
-        say(f"{pack(args.out, args.pack)} runs in {args.pack}")
-        return
-    stop = Stop()
-    stop.on_signals()
-    play(EdlGrid(), args.out, stop)
-    if stop.is_set():
-        stop.raise_for_status()
+    command(PROGRAM, __doc__, lambda out, stop: play(EdlGrid(), out, stop), lambda out, path: f"{pack(out, path)} runs")
 
 
 if __name__ == "__main__":
