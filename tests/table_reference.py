@@ -9,7 +9,7 @@ import numpy as np
 
 from coop.common.transitions import Batch, Segment
 from coop.common.types import Array, EnvSpec
-from coop.replay.table.put import reuse_histogram
+from coop.replay.table.loops import reuse_histogram
 from coop.replay.table.table import Table
 
 

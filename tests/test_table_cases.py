@@ -16,7 +16,7 @@ from coop.common.settings.capacity import estimated_bytes
 from coop.common.transitions import Segment
 from coop.common.types import EnvSpec
 from coop.replay.table import streams
-from coop.replay.table.put import reuse_histogram
+from coop.replay.table.loops import reuse_histogram
 from coop.replay.table.table import Table
 
 

@@ -35,6 +35,7 @@ class FrameStore:
         used: slots ever used; those above were never written. stored: frames ever stored.
         references, numbers_of: of each slot, its references, and the number of its frame, see `numbers`.
         free, free_count: a stack of free slots below `used`, and its height.
+        marks: of each slot, scratch memory for finding equal ones.
     """
 
     def __init__(self, frame_shape: tuple[int, ...], frame_dtype: str, *, shared_memory: bool = False) -> None:
@@ -45,7 +46,7 @@ class FrameStore:
         self.numbers_of = np.zeros(FIRST_SLOTS, np.int64)
         self.references = np.zeros(FIRST_SLOTS, np.int32)
         self.free = np.zeros(FIRST_SLOTS, np.int32)
-        self._mark = np.zeros(FIRST_SLOTS, np.int32)  # scratch of `unique`
+        self.marks = np.zeros(FIRST_SLOTS, np.int32)
         self.shared_memory, memory = "", None
         if shared_memory:
             with suppress(OSError):
@@ -117,8 +118,8 @@ class FrameStore:
         """
         flat = slots.reshape(-1)
         distinct, order = self._distinct(flat)
-        self._mark[distinct] = order[: len(distinct)]
-        return distinct, self._mark[flat].reshape(slots.shape)
+        self.marks[distinct] = order[: len(distinct)]
+        return distinct, self.marks[flat].reshape(slots.shape)
 
     def read(self, slots: Slots, out: Array | None = None) -> Array:
         """Copy the frames in `slots`, [n, *frame_shape], to `out`, contiguous memory, or to a new array."""
@@ -136,8 +137,8 @@ class FrameStore:
     def _distinct(self, slots: Slots) -> tuple[Slots, NDArray[np.int32]]:
         """The distinct slots among slots intp [n], and the numbers 0..n-1."""
         order = np.arange(len(slots), dtype=np.int32)
-        self._mark[slots] = order  # the last of equal slots wins
-        return slots[self._mark[slots] == order], order
+        self.marks[slots] = order  # the last of equal slots wins
+        return slots[self.marks[slots] == order], order
 
     def _items(self, frames: Array) -> NDArray[np.void]:
         """Frames [n, *frame_shape] as void [n], without a copy if they are contiguous."""
@@ -145,7 +146,7 @@ class FrameStore:
 
     def _grow(self, needed: int) -> None:
         slots = max(needed, int(len(self.references) * GROWTH))
-        for name in ("references", "free", "_mark", "numbers_of"):
+        for name in ("references", "free", "marks", "numbers_of"):
             array = getattr(self, name)
             larger = np.zeros(slots, array.dtype)  # zeros are committed only when written
             larger[: self.used] = array[: self.used]

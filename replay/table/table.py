@@ -16,10 +16,10 @@ from coop.common.transitions import IN_SEGMENT, MASKS, Batch, Segment
 from coop.common.types import Array, EnvSpec
 from coop.replay.table.columns import Columns
 from coop.replay.table.frames import FrameStore, PinnedFrames, Slots, StoredFrames
+from coop.replay.table.loops import PLAIN, REUSE_BUCKETS, Placed, compiled_loops
 from coop.replay.table.numbering import EPISODES, EpisodeNumbers
 from coop.replay.table.own_policies import OwnEviction, make_policies
 from coop.replay.table.policies import IMPORTANCE_EXPONENT, PRIORITY_EXPONENT, Incoming, TableView
-from coop.replay.table.put import REUSE_BUCKETS, Placed, Put, compiled_put, put
 from coop.replay.table.streams import StreamTails
 
 WORTH_COMPILING = 20_000  # segments inserted: loading compiled loops takes as long as they save in 15,000
@@ -103,7 +103,7 @@ class Table:
         self._max_priority = 1.0
         self._row_of: dict[int, int] | None = {} if self._prioritized and not evicts.in_order else None
         self._held = self._inserts = 0
-        self._compiled: Put | None = None
+        self._loops = PLAIN
         self._episodes = EpisodeNumbers(capacity) if evicts.episodes or draws.episodes else None
         named = (seen.named[name] for name in ("rewards", "terminated", "actions"))
         numbers = np.empty(0, np.int64) if self._episodes is None else self._episodes.of_rows
@@ -180,10 +180,9 @@ class Table:
         placed = Placed(segment, rows, kept, first, size)
         self._inserts += 1
         if self._inserts == WORTH_COMPILING:
-            self._compiled = compiled_put()
-        place = self._compiled or put
+            self._loops = compiled_loops()
         replaced = () if self._row_of is None else self._columns.ids[rows[rows < size]].tolist()
-        self._held += place(self._frames, self._tails, self._columns, self._reuse_evicted, placed)
+        self._held += self._loops.put(self._frames, self._tails, self._columns, self._reuse_evicted, placed)
         self._reuse_evicted[0] += segment.steps - len(rows)
         self.inserted += segment.steps
         if self._row_of is not None:
@@ -249,16 +248,14 @@ class Table:
         if size == 0:
             raise ValueError("an empty table has nothing to sample")
         rows, weights = self._sampling.draw(batch_size, size)
-        # Transition by transition, so that neighbouring frames are read one after another.
-        distinct, index = self._frames.unique(self._columns.slots.take(rows, axis=0).astype(np.intp))
-        np.add.at(self._columns.reuse, rows, np.int32(1))
+        distinct, obs_index, next_index = self._loops.gather(self._frames, self._columns, rows)
         self.batches += 1
         self._sampled += batch_size
         columns = self._columns.read(rows)
         return distinct, {
             **columns,
-            "obs_index": index[:, : self.spec.stack].copy(),
-            "next_index": index[:, self.spec.stack :].copy(),
+            "obs_index": obs_index,
+            "next_index": next_index,
             "weights": weights,
             "age": self.numbered - 1 - columns["ids"],
         }
@@ -271,8 +268,7 @@ class Table:
         not finite, and for different lengths.
         """
         given = np.asarray(priorities, np.float64)
-        largest = float(given.max(initial=0))
-        if len(ids) != len(given) or not (given.min(initial=0) >= 0 and largest < np.inf):  # NaN is neither
+        if len(ids) != len(given) or np.isnan(self._loops.largest(given)):
             raise ValueError("priorities: must be finite, at least 0, and one for each id")
         if not self._prioritized:
             return
@@ -280,12 +276,9 @@ class Table:
             rows = ids.astype(np.intp) % self.capacity
         else:
             rows = np.array([self._row_of.get(number, self.capacity) for number in ids.tolist()], np.intp)
-        held = (rows < len(self)) & (self._columns.ids.take(rows, mode="clip") == ids)
-        if not held.all():
-            rows, given = rows[held], given[held]
-            largest = float(given.max(initial=0))
+        rows, given = self._loops.held(self._columns, len(self), ids, rows, given)
         if len(rows):
-            self._max_priority = max(self._max_priority, largest)
+            self._max_priority = max(self._max_priority, self._loops.largest(given))
             self._set_priorities(rows, given)
 
     def snapshot(self) -> TableSnapshot:

@@ -16,7 +16,7 @@ from coop.common.transitions import IN_BATCH, KEPT, Batch, filled
 from coop.common.types import Array, EnvSpec
 from coop.lockstep.compiled import loops
 from coop.lockstep.memory import TableMemory
-from coop.replay.table.put import REUSE_BUCKETS
+from coop.replay.table.loops import REUSE_BUCKETS
 
 Ints = NDArray[np.int64]
 

@@ -1,4 +1,4 @@
-"""Segments come into the table by a compiled loop as by numpy: slots, rows and counts are equal after each."""
+"""A table's compiled loops do what numpy does: slots, rows, counts and batches are equal after each call."""
 
 import sys
 from typing import Any
@@ -9,12 +9,13 @@ from msgspec.structs import replace
 from table_reference import Stream, check_references, make_spec
 
 from coop.common.transitions import Segment
-from coop.replay.table import put, streams, table
+from coop.replay.table import streams, table
 from coop.replay.table.frames import FIRST_SLOTS
+from coop.replay.table.loops import PLAIN, Loops, compiled_loops
 from coop.replay.table.table import Table
 
 pytest.importorskip("numba")
-from coop.replay.table import compiled_put
+COMPILED = compiled_loops()
 
 
 def state(one: Table) -> dict[str, Any]:
@@ -30,8 +31,8 @@ def state(one: Table) -> dict[str, Any]:
 def both(monkeypatch: pytest.MonkeyPatch, stack: int, eviction: str, sampling: str, capacity: int) -> list[Table]:
     monkeypatch.setattr(table, "WORTH_COMPILING", 1)
     made = []
-    for loop in (put.put, compiled_put.put):
-        monkeypatch.setattr(table, "compiled_put", lambda loop=loop: loop)
+    for loops in (PLAIN, COMPILED):
+        monkeypatch.setattr(table, "compiled_loops", lambda loops=loops: loops)
         spec = make_spec(stack, "uint8")
         made.append(Table(spec, capacity, eviction=eviction, sampling=sampling, rng=np.random.default_rng(0)))
         made[-1].insert(Stream(spec, 99, np.random.default_rng(0), 20).segment(1))
@@ -39,13 +40,18 @@ def both(monkeypatch: pytest.MonkeyPatch, stack: int, eviction: str, sampling: s
 
 
 @pytest.mark.parametrize("stack", [1, 4])
-@pytest.mark.parametrize("eviction", ["fifo", "reservoir", "prioritized"])
+@pytest.mark.parametrize(
+    ("eviction", "sampling"),
+    [("fifo", "uniform"), ("fifo", "prioritized"), ("reservoir", "uniform"), ("prioritized", "prioritized")],
+)
 @pytest.mark.parametrize("most", [2, streams.MAX_STREAMS])
-def test_the_loop_does_what_numpy_does(most: int, eviction: str, stack: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_loops_do_what_numpy_does(
+    most: int, eviction: str, sampling: str, stack: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(streams, "MAX_STREAMS", most)
-    sampling = "prioritized" if eviction == "prioritized" else "uniform"
     tables = both(monkeypatch, stack, eviction, sampling, 60)
-    assert [one._compiled for one in tables] == [put.put, compiled_put.put]
+    assert [one._loops for one in tables] == [PLAIN, COMPILED]
+    assert {loop.__module__ for loop in COMPILED} == {"coop.replay.table.compiled_loops"}
     spec, rng = make_spec(stack, "uint8"), np.random.default_rng(1)
     players = [Stream(spec, number, np.random.default_rng(number), 9) for number in range(4)]
     lengths = [*(int(rng.integers(1, 12)) for _ in range(120)), 90, 3, 61]
@@ -55,12 +61,19 @@ def test_the_loop_does_what_numpy_does(most: int, eviction: str, stack: int, mon
             continue  # lost: the next one of this stream repeats frames that the table does not have
         if turn % 3 == 0:
             segment = read_only(segment)
+        batches = []
         for one in tables:
             one.insert(segment)
             batch = one.sample(16)
             if sampling == "prioritized":
-                one.update_priorities(batch.ids, np.abs(np.sin(batch.ids)))
+                ids = np.concatenate((batch.ids, batch.ids - 60, [10**6]))  # of which some are not held
+                one.update_priorities(ids, np.abs(np.sin(ids)))
             check_references(one)
+            batches.append(batch)
+        for name, value in batches[0].columns().items():
+            np.testing.assert_array_equal(getattr(batches[1], name), value, err_msg=f"{name} after {turn}")
+            assert getattr(batches[1], name).dtype == value.dtype
+        np.testing.assert_array_equal(batches[0].frames, batches[1].frames)
         expected, found = map(state, tables)
         for name, value in expected.items():
             np.testing.assert_array_equal(found[name], value, err_msg=f"{name} after {turn}")
@@ -106,7 +119,15 @@ def test_a_table_compiles_when_it_pays_and_numba_is_there(monkeypatch: pytest.Mo
     found = []
     for _ in range(4):
         one.insert(stream.segment(2))
-        found.append(one._compiled)
-    assert found == [None, None, compiled_put.put, compiled_put.put]
-    monkeypatch.setitem(sys.modules, "coop.replay.table.compiled_put", None)
-    assert put.compiled_put() is None
+        found.append(one._loops)
+    assert found == [PLAIN, PLAIN, COMPILED, COMPILED]
+    monkeypatch.setitem(sys.modules, "coop.replay.table.compiled_loops", None)
+    assert compiled_loops() is PLAIN
+
+
+@pytest.mark.parametrize("loops", [PLAIN, COMPILED], ids=["numpy", "compiled"])
+def test_the_largest_priority(loops: Loops) -> None:
+    assert loops.largest(np.array([0.5, 2.0, 1.0])) == 2.0
+    assert loops.largest(np.empty(0)) == 0.0
+    for wrong in (-1e-9, np.nan, np.inf):
+        assert np.isnan(loops.largest(np.array([0.5, wrong, 1.0])))

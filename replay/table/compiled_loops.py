@@ -1,6 +1,8 @@
-"""A segment's way into the table in a loop that numba compiles: a third of the time of numpy's sixty short calls."""
+"""`coop.replay.table.loops` in loops that numba compiles: a third of the time of numpy's many short calls."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,15 +10,15 @@ from numpy.typing import NDArray
 from coop.common.compiling import compiled
 from coop.common.types import Array
 from coop.replay.table.columns import Columns
-from coop.replay.table.frames import FrameStore, as_slice
-from coop.replay.table.put import Placed
+from coop.replay.table.frames import FrameStore, Slots, as_slice
+from coop.replay.table.loops import Placed
 from coop.replay.table.streams import StreamTails
 
 
 def put(
     frames: FrameStore, tails: StreamTails, columns: Columns, reuse_evicted: NDArray[np.int64], placed: Placed
 ) -> int:
-    """As `coop.replay.table.put.put`, to the bit: each frame gets the same slot."""
+    """As `coop.replay.table.loops.put`, to the bit: each frame gets the same slot."""
     segment, rows, kept, first, size = placed
     count = len(segment.frames)
     positions = np.arange(kept.start, kept.stop) if isinstance(kept, slice) else kept
@@ -41,6 +43,36 @@ def put(
     if len(forgotten):
         frames.drop(forgotten[forgotten >= 0])
     return int(added)
+
+
+def gather(frames: FrameStore, columns: Columns, rows: Slots) -> tuple[Slots, NDArray[np.int32], NDArray[np.int32]]:
+    """As `coop.replay.table.loops.gather`, to the bit."""
+    slots = columns.slots
+    distinct = np.empty(len(rows) * slots.shape[1], np.intp)
+    shape = len(rows), slots.shape[1] // 2
+    obs_index, next_index = np.empty(shape, np.int32), np.empty(shape, np.int32)
+    count = _gather(slots, columns.reuse, frames.marks, rows, distinct, obs_index, next_index)
+    return distinct[:count], obs_index, next_index
+
+
+def held(
+    columns: Columns, size: int, ids: NDArray[Any], rows: Slots, priorities: NDArray[np.float64]
+) -> tuple[Slots, NDArray[np.float64]]:
+    """As `coop.replay.table.loops.held`."""
+    kept, given = np.empty(len(rows), np.intp), np.empty(len(rows))
+    count = _held(columns.ids, size, ids, rows, priorities, kept, given)
+    return kept[:count], given[:count]
+
+
+@compiled
+def largest(priorities: NDArray[np.float64]) -> float:
+    """As `coop.replay.table.loops.largest`."""
+    found = 0.0
+    for priority in priorities:
+        if not 0 <= priority < np.inf:
+            return np.nan
+        found = max(found, priority)
+    return found
 
 
 @compiled
@@ -156,3 +188,39 @@ def _drop(slot: int, references: Array, free: Array, free_count: int) -> int:
         return free_count
     free[free_count] = slot
     return free_count + 1
+
+
+@compiled
+def _gather(
+    slots: Array, reuse: Array, marks: Array, rows: Array, distinct: Array, obs_index: Array, next_index: Array
+) -> int:
+    """Write the distinct slots of these rows and the indices, and count the draws; returns how many slots there are."""
+    width, stack = slots.shape[1], obs_index.shape[1]
+    for i in range(len(rows)):
+        reuse[rows[i]] += 1
+        for j in range(width):
+            marks[slots[rows[i], j]] = i * width + j  # the last of equal slots wins
+    count = 0
+    for i in range(len(rows)):
+        for j in range(width):
+            slot = slots[rows[i], j]
+            if marks[slot] == i * width + j:
+                distinct[count] = slot
+                marks[slot] = count
+                count += 1
+    for i in range(len(rows)):
+        for j in range(stack):
+            obs_index[i, j] = marks[slots[rows[i], j]]
+            next_index[i, j] = marks[slots[rows[i], stack + j]]
+    return count
+
+
+@compiled
+def _held(numbers: Array, size: int, ids: Array, rows: Array, priorities: Array, kept: Array, given: Array) -> int:
+    """Write the rows below `size` that hold the transitions, and their priorities; returns how many there are."""
+    count = 0
+    for i in range(len(rows)):
+        if rows[i] < size and numbers[rows[i]] == ids[i]:
+            kept[count], given[count] = rows[i], priorities[i]
+            count += 1
+    return count
