@@ -23,7 +23,7 @@ TASKS = {"cartpole": (195.0, 50_000), "minatar-breakout": (5.0, 150_000)}
 STEPS = {"cartpole": 2, "minatar-breakout": 4}
 # The same for everybody, in place of our preset's.
 PERIODS = {"minatar-breakout": 250}  # updates between two targets
-RATES = {"minatar-breakout": 1e-3}
+RATES = {"minatar-breakout": 2e-3}
 N_STEPS = {"minatar-breakout": 3}  # of a return
 IN_JAX = ("jax", "rejax")
 OURS = {"lockstep": ("coop-lockstep",), "distributed": ("coop-local", "--actors", "1")}
