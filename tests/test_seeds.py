@@ -220,6 +220,39 @@ def test_a_seed_that_diverges_is_marked_and_the_others_go_on(
         assert_same_files(tmp_path / "together" / str(seed), tmp_path / "alone" / str(seed))
 
 
+ENDS: dict[str, tuple[str, dict[str, Any]]] = {
+    "target_return": ("cartpole", {"target_return": 9.0, "total_steps": 5000, "replay": {"eviction": "fifo"}}),
+    "total_episodes": ("cartpole", {"total_episodes": 14, "checkpoint_every": 3}),
+    "total_updates": ("cartpole", {"total_updates": 123, "learner": {"learning_rate_final": 1e-5}}),
+    "total_episodes of games": ("minatar-breakout", {**PICTURES, "total_episodes": 9}),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_each_run_ends_where_it_would_by_itself(end: str, tmp_path: Path) -> None:
+    """And goes on from there, in the middle of a segment too."""
+    preset, changes = ENDS[end]
+    config, seeds = config_of("coop", NARROW, changes, {"replay": {"ratio": 0.3}}, preset=preset), [1, 2, 3]
+    for name in ("together", "alone"):
+        files_of(config, seeds, tmp_path / name, Stop(), together=name == "together")
+    steps, waiting = set(), 0
+    for seed in seeds:
+        one, other = (tmp_path / name / str(seed) for name in ("together", "alone"))
+        assert_same_files(one, other)
+        assert read_summary(one)["exit"] == f"complete: {end.split(maxsplit=1)[0]} reached"
+        steps.add(read_summary(one)["env_steps"])
+        with ExitStack() as stack:
+            runs = [
+                stack.enter_context(closing(LockstepRun(replace(config, seed=seed), path, "test", Start(resume=True))))
+                for path in (one, other)
+            ]
+            assert_same(*(each.run for each in runs))
+            waiting += runs[0].run.memory.waiting
+    assert waiting > 0 or end == "total_updates"
+    assert len(steps) == (1 if end == "total_updates" else 3)
+    assert max(steps) < config.total_steps
+
+
 class StopAt(Stop):
     """A stop after some blocks of steps."""
 
@@ -367,7 +400,7 @@ REFUSED = {
     "env": {"env": {"id": "Acrobot-v1"}}, "edl.feedback": {"edl": {"feedback": "random"}},
     "eval_every": {"eval_every": 9},
     "network.kind": {"network": {"hidden": []}}, "learner.weight_decay": {"learner": {"weight_decay": [0.1]}},
-    "target_return": {"target_return": 9.0}, "replay.n_step": {"replay": {"n_step": 3}},
+    "replay.n_step": {"replay": {"n_step": 3}},
 }  # fmt: skip
 
 

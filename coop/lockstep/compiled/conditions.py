@@ -39,8 +39,6 @@ def why_not(config: RunConfig) -> str:
         ("learner.weight_decay", not any(learner.weight_decay), "0"),
         ("actor.num_envs", config.actor.num_envs == 1, "1"),
         ("eval_every", not config.eval_every, "0"), ("video_every", not config.video_every, "0"),
-        ("total_updates", not config.total_updates, "0"), ("total_episodes", not config.total_episodes, "0"),
-        ("target_return", config.target_return is None, "none"),
     )  # fmt: skip
     if refused := next((f"{name}: only {allowed}" for name, fits, allowed in wanted if not fits), ""):
         return refused

@@ -113,8 +113,8 @@ class Group:
                 directory.record(block.episodes, None)
                 for row in block.metrics:
                     directory.record((), row)
-                if block.run.trainer.diverged:
-                    self._end(block.run, block.run.trainer.diverged)
+                if block.outcome:
+                    self._end(block.run, block.outcome)
         look = time.monotonic() >= self._looked
         if look:
             self._looked = time.monotonic() + LOOK_EVERY

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from coop.common.numbers import METRICS_EVERY
+from coop.common.numbers import METRICS_EVERY, generator_state, set_generator_state
 from coop.common.types import Array, EpisodeEnd, EpisodeRecord, EpisodeRow
 from coop.learner.agent import Agent
 from coop.learner.diagnostics import ARCHIVED
@@ -42,29 +42,36 @@ MOST = 400  # steps of a block
 
 @dataclass(frozen=True)
 class PlayedBlock:
-    """What a block of steps tells of one run: rows for episodes.csv and metrics.jsonl, in order."""
+    """What a block of steps tells of one run: rows for episodes.csv and metrics.jsonl, in order.
+
+    outcome: why the run is over before all its steps; empty if it is not.
+    """
 
     run: Lockstep
     episodes: Sequence[EpisodeRow]
     metrics: Sequence[dict[str, Any]]
+    outcome: str
 
 
 @dataclass(frozen=True)
 class _Block:
-    """What chance decides for n steps.
+    """What chance decides for n steps after the first `step`.
 
     cut, due: whether a segment ends at a step, and whether an update follows it. rows: int64 [n, K], where a step's
     transition goes, -1: nowhere. batch: int64 [n, K, batch]. action: int64 [n, K], -1: the greedy one. s: float64 [n,
-    K]. epsilon: before each step.
+    K], scales: of s. epsilon: before each step. generators: of each run, their states before.
     """
 
+    step: int
     cut: list[bool]
     due: list[bool]
     rows: Ints
     batch: Ints
     action: Ints
     s: NDArray[np.float64]
+    scales: list[float]
     epsilon: list[float]
+    generators: list[tuple[Any, ...]]
 
 
 class Seeds:
@@ -75,7 +82,7 @@ class Seeds:
             None: the one that is trained, as in Algorithm 1.
 
     Attributes:
-        runs: those that have not diverged. step: environment steps done, of each.
+        runs: those that are not over. step: environment steps done, of each.
     """
 
     def __init__(self, runs: Sequence[Lockstep], player: int | None = None) -> None:
@@ -90,9 +97,10 @@ class Seeds:
         self._nets: Networks | PictureNetworks
         self._games, self._nets = _parts(runs, self._agents, self._tables.packing)
         self._waiting: list[tuple[Any, ...]] = []  # steps since the last segment's end
+        self._outcomes = [""] * len(self.runs)
 
     def play(self, most: int) -> list[PlayedBlock]:
-        """Play some steps, at least 1 and about `most`, to the end of a segment; those runs that diverge are dropped.
+        """Play some steps, at least 1 and about `most`, to the end of a segment; those runs that are over are dropped.
 
         A row of metrics, or a due checkpoint, ends a block.
         """
@@ -101,14 +109,15 @@ class Seeds:
         metrics: list[list[dict[str, Any]]] = [[] for _ in self.runs]
         with np.errstate(all="ignore"), torch.inference_mode():
             self._play(block, episodes, metrics)
-        played = [PlayedBlock(*each) for each in zip(self.runs, episodes, metrics, strict=True)]
-        alive = np.array([k for k, run in enumerate(self.runs) if not run.trainer.diverged], np.intp)
+        played = [PlayedBlock(*each) for each in zip(self.runs, episodes, metrics, self._outcomes, strict=True)]
+        alive = np.array([k for k, outcome in enumerate(self._outcomes) if not outcome], np.intp)
         if len(alive) < len(self.runs):
             self._keep(alive)
         return played
 
     def _keep(self, runs: NDArray[np.intp]) -> None:
         self.runs, self._agents = [self.runs[k] for k in runs], [self._agents[k] for k in runs]
+        self._outcomes = [""] * len(self.runs)
         if not self.runs:
             return
         self._games, self._tables, self._nets = self._games.kept(runs), self._tables.kept(runs), self._nets.kept(runs)
@@ -132,40 +141,46 @@ class Seeds:
         config, agent = self.config, self._agents[0]
         steps = range(self.step + 1, self.step + count + 1)
         due = [self._due(step) > self._due(step - 1) for step in steps]
-        cut, lengths, waiting = [], [], 0
+        cut, waiting = [], 0
         for one in due:
             waiting += 1
             cut.append(one or waiting == config.actor.segment_steps)
-            lengths.append(waiting if cut[-1] else 0)
             waiting *= not cut[-1]
         epsilon = [agent.epsilon(step - 1) for step in steps]
         runs, size = len(self.runs), config.learner.batch_size
         rows, action = np.full((count, runs), -1), np.full((count, runs), -1)
         batch, s = np.zeros((count, runs, size), np.int64), np.zeros((count, runs))
-        scales = self._scales(due)
+        generators = [tuple(map(generator_state, self._generators(k))) for k in range(runs)]
+        block = _Block(self.step, cut, due, rows, batch, action, s, self._scales(due), epsilon, generators)
+        for k in range(runs):
+            self._draw(k, block, count)
+        return block
+
+    def _generators(self, k: int) -> tuple[np.random.Generator, ...]:
+        """Of run k: what its actions, its table and s are drawn with."""
+        return self.runs[k]._policy_rng, self._tables.rngs[k], self._agents[k]._noise
+
+    def _draw(self, k: int, block: _Block, count: int) -> None:
+        """Draw what chance decides for the first `count` steps of a block of run k."""
+        config, due, first = self.config, block.due[:count], 0
+        policy, _, noise = self._generators(k)
         # From a full table that draws for nothing else, as many numbers are the same at once.
-        together = config.replay.eviction == "fifo" and self.step >= config.replay.capacity
-        for k, run in enumerate(self.runs):
-            uniform, choose, noise = (
-                run._policy_rng.random,
-                run._policy_rng.integers,
-                self._agents[k]._noise.standard_normal,
-            )
-            if together:
-                batch[due, k] = self._tables.drawn(k, self.step, sum(due))
-            for place, step in enumerate(steps):
-                if uniform() < epsilon[place]:
-                    action[place, k] = choose(agent.spec.num_actions, size=1, dtype=np.int32)[0]
-                if lengths[place]:
-                    first = place + 1 - lengths[place]
-                    rows[first : place + 1, k] = self._tables.rows(k, step - lengths[place], lengths[place])
-                if due[place]:
-                    if not together:
-                        batch[place, k] = self._tables.drawn(k, step)[0]
-                    scale = scales[place]
-                    normal = config.edl.noise == "normal" and scale
-                    s[place, k] = scale * float(noise()) if normal else scale
-        return _Block(cut, due, rows, batch, action, s, epsilon)
+        together = config.replay.eviction == "fifo" and block.step >= config.replay.capacity
+        if together:
+            block.batch[:count][due, k] = self._tables.drawn(k, block.step, sum(due))
+        for place in range(count):
+            step = block.step + place + 1
+            if policy.random() < block.epsilon[place]:
+                block.action[place, k] = policy.integers(self._agents[k].spec.num_actions, size=1, dtype=np.int32)[0]
+            if block.cut[place]:
+                block.rows[first : place + 1, k] = self._tables.rows(k, block.step + first, place + 1 - first)
+                first = place + 1
+            if due[place]:
+                if not together:
+                    block.batch[place, k] = self._tables.drawn(k, step)[0]
+                scale = block.scales[place]
+                normal = config.edl.noise == "normal" and scale
+                block.s[place, k] = scale * float(noise.standard_normal()) if normal else scale
 
     def _scales(self, due: Sequence[bool]) -> list[float]:
         """The scale of s in the update after each step."""
@@ -187,6 +202,7 @@ class Seeds:
         over = np.empty(len(self.runs), np.bool_)
         restarts: list[list[tuple[int, Array]]] = [[] for _ in self.runs]
         actions = np.empty(whole, np.int64)
+        answers = actions, reached, raw_rewards, terminated
         self._errors = np.zeros((sum(block.due), len(self.runs), size), np.float32)
         self._seen = np.zeros((sum(block.due), len(self.runs), 5, size), np.int64)
         done = 0
@@ -213,7 +229,15 @@ class Seeds:
             self._record(ended, episodes)
             if block.due[place] and self.updates % METRICS_EVERY == 0:
                 self._rows(done, metrics)
-        self._follow(actions, (reached, raw_rewards, terminated), restarts)
+            counted = block.due[place] and self.config.total_updates
+            for k in self._reached(self._going() if counted else [k for k, _ in ended]):
+                self._draw_again(k, block, place + 1)
+                self._follow(k, place + 1, answers, restarts[k])
+                self.save_into(k)
+            if all(self._outcomes):
+                return
+        for k in self._going():
+            self._follow(k, count, answers, restarts[k])
         self._push(done)
 
     def _ended(self, over: NDArray[np.bool_], obs: NDArray[np.float32], epsilon: float) -> list[tuple[int, EpisodeEnd]]:
@@ -230,7 +254,7 @@ class Seeds:
     def _update(self, block: _Block, place: int, number: int) -> None:
         """Do update `number` of the block, that of step `place`, in every run; change roles if it is time."""
         nets, learner, role = self._nets, self.config.learner, self._role
-        rate, finite = self._agents[0]._learning_rate(), True
+        rate, finite = self._agents[self._going()[0]]._learning_rate(), True
         for start in range(0, len(self.runs), nets.block):
             runs = slice(start, min(start + nets.block, len(self.runs)))
             given, seen = nets.batches.first(runs.stop - start), self._seen[number, runs]
@@ -247,9 +271,8 @@ class Seeds:
             nets.copy()
             self._versions[1] = self.updates
         self._archive(block, place, number)
-        for run, agent in zip(self.runs, self._agents, strict=True):
-            if not run.trainer.diverged:
-                agent.updates = self.updates
+        for k in self._going():
+            self._agents[k].updates = self.updates
         if not finite:
             self._diverge(np.isfinite(self._errors[number]).all(1), "TD errors")
         if (swapped or self.updates % learner.publish_every == 0) and not (sound := nets.finite(role)).all():
@@ -257,16 +280,27 @@ class Seeds:
 
     def _diverge(self, finite: NDArray[np.bool_], what: str) -> None:
         for k in np.flatnonzero(~finite).tolist():
-            run = self.runs[k]
-            if not run.trainer.diverged:
-                run.trainer.diverged = f"diverged: {what} are not finite at update {self.updates}"
-                run.step = self.step
+            if not self._outcomes[k]:
+                self._outcomes[k] = f"diverged: {what} are not finite at update {self.updates}"
+                self.runs[k].trainer.diverged = self._outcomes[k]
                 self.save_counters(k)
+
+    def _going(self) -> list[int]:
+        """The runs that are not over."""
+        return [k for k, outcome in enumerate(self._outcomes) if not outcome]
+
+    def _reached(self, runs: Sequence[int]) -> Iterator[int]:
+        """Those of these runs that this step has ended, by another end than their steps."""
+        for k in runs:
+            if not self._outcomes[k] and self.step < self.config.total_steps:
+                self._outcomes[k] = self.runs[k].trainer.outcome()
+                if self._outcomes[k]:
+                    yield k
 
     def _archive(self, block: _Block, place: int, number: int) -> None:
         """Give the diagnostics their first transitions."""
-        for k, run in enumerate(self.runs):
-            telemetry = run.trainer.telemetry
+        for k in self._going():
+            telemetry = self.runs[k].trainer.telemetry
             archive = telemetry.diagnostics.archive
             if archive is not None and len(archive) >= ARCHIVED:
                 return
@@ -277,7 +311,7 @@ class Seeds:
         """Number the episodes that have ended."""
         for k, end in ended:
             run = self.runs[k]
-            if not run.trainer.diverged or run.step == self.step:
+            if not self._outcomes[k] or run.step == self.step:
                 number = run.trainer.telemetry.episode(end.episode_return)
                 row = EpisodeRow(number, EpisodeRecord(self.step, 0, 0, end), self.updates, run.agent.feedback_scale())
                 episodes[k].append(row)
@@ -285,47 +319,47 @@ class Seeds:
     def _rows(self, done: int, metrics: list[list[dict[str, Any]]]) -> None:
         """Make the rows of metrics of the interval that ends with the block."""
         self._push(done)
-        for k, run in enumerate(self.runs):
-            if not run.trainer.diverged:
-                self.save_networks(k)
-                self.save_counters(k)
-                with torch.inference_mode(mode=False):  # where views of layers would not know what they are of
-                    row = run.trainer._metrics(time.monotonic())
-                metrics[k] += [] if row is None else [row]
-                run.step = self.step
+        for k in self._going():
+            self.save_networks(k)
+            self.save_counters(k)
+            with torch.inference_mode(mode=False):  # where views of layers would not know what they are of
+                row = self.runs[k].trainer._metrics(time.monotonic())
+            metrics[k] += [] if row is None else [row]
 
     def _push(self, done: int) -> None:
         """Hand the updates of the block to the telemetry."""
-        for k, run in enumerate(self.runs):
-            telemetry = run.trainer.telemetry
-            telemetry.largest_reward = max(telemetry.largest_reward, float(self._tables.largest[k]))
+        for k in self._going():
+            telemetry = self.runs[k].trainer.telemetry
             for number in range(len(self._errors[:done])):
                 ids, age, reuse, lag, terminated = self._seen[number, k]
                 telemetry.add_errors(self._errors[number, k])
                 telemetry._batches.append((age, reuse, lag, terminated, ids))
         self._errors, self._seen = self._errors[done:], self._seen[done:]
 
-    def _follow(
-        self, actions: Ints, answers: tuple[Array, Array, Array], restarts: Sequence[Sequence[tuple[int, Array]]]
-    ) -> None:
-        """Note the actions of a block, and what the emulators answered, as `Lockstep` does step by step.
+    def _follow(self, k: int, count: int, answers: tuple[Array, ...], restarts: Sequence[tuple[int, Array]]) -> None:
+        """Note the first actions of run k in a block, and what its emulator answered, as `Lockstep` does step by step.
 
-        answers: observations, as rows, rewards and terminations: [count, K, ...]. restarts: of each run, the step that
-        ended an episode, and the row that the next one begins with.
+        answers: to the actions: observations, as rows, rewards and terminations: [count, K, ...], after the actions.
+        restarts: the steps that ended an episode, and the rows that the next ones begin with.
         """
-        held, spec = self._tables.packing, self._agents[0].spec
+        run, held, spec = self.runs[k], self._tables.packing, self._agents[0].spec
+        actions, obs, rewards, terminated = (each[:count, k] for each in answers)
         entries = [("obs", spec.frame_dtype, spec.obs_shape), ("reward", np.float64), ("terminated", np.bool_)]
-        shown = np.empty(len(actions), entries)
-        for k, run in enumerate(self.runs):
-            shown["obs"] = held.obs(answers[0][:, k])
-            shown["reward"], shown["terminated"] = answers[1][:, k], answers[2][:, k]
-            start, seen = 0, run._seen
-            for place, first in restarts[k]:
-                begun = held.obs(first[None]).tobytes()
-                seen = zlib.crc32(begun, zlib.crc32(shown[start : place + 1].tobytes(), seen))
-                start = place + 1
-            run._actions += actions[:, k].tolist()
-            run._seen = zlib.crc32(shown[start:].tobytes(), seen)
+        shown = np.empty(count, entries)
+        shown["obs"], shown["reward"], shown["terminated"] = held.obs(obs), rewards, terminated
+        start, seen = 0, run._seen
+        for place, first in restarts:
+            begun = held.obs(first[None]).tobytes()
+            seen = zlib.crc32(begun, zlib.crc32(shown[start : place + 1].tobytes(), seen))
+            start = place + 1
+        run._actions += actions.tolist()
+        run._seen = zlib.crc32(shown[start:].tobytes(), seen)
+
+    def _draw_again(self, k: int, block: _Block, count: int) -> None:
+        """Bring run k's generators to where they are after the first steps of a block."""
+        for rng, state in zip(self._generators(k), block.generators[k], strict=True):
+            set_generator_state(rng, state)
+        self._draw(k, block, count)
 
     def save_into(self, k: int) -> None:
         """Bring run k to where its seed is, so that `Lockstep.save` saves it; it is not to be played on otherwise."""
@@ -344,8 +378,9 @@ class Seeds:
     def save_counters(self, k: int) -> None:
         """Write run k's counters into its trainer."""
         run = self.runs[k]
-        run.step = self.step
+        run.step, telemetry = self.step, run.trainer.telemetry
         self._agents[k].updates = self.updates
+        telemetry.largest_reward = max(telemetry.largest_reward, float(self._tables.largest[k]))
         run.trainer.drawn = msgspec.structs.replace(
             run.trainer.drawn, inserted=self.step, **self._tables.counters(k), episodes=()
         )  # fmt: skip
