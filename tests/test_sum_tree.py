@@ -104,6 +104,10 @@ def test_compiled_loops_give_the_same_bits(capacity: int, seed: int, batches: li
         if plain.total > 0:
             sums = np.minimum(rng.random(64), 1 - 2.0**-53) * plain.total
             np.testing.assert_array_equal(plain.find(sums), compiled.find(sums))
+            places = rng.random(int(rng.integers(1, 100)))
+            rows, drawn = plain.draw(places)
+            assert (drawn > 0).all()
+            np.testing.assert_array_equal(compiled.draw(places), (rows, drawn))
 
 
 def test_sampling_takes_the_compiled_tree_where_numba_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,12 @@ from coop.replay.table.sum_tree import GROUP, GROUP_BITS, SumTree
 class CompiledSumTree(SumTree):
     """As `SumTree`, to the bit."""
 
+    def draw(self, places: Floats) -> tuple[Rows, Floats]:
+        """See `SumTree.draw`."""
+        rows, values = np.empty(len(places), np.intp), np.empty(len(places))
+        _draw(self.levels, self.running, places, rows, values)
+        return rows, values
+
     def update(self, rows: Rows, values: Floats) -> None:
         """See `SumTree.update`."""
         _update(self.levels, self.running, rows, values)
@@ -21,6 +27,17 @@ class CompiledSumTree(SumTree):
         rows = np.empty(len(sums), np.intp)
         _find(self.running, sums, rows)
         return rows
+
+
+@compiled
+def _draw(levels: tuple[Floats, ...], running: tuple[Floats, ...], places: Floats, rows: Rows, values: Floats) -> None:
+    sums, total = np.empty(len(places)), running[-1][0, -1]
+    for i in range(len(places)):
+        sums[i] = (i + places[i]) / len(places) * total
+    _find(running, sums, rows)
+    lowest = levels[0].ravel()
+    for i in range(len(rows)):
+        values[i] = lowest[rows[i]]
 
 
 @compiled

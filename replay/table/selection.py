@@ -98,10 +98,8 @@ class Proportional(Sampling):
 
     def draw(self, count: int, size: int) -> tuple[Rows, NDArray[np.float32]]:
         """Draw once from each share, with importance-sampling weights."""
-        total = self._tree.total
-        shares = (np.arange(count) + self.table.rng.random(count)) / count
-        rows = self._tree.find(shares * total)
-        weights = (size * self._tree.values(rows) / total) ** -self._beta
+        rows, values = self._tree.draw(self.table.rng.random(count))
+        weights = (size * values / self._tree.total) ** -self._beta
         return rows, (weights / weights.max()).astype(np.float32)
 
     def prioritise(self, rows: Rows, priorities: Floats) -> None:

@@ -51,6 +51,11 @@ class SumTree:
         found: Floats = self.levels[0].ravel()[rows]
         return found
 
+    def draw(self, places: Floats) -> tuple[Rows, Floats]:
+        """A row from each of n equal shares of the sum, at its place in [0, 1) there, and the values of these rows."""
+        rows = self.find((np.arange(len(places)) + places) / len(places) * self.total)
+        return rows, self.values(rows)
+
     def update(self, rows: Rows, values: Floats) -> None:
         """Set values; if a row repeats, its last value counts."""
         self.levels[0].ravel()[rows] = values
