@@ -62,6 +62,11 @@ class SegmentAssembler:
         """Steps of each stream since the last flush."""
         return self._steps
 
+    @property
+    def incomplete(self) -> int:
+        """Steps of a stream up to the last flush whose transitions were not complete there."""
+        return max(self._waiting)
+
     def begin(self, obs: Array) -> None:
         """Store the first observations of all streams, <frame_dtype>[envs, *obs_shape]; call once, before `add`."""
         self._frames.restart(range(self._num_envs), obs)

@@ -25,6 +25,9 @@ OF_PICTURES = {
             "env": {"clip_rewards": True},
         },
     ),
+    "returns over three, ends at a limit": (
+        "dqn", {"replay": {"n_step": 3, "ratio": 0.5}, "env": {"max_episode_steps": 13}}
+    ),
     "dead units": ("coop", {"learner": {"learning_rate": 0.05}}),
     "six actions, sgd": ("edql", {"learner": {"optimizer": "sgd"}, "env": {"id": "MinAtar/Breakout-v0"}}),
 }  # fmt: skip
@@ -34,7 +37,8 @@ OF_PICTURES = {
 def test_pictures_are_played_to_the_bit_as_by_itself(case: str) -> None:
     method, *changes = OF_PICTURES[case]
     config = config_of(method, PICTURES, *changes, preset="minatar-breakout")
-    assert_as_by_itself(config, 460 if config.replay.ratio < 1 else 260, (3,) if config.learner.double else (3, 4))
+    one = config.learner.double or config.replay.n_step > 1
+    assert_as_by_itself(config, 460 if config.replay.ratio < 1 else 260, (3,) if one else (3, 4))
 
 
 def test_pictures_that_fill_no_whole_bytes_are_played_too() -> None:

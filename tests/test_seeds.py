@@ -40,6 +40,7 @@ SMALL: dict[str, Any] = {"replay": {"capacity": 100, "learning_starts": 50}, "to
 NARROW: dict[str, Any] = {"network": {"hidden": [32, 32, 32]}}
 PICTURES: dict[str, Any] = {"learner": {"batch_size": 8, "swap_every": 60}, "actor": {"epsilon_start": 0.4}}
 OF_PRESET = {"cartpole": {}, "minatar-breakout": {**PICTURES, "total_steps": 390}}
+SEVERAL: dict[str, Any] = {"replay": {"n_step": 3, "ratio": 0.3}, "checkpoint_every": 30}
 
 
 def config_of(method: str, *changes: dict[str, Any], preset: str = "cartpole") -> RunConfig:
@@ -225,6 +226,10 @@ ENDS: dict[str, tuple[str, dict[str, Any]]] = {
     "total_episodes": ("cartpole", {"total_episodes": 14, "checkpoint_every": 3}),
     "total_updates": ("cartpole", {"total_updates": 123, "learner": {"learning_rate_final": 1e-5}}),
     "total_episodes of games": ("minatar-breakout", {**PICTURES, "total_episodes": 9}),
+    "total_episodes, returns over five": (
+        "minatar-breakout",
+        {**PICTURES, "total_episodes": 9, "replay": {"n_step": 5, "eviction": "reservoir"}},
+    ),
 }
 
 
@@ -239,7 +244,7 @@ def test_each_run_ends_where_it_would_by_itself(end: str, tmp_path: Path) -> Non
     for seed in seeds:
         one, other = (tmp_path / name / str(seed) for name in ("together", "alone"))
         assert_same_files(one, other)
-        assert read_summary(one)["exit"] == f"complete: {end.split(maxsplit=1)[0]} reached"
+        assert read_summary(one)["exit"] == f"complete: {end.replace(',', ' ').split(maxsplit=1)[0]} reached"
         steps.add(read_summary(one)["env_steps"])
         with ExitStack() as stack:
             runs = [
@@ -270,11 +275,12 @@ class StopAt(Stop):
 TWICE = {"total_steps": 600, "checkpoint_every": 130}
 
 
-@pytest.fixture(scope="module", params=["cartpole", "minatar-breakout"])
+@pytest.fixture(scope="module", params=["cartpole", "minatar-breakout", "minatar-breakout, returns over three"])
 def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Path]:
     """Two runs that have been played by themselves."""
     path = tmp_path_factory.mktemp("whole")
-    config = config_of("coop", TWICE, OF_PRESET[request.param], preset=request.param)
+    preset, _, several = request.param.partition(",")
+    config = config_of("coop", TWICE, OF_PRESET[preset], SEVERAL if several else {}, preset=preset)
     files_of(config, [1, 2], path, Stop(), together=False)
     return config, path
 

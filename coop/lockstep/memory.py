@@ -91,8 +91,8 @@ class TableMemory:
 
     @property
     def waiting(self) -> int:
-        """Steps since the last segment's end, which the table does not hold yet."""
-        return self._segments.waiting
+        """Steps that the table does not hold yet; 0 only at a segment's end."""
+        return self._segments.waiting + self._segments.incomplete
 
     def add(self, turn: Turn, step: int) -> None:
         """See `Experience`."""

@@ -45,7 +45,7 @@ def play_runs(
 
 
 def _align(run: Lockstep, directory: RunDirectory) -> None:
-    """Play to the end of a segment, where a stop may have come before it."""
+    """Play to the end of a segment at which every transition is complete: a stop may have come before it."""
     while isinstance(run.memory, TableMemory) and run.memory.waiting and not run.trainer.outcome():
         for effects in run.play():
             directory.record(effects.episodes, effects.metrics)

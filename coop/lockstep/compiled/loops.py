@@ -71,6 +71,7 @@ def gather(
     rewards: Array,
     terminated: Array,
     versions: Array,
+    spans: Array,
     ids: Array,
     reuse: Array,
     rows: Array,
@@ -102,7 +103,7 @@ def gather(
             taken[k, b] = actions[k, row]
             gained[k, b] = rewards[k, row]
             largest[k] = max(largest[k], np.abs(rewards[k, row]))
-            discounts[k, b] = powers[1] * (np.float32(0) if terminated[k, row] else np.float32(1))
+            discounts[k, b] = powers[spans[k, row]] * (np.float32(0) if terminated[k, row] else np.float32(1))
             seen[k, 0, b] = ids[k, row]
             seen[k, 1, b] = now[0] - 1 - ids[k, row]
             seen[k, 2, b] = reuse[k, row]
@@ -119,6 +120,7 @@ def insert(
     new_rewards: Array,
     terminal: Array,
     version: int,
+    span: int,
     number: int,
     capacity: int,
     obs: Array,
@@ -127,6 +129,7 @@ def insert(
     rewards: Array,
     terminated: Array,
     versions: Array,
+    spans: Array,
     ids: Array,
     reuse: Array,
     evicted: Array,
@@ -134,8 +137,9 @@ def insert(
 ) -> None:
     """Put a transition of each run into its row, int64 [K], -1 for none; the columns are as `gather` has them.
 
-    new_obs, new_next: [K, width]. new_actions, new_rewards, terminal: [K]. version, number: of the transition. evicted:
-    int64 [K, buckets], evicted transitions by the bit length of their draws. held: int64 [K], terminal transitions.
+    new_obs, new_next: [K, width]. new_actions, new_rewards, terminal: [K]. version, span, number: of the transition.
+    evicted: int64 [K, buckets], evicted transitions by the bit length of their draws. held: int64 [K], terminal
+    transitions.
     """
     for k in range(rows.shape[0]):
         row = rows[k]
@@ -156,6 +160,7 @@ def insert(
         rewards[k, row] = new_rewards[k]
         terminated[k, row] = terminal[k]
         versions[k, row] = version
+        spans[k, row] = span
         ids[k, row] = number
         reuse[k, row] = 0
 

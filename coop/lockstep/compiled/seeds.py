@@ -30,6 +30,7 @@ from coop.learner.diagnostics import ARCHIVED
 from coop.lockstep.compiled.carts import Carts, cart_of
 from coop.lockstep.compiled.games import Games
 from coop.lockstep.compiled.passes import Networks
+from coop.lockstep.compiled.pending import Pending, Step
 from coop.lockstep.compiled.pictures import PictureNetworks
 from coop.lockstep.compiled.tables import Packing, Tables
 from coop.lockstep.lockstep import Lockstep
@@ -88,7 +89,7 @@ class Seeds:
     def __init__(self, runs: Sequence[Lockstep], player: int | None = None) -> None:
         self.runs, self._player, self.config = list(runs), player, runs[0].config
         self._agents = [run.agent for run in runs if isinstance(run.agent, Agent)]
-        agent = self._agents[0]
+        agent, replay = self._agents[0], self.config.replay
         self.step, self.updates, self._role, self._versions = runs[0].step, agent.updates, agent.acting, agent.versions
         memories = [run.memory for run in runs]
         tables = [memory for memory in memories if isinstance(memory, TableMemory)]
@@ -96,8 +97,8 @@ class Seeds:
         self._games: Carts | Games
         self._nets: Networks | PictureNetworks
         self._games, self._nets = _parts(runs, self._agents, self._tables.packing)
-        self._waiting: list[tuple[Any, ...]] = []  # steps since the last segment's end
-        self._outcomes = [""] * len(self.runs)
+        self._pending, self._outcomes = Pending(replay.n_step, self.config.learner.gamma), [""] * len(self.runs)
+        self._ahead = replay.n_step == 1  # or the ends of episodes decide what a table holds
 
     def play(self, most: int) -> list[PlayedBlock]:
         """Play some steps, at least 1 and about `most`, to the end of a segment; those runs that are over are dropped.
@@ -157,30 +158,29 @@ class Seeds:
         return block
 
     def _generators(self, k: int) -> tuple[np.random.Generator, ...]:
-        """Of run k: what its actions, its table and s are drawn with."""
-        return self.runs[k]._policy_rng, self._tables.rngs[k], self._agents[k]._noise
+        """Of run k: what its actions and s are drawn with ahead, and its table's."""
+        found = self.runs[k]._policy_rng, self._agents[k]._noise, self._tables.rngs[k]
+        return found if self._ahead else found[:2]
 
     def _draw(self, k: int, block: _Block, count: int) -> None:
         """Draw what chance decides for the first `count` steps of a block of run k."""
         config, due, first = self.config, block.due[:count], 0
-        policy, _, noise = self._generators(k)
+        policy, noise, *_ = self._generators(k)
         # From a full table that draws for nothing else, as many numbers are the same at once.
-        together = config.replay.eviction == "fifo" and block.step >= config.replay.capacity
+        together = self._ahead and config.replay.eviction == "fifo" and block.step >= config.replay.capacity
         if together:
             block.batch[:count][due, k] = self._tables.drawn(k, block.step, sum(due))
         for place in range(count):
-            step = block.step + place + 1
             if policy.random() < block.epsilon[place]:
                 block.action[place, k] = policy.integers(self._agents[k].spec.num_actions, size=1, dtype=np.int32)[0]
-            if block.cut[place]:
+            if block.cut[place] and self._ahead:
                 block.rows[first : place + 1, k] = self._tables.rows(k, block.step + first, place + 1 - first)
                 first = place + 1
             if due[place]:
-                if not together:
-                    block.batch[place, k] = self._tables.drawn(k, step)[0]
-                scale = block.scales[place]
-                normal = config.edl.noise == "normal" and scale
-                block.s[place, k] = scale * float(noise.standard_normal()) if normal else scale
+                if self._ahead and not together:
+                    block.batch[place, k] = self._tables.drawn(k, block.step + place + 1)[0]
+                normal = config.edl.noise == "normal" and block.scales[place]
+                block.s[place, k] = block.scales[place] * (float(noise.standard_normal()) if normal else 1.0)
 
     def _scales(self, due: Sequence[bool]) -> list[float]:
         """The scale of s in the update after each step."""
@@ -215,15 +215,15 @@ class Seeds:
             )
             self.step += 1
             ended = self._ended(over, next_obs, block.epsilon[place]) if some_over else []
-            self._waiting.append((block.rows[place], obs, next_obs, action, rewards[place], terminal, self.updates))
+            self._pending.add(Step(obs, next_obs, action, rewards[place], terminal, over.copy(), self.updates))
             for k, _ in ended:
                 games.restart(k)
                 restarts[k].append((place, games.obs[k]))
             if block.cut[place]:
-                for transition in self._waiting:
-                    self._tables.insert(*transition)
-                self._waiting = []
+                self._pending.insert(self._tables, block.rows[: place + 1])
             if block.due[place]:
+                if not self._ahead:
+                    block.batch[place] = self._tables.drawn(0, self._tables.inserted)
                 self._update(block, place, done)
                 done += 1
             self._record(ended, episodes)

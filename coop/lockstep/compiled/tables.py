@@ -22,7 +22,7 @@ Ints = NDArray[np.int64]
 
 _COLUMNS = {
     "actions": np.int64, "rewards": np.float32, "terminated": np.bool_, "param_version": np.int64, "ids": np.int64,
-    "reuse": np.int64,
+    "span": np.int64, "reuse": np.int64,
 }  # fmt: skip
 
 
@@ -147,14 +147,22 @@ class Tables:
         return self.rngs[k].integers(0, min(inserted, self.capacity), (count, self.config.learner.batch_size))
 
     def insert(
-        self, rows: Ints, obs: Array, next_obs: Array, actions: Ints, rewards: Array, terminal: Array, version: int
+        self,
+        rows: Ints,
+        obs: Array,
+        next_obs: Array,
+        actions: Ints,
+        rewards: Array,
+        terminal: Array,
+        version: int,
+        span: int,
     ) -> None:
-        """Put the next transition of every run into its row, int64 [K]; obs, next_obs: [K, width]."""
+        """Put the next transition of every run, over `span` steps, into its row, int64 [K]; obs, next_obs: rows."""
         held = self.columns
         loops.insert(
-            rows, obs, next_obs, actions, rewards, terminal, version, self.inserted, self.capacity, self.obs,
-            self.next_obs, held["actions"], held["rewards"], held["terminated"], held["param_version"], held["ids"],
-            held["reuse"], self.reuse_evicted, self.terminal,
+            rows, obs, next_obs, actions, rewards, terminal, version, span, self.inserted, self.capacity, self.obs,
+            self.next_obs, held["actions"], held["rewards"], held["terminated"], held["param_version"], held["span"],
+            held["ids"], held["reuse"], self.reuse_evicted, self.terminal,
         )  # fmt: skip
         self.inserted += 1
 
@@ -163,9 +171,9 @@ class Tables:
         held = self.columns
         loops.gather(
             self.obs[runs], self.next_obs[runs], held["actions"][runs], held["rewards"][runs],
-            held["terminated"][runs], held["param_version"][runs], held["ids"][runs], held["reuse"][runs], rows,
-            self._powers, batches.x, batches.taken, batches.rewards, batches.discounts, seen, self.largest[runs],
-            np.array((self.inserted, updates)),
+            held["terminated"][runs], held["param_version"][runs], held["span"][runs], held["ids"][runs],
+            held["reuse"][runs], rows, self._powers, batches.x, batches.taken, batches.rewards, batches.discounts, seen,
+            self.largest[runs], np.array((self.inserted, updates)),
         )  # fmt: skip
 
     def counters(self, k: int) -> dict[str, int]:
