@@ -30,8 +30,8 @@ from coop.learner.diagnostics import ARCHIVED
 from coop.lockstep.compiled.carts import Carts, cart_of
 from coop.lockstep.compiled.games import Games
 from coop.lockstep.compiled.passes import Networks
-from coop.lockstep.compiled.pending import Pending, Step
 from coop.lockstep.compiled.pictures import PictureNetworks
+from coop.lockstep.compiled.step_queue import PlayedStep, StepQueue
 from coop.lockstep.compiled.tables import Packing, Tables
 from coop.lockstep.lockstep import Lockstep
 from coop.lockstep.memory import TableMemory
@@ -97,7 +97,7 @@ class Seeds:
         self._games: Carts | Games
         self._nets: Networks | PictureNetworks
         self._games, self._nets = _parts(runs, self._agents, self._tables.packing)
-        self._pending, self._outcomes = Pending(replay.n_step, self.config.learner.gamma), [""] * len(self.runs)
+        self._queue, self._outcomes = StepQueue(replay.n_step, self.config.learner.gamma), [""] * len(self.runs)
         self._ahead = replay.n_step == 1  # or the ends of episodes decide what a table holds
 
     def play(self, most: int) -> list[PlayedBlock]:
@@ -215,12 +215,12 @@ class Seeds:
             )
             self.step += 1
             ended = self._ended(over, next_obs, block.epsilon[place]) if some_over else []
-            self._pending.add(Step(obs, next_obs, action, rewards[place], terminal, over.copy(), self.updates))
+            self._queue.add(PlayedStep(obs, next_obs, action, rewards[place], terminal, over.copy(), self.updates))
             for k, _ in ended:
                 games.restart(k)
                 restarts[k].append((place, games.obs[k]))
             if block.cut[place]:
-                self._pending.insert(self._tables, block.rows[: place + 1])
+                self._queue.insert(self._tables, block.rows[: place + 1])
             if block.due[place]:
                 if not self._ahead:
                     block.batch[place] = self._tables.drawn(0, self._tables.inserted)

@@ -12,7 +12,7 @@ from coop.common.types import Array
 from coop.lockstep.compiled.tables import Tables
 
 
-class Step(NamedTuple):
+class PlayedStep(NamedTuple):
     """A step of K runs. obs, next_obs: rows [K, width]; all others but `version` [K]."""
 
     obs: Array
@@ -24,7 +24,7 @@ class Step(NamedTuple):
     version: int
 
 
-class Pending:
+class StepQueue:
     """Steps on their way to the tables, which get them at the end of each segment, as from `SegmentAssembler`.
 
     Returns over several steps are those of one run: where an episode ends decides how many transitions are complete.
@@ -32,9 +32,9 @@ class Pending:
 
     def __init__(self, n_step: int, gamma: float) -> None:
         self._n_step, self._gamma = n_step, gamma
-        self._steps: list[Step] = []
+        self._steps: list[PlayedStep] = []
 
-    def add(self, step: Step) -> None:
+    def add(self, step: PlayedStep) -> None:
         """Keep a step, whose arrays must not be written again."""
         self._steps.append(step)
 
