@@ -253,6 +253,10 @@ def test_each_run_ends_where_it_would_by_itself(end: str, tmp_path: Path) -> Non
             ]
             assert_same(*(each.run for each in runs))
             waiting += runs[0].run.memory.waiting
+    told = [(tmp_path / "together" / str(seed) / "episodes.csv").read_bytes() for seed in seeds]
+    files_of(config, seeds, tmp_path / "together", Stop(), together=True)
+    assert told == [(tmp_path / "together" / str(seed) / "episodes.csv").read_bytes() for seed in seeds]
+    assert all(read_summary(tmp_path / "together" / str(seed))["env_steps"] in steps for seed in seeds)
     assert waiting > 0 or end == "total_updates"
     assert len(steps) == (1 if end == "total_updates" else 3)
     assert max(steps) < config.total_steps

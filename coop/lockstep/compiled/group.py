@@ -34,7 +34,8 @@ def play_runs(
     for run, directory in files.items():
         _align(run, directory)
     summaries, failed = [], []
-    for _, group in groupby(sorted(files, key=lambda run: run.step), key=lambda run: run.step):
+    place = {run: (run.step, run.trainer.outcome()) for run in files}
+    for _, group in groupby(sorted(files, key=place.__getitem__), key=place.__getitem__):
         played = Group(list(group), files, player)
         played.play(stop, progress)
         summaries += played.summaries
@@ -52,7 +53,7 @@ def _align(run: Lockstep, directory: RunDirectory) -> None:
 
 
 class Group:
-    """Runs that are equally far, at the end of a segment.
+    """Runs that are equally far, at the end of a segment, or that are over.
 
     summaries: of the runs that are over. failed: what could not be completed.
     """
@@ -80,8 +81,9 @@ class Group:
     def play(self, stop: Stop, progress: Callable[[str], None]) -> None:
         """Play to the end."""
         due, total = time.monotonic() + PROGRESS_EVERY, self._config.total_steps
+        over = any(run.trainer.outcome() for *_, run in self._running())
         try:
-            while self._running() and self.step < total and not stop.is_set():
+            while self._running() and not over and self.step < total and not stop.is_set():
                 self.block()
                 if self._running() and time.monotonic() >= due:
                     due = time.monotonic() + PROGRESS_EVERY
@@ -95,7 +97,7 @@ class Group:
             raise
         for seeds, k, run in self._running():
             seeds.save_into(k)
-            self._end(run, stop.reason if seeds.step < total else run.trainer.outcome())
+            self._end(run, run.trainer.outcome() or stop.reason)
 
     def _progress(self) -> str:
         running = self._running()
