@@ -6,6 +6,7 @@ all of them before the next one, so that what it reads stays in the processor's 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -30,6 +31,7 @@ Views = list[tuple[Floats, Floats]]
 BLOCK = 4  # runs that pass through an update together
 LOSSES = {"squared": 0, "mse": 1, "huber": 2}
 INPUTS, ACTIONS = 4, 2
+PAGE = 1024  # numbers; loads and stores of arrays whose addresses differ by whole pages don't hold each other up
 
 
 def loss_of(learner: LearnerSettings) -> tuple[np.float32, int]:
@@ -54,11 +56,20 @@ def views_of(flat: Floats, hidden: tuple[int, ...]) -> Views:
     return found
 
 
+def pages(*shape: int) -> Floats:
+    """Zeros that begin at a page."""
+    count = math.prod(shape)
+    room = np.zeros(count + PAGE, np.float32)
+    start = -room.ctypes.data // 4 % PAGE
+    return room[start : start + count].reshape(shape)
+
+
 class Networks:
     """Both networks of K runs, with their optimizers.
 
     Attributes:
-        theta: float32 [2, K, P]. buffers: the optimizers' running means by name, float32 [trained, K, P].
+        theta: float32 [2, K, P], P rounded up to whole pages, zeros behind a network's parameters. buffers: the
+            optimizers' running means by name, float32 [trained, K, P].
         steps: that each optimizer has taken.
         block: runs that pass through an update together. batches: theirs, for `update`.
     """
@@ -70,14 +81,15 @@ class Networks:
         self._agents, count, config = list(agents), len(agents), agents[0].config
         self.config = config
         hidden, trained = config.network.hidden, 2 if config.two_networks else 1
-        size = size_of(hidden)
-        self.theta = np.zeros((2, count, size), np.float32)
+        self._used = size_of(hidden)
+        size = -(-self._used // PAGE) * PAGE
+        self.theta = pages(2, count, size)
         self.steps = [0] * trained
         probe = make_optimizer(config.learner, self.theta[0, 0], self.theta[0, 0])
-        self.buffers = {name: np.zeros((trained, count, size), np.float32) for name in probe.buffers}
+        self.buffers = {name: pages(trained, count, size) for name in probe.buffers}
         self._finite = np.ones(count, np.bool_)
         self._adam = isinstance(probe, Adam)
-        self._gradient = np.zeros((BLOCK, size), np.float32)
+        self._gradient = pages(BLOCK, size)
         self._parts = views_of(self._gradient, hidden)
         self._views: dict[tuple[int, int, int], Views] = {}
         self._flats: dict[tuple[int, int, int], tuple[Floats, dict[str, Floats]]] = {}
@@ -90,11 +102,11 @@ class Networks:
         self._basis = convert_like(SUM_AND_DIFFERENCE, self.theta)
         for k, agent in enumerate(agents):
             for number, network in enumerate(agent.networks):
-                self.theta[number, k] = network.flat.numpy()
+                self.theta[number, k, : self._used] = network.flat.numpy()
             for number, optimizer in enumerate(agent.optimizers):
                 self.steps[number] = optimizer.steps
                 for name, buffer in self.buffers.items():
-                    buffer[number, k] = optimizer.buffers[name]
+                    buffer[number, k, : self._used] = optimizer.buffers[name]
 
     def _make_buffers(self) -> None:
         """What an update of a block writes between its steps."""
@@ -270,12 +282,12 @@ class Networks:
     def save(self, k: int) -> None:
         """Write run k's networks into its agent."""
         for network, flat in zip(self._agents[k].networks, self.theta[:, k], strict=True):
-            network.load(flat)
+            network.load(flat[: self._used])
 
     def save_means(self, k: int) -> None:
         """Write the state of run k's optimizers into its agent."""
         for number, optimizer in enumerate(self._agents[k].optimizers):
-            means = {name: torch.from_numpy(buffer[number, k]) for name, buffer in self.buffers.items()}
+            means = {name: torch.from_numpy(buffer[number, k, : self._used]) for name, buffer in self.buffers.items()}
             optimizer.load_state({"steps": self.steps[number], **means})
 
     def kept(self, runs: NDArray[np.intp]) -> Networks:
