@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,14 @@ from coop.common.messaging.wire import Message
 from coop.learner.protocol import AnyAgent
 
 
+SOON = 1 << 20  # bytes for all actors, which take less time to send than a thread to wake and to get the interpreter
+
+
 class Broadcaster:
     """Publishes an agent's networks and role, and answers queries with the values published last.
 
-    A thread of its own sends the networks, because that takes as long as many updates where actors are many; meanwhile
-    no others are sent, and the newest ones follow.
+    Small networks are sent at once, where actors are few. All others are sent by a thread of its own, because that takes
+    as long as many updates; meanwhile no others are sent, and the newest ones follow.
 
     env_step: environment steps of the run so far, here and below.
 
@@ -59,7 +63,12 @@ class Broadcaster:
             if version != self._taken[number]:
                 changed.append((number, version, agent.networks[number].snapshot()))
                 self._taken[number] = version
-        self._sent = self._thread.submit(self._send, changed, agent.acting, (agent.updates, env_step))
+        send = partial(self._send, changed, agent.acting, (agent.updates, env_step))
+        actors = self._node.presence.counts().get("actor", 0)
+        if not wait and actors * sum(flat.nbytes for _, _, flat in changed) < SOON:
+            send()
+            return
+        self._sent = self._thread.submit(send)
         if wait:
             self._await()
 
