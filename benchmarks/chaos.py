@@ -133,6 +133,7 @@ def _run() -> None:
         "run": "chaos",
         "actors": options.actors,
         "seed": options.seed,
+        "learner.mirror": "on",
         "total-steps": options.total_steps,
         "checkpoint-every": options.checkpoint_every,
         "replay.capacity": options.total_steps,  # the closing table shows what came in twice at any time

@@ -178,7 +178,7 @@ def fuzz(count: int, seed: int, folder: Path) -> None:
     """Raise a CoopError if a check fails."""
     at = free_endpoint(), free_endpoint()
     ports = [int(endpoint.rpartition(":")[2]) for endpoint in at]
-    flags = ("--preset=cartpole", "--total-steps=100000000", "--replay.ratio=0.1")
+    flags = ("--preset=cartpole", "--learner.mirror=on", "--total-steps=100000000", "--replay.ratio=0.1")
     roles = Roles.of_run(folder, RUN, at, flags, actors=2)
     actor = roles.processes["actor 1"]
     with running(roles, "actor 2"), Node(open_session((), at), RUN, "watch", new_incarnation()) as node:

@@ -49,7 +49,7 @@ class Trial:
         settings = (f"--total-steps={STEPS}", f"--replay.capacity={STEPS}", f"--replay.ratio={RATIO}")
         at = (f"--run={RUN}", f"--run-dir={folder}", "--listen", f"{self._anywhere}:{LEARNER_PORT}")
         flags = {
-            "learner": (*at, "--preset=cartpole", "--replay.journal", *settings),
+            "learner": (*at, "--preset=cartpole", "--learner.mirror=on", "--replay.journal", *settings),
             "replay": self._replay_flags(),
             "actor 1": self.joining,
             "actor 2": self.joining,

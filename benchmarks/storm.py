@@ -60,7 +60,7 @@ class Storm:
         self._flags = {
             "learner": (
                 *(f"--run={RUN}", f"--run-dir={folder}", "--listen", learner_at, "--preset=cartpole"),
-                *("--checkpoint-every=2000", *settings),
+                *("--learner.mirror=on", "--checkpoint-every=2000", *settings),
             ),
             "replay": (*joining, f"--run-dir={folder}", "--listen", replay_at),
             "actor 1": joining,

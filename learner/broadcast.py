@@ -15,15 +15,14 @@ from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message
 from coop.learner.protocol import AnyAgent
 
-
-SOON = 1 << 20  # bytes for all actors, which take less time to send than a thread to wake and to get the interpreter
+SMALL = 1 << 20  # bytes to all actors together, which are sent in less time than a thread takes to wake
 
 
 class Broadcaster:
     """Publishes an agent's networks and role, and answers queries with the values published last.
 
-    Small networks are sent at once, where actors are few. All others are sent by a thread of its own, because that takes
-    as long as many updates; meanwhile no others are sent, and the newest ones follow.
+    Small networks to few actors are sent at once. Others are sent by a thread, because that takes as long as many
+    updates; meanwhile no more are sent, and the newest ones follow.
 
     env_step: environment steps of the run so far, here and below.
 
@@ -65,7 +64,7 @@ class Broadcaster:
                 self._taken[number] = version
         send = partial(self._send, changed, agent.acting, (agent.updates, env_step))
         actors = self._node.presence.counts().get("actor", 0)
-        if not wait and actors * sum(flat.nbytes for _, _, flat in changed) < SOON:
+        if not wait and actors * sum(flat.nbytes for _, _, flat in changed) < SMALL:
             send()
             return
         self._sent = self._thread.submit(send)

@@ -17,7 +17,7 @@ from coop.common.messaging.transport import Node, new_incarnation
 from coop.common.process.console import Console, say
 from coop.common.process.lifecycle import Stop
 from coop.common.process.limits import use_threads
-from coop.common.settings.capacity import MIRROR_SHARE, frame_bytes, mirror_slots, table_slots
+from coop.common.settings.capacity import MIRROR_SHARE, frame_bytes, mirror_slots, mirrors, table_slots
 from coop.common.settings.config import RunConfig
 from coop.common.settings.resuming import settings_digest
 from coop.common.types import EnvSpec
@@ -141,7 +141,7 @@ def training_run(
 
 def _mirror(config: RunConfig, spec: EnvSpec, device: torch.device, console: Console) -> FrameMirror | None:
     """The mirror of the table's frames on the GPU or in this host's memory; None if it is off or there is no room."""
-    if config.learner.mirror == "off":
+    if not mirrors(config, spec):
         return None
     if device.type == "cuda":
         slots, room = table_slots(config, spec), MIRROR_SHARE * torch.cuda.mem_get_info(device)[0] // frame_bytes(spec)

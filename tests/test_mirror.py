@@ -34,7 +34,7 @@ from coop.common.messaging.wire import Message
 from coop.common.process.lifecycle import Stop
 from coop.common.process.limits import MemoryLimit
 from coop.common.process.memory import GrowingRows
-from coop.common.settings.capacity import MIRROR_SHARE, estimated_bytes, mirror_slots
+from coop.common.settings.capacity import MIRROR_SHARE, estimated_bytes, mirror_slots, mirrors
 from coop.common.settings.config import LearnerSettings, ReplaySettings, RunConfig
 from coop.common.settings.effects import without_effect
 from coop.common.settings.resuming import check_resumed
@@ -572,6 +572,15 @@ def test_the_mirror_takes_a_share_of_the_memory(monkeypatch: pytest.MonkeyPatch)
     left = 2**30 - estimated_bytes(atari, 100_000)
     assert slots(100_000) * each <= left / 2 < (slots(100_000) + 1) * each, "the table may be on this machine"
     assert slots(100_000, "reservoir") == 0
+
+
+@pytest.mark.parametrize(
+    ("mirror", "numbers", "kept"),
+    [("auto", 15, False), ("auto", 16, True), ("on", 1, True), ("on", 16, True), ("off", 16, False)],
+)
+def test_frames_hardly_larger_than_their_names_are_mirrored_if_asked(mirror: Any, numbers: int, kept: bool) -> None:
+    config = replace(CONFIG, learner=replace(CONFIG.learner, mirror=mirror))
+    assert mirrors(config, EnvSpec("floats", (numbers,), "float32", 1, 2)) == kept
 
 
 def test_rows_that_grow_keep_what_they_held() -> None:

@@ -149,7 +149,7 @@ def test_an_actors_emulators_act_in_groups(tmp_path: Path, endpoint: str) -> Non
     """All streams arrive, each whole: what it read is what the journal has, bit for bit."""
     path = tmp_path / "run"
     flags = ("--preset", "cartpole", "--total-steps", "1500", "--replay.journal", "--run-dir", str(path))
-    flags += ("--network.hidden", "32")
+    flags += ("--network.hidden", "32", "--learner.mirror", "on")
     actor = ("--connect", endpoint, "--envs", "5", "--groups", "2")
     with (
         Command("coop-local", "--actors", "0", "--listen", endpoint, *flags) as head,

@@ -126,8 +126,32 @@ def test_an_older_broadcast_that_comes_before_the_answer_is_not_followed_after_i
     assert (policy.acting, follower.progress) == (1, (15, 0))
 
 
-def test_broadcasts_that_take_long_hold_up_no_update(nodes: tuple[Node, Node], spec: EnvSpec) -> None:
+@pytest.mark.parametrize(("hidden", "at_once"), [(513, True), (514, False)])
+def test_small_networks_are_sent_at_once(nodes: tuple[Node, Node], spec: EnvSpec, hidden: int, at_once: bool) -> None:
+    """Those below 1 MiB for all actors, here one; others by a thread."""
+    learner, _ = nodes
+    agent = Agent(replace(CONFIG, network=NetworkSettings(hidden=(hidden, 503))), spec)
+    assert (agent.networks[0].snapshot().nbytes < 1 << 20) == at_once
+    broadcaster, publish, by = Broadcaster(learner, agent), learner.publish, set[int]()
+
+    def noted(key: str, payload: bytearray) -> None:
+        by.add(threading.get_ident())
+        publish(key, payload)
+
+    learner.publish = noted  # type: ignore[method-assign]
+    until(lambda: learner.presence.counts().get("actor") == 1)
+    change(agent, 0, 1)
+    broadcaster.publish()
+    broadcaster.close()
+    assert (by == {threading.get_ident()}) == at_once
+    assert len(by) == 1
+
+
+def test_broadcasts_that_take_long_hold_up_no_update(
+    nodes: tuple[Node, Node], spec: EnvSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What changes meanwhile follows in one broadcast, and no role names weights that have not been sent."""
+    monkeypatch.setattr("coop.learner.broadcast.SMALL", 0)
     learner, _ = nodes
     agent, broadcaster, policy, follower = followed(nodes, spec)
     publish, gate, sent = learner.publish, threading.Event(), []

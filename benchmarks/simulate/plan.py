@@ -115,7 +115,7 @@ def make_plan(seed: int) -> Plan:
         prefetch=draw.choice((1, 2, 4, 8)),
         window=draw.choice((1, 2, 4)),
         journal=draw.choice(("sync", "sync", "async", "async", "async", "off")),
-        mirror=draw.choice(("auto", "off")),
+        mirror=draw.choice(("on", "off")),
         sampling=draw.choice(("uniform", "uniform", "prioritized")),
         every=every,
         actors=actors,

@@ -18,6 +18,7 @@ from coop.common.types import EnvSpec
 SLOT_BYTES = 3 * 4 + 8  # counters of a frame's slot, and its number
 HEADER_BYTES = 1 << 20  # of a message, including the alignment of its arrays
 NAME_BYTES = 4 + 8 + 4  # slot, number and place of a frame in an answer to a draw
+MIRRORED_BYTES = 4 * NAME_BYTES  # of a frame: to name a smaller one costs more than to send it again
 MIRROR_SHARE = 0.25  # of the learner's memory, or what is free of its GPU's: the most for its mirror of the frames
 SPARE_SLOTS = 4096
 
@@ -37,6 +38,12 @@ def check_memory(config: RunConfig, spec: EnvSpec) -> None:
     needed, limit = _most_bytes(config, spec), memory_limit()
     if needed > limit.size:
         raise UsageError(f"replay.capacity = {config.replay.capacity:,}: needs up to {needed / 2**30:.1f} GiB, {limit}")
+
+
+def mirrors(config: RunConfig, spec: EnvSpec) -> bool:
+    """Whether the learner keeps a mirror of the table's frames, where it has room."""
+    mirror = config.learner.mirror
+    return mirror == "on" or (mirror == "auto" and frame_bytes(spec) >= MIRRORED_BYTES)
 
 
 def mirror_slots(config: RunConfig, spec: EnvSpec) -> int:

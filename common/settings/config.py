@@ -121,8 +121,9 @@ class LearnerSettings:
     """CPU threads that PyTorch uses in the learner."""
     prefetch: Annotated[int, Meta(gt=0, le=MAX_AHEAD // 4)] = 8
     """Batches that are asked for ahead."""
-    mirror: Literal["auto", "off"] = "auto"
-    """auto: keep copies of the table's frames, in at most a quarter of the memory, so that each is sent once."""
+    mirror: Literal["auto", "on", "off"] = "auto"
+    """on: keep copies of the table's frames, in at most a quarter of the memory, so that each is sent once; auto: of
+    frames of 64 bytes or more."""
     publish_every: Positive = 10
     """Updates between broadcasts of the acting network; every swap is broadcast too."""
 
