@@ -20,6 +20,7 @@ from coop.common.process.limits import memory_limit
 from coop.common.process.output import complain, flush_at_end, on_output_gone, warn
 
 SUPERVISED = "COOP_SUPERVISED"  # process id of a supervisor whose death must end this process, also while it starts
+SUPERVISOR_EVERY = 0.02  # seconds between looks for the supervisor, and for who handles signals
 LOOK_EVERY = 0.5  # seconds after which a wait notices a signal that came just before it began
 LEFT = 2.0  # seconds for users' threads to end by themselves
 _OUT_OF_MEMORY = (
@@ -72,6 +73,7 @@ class Stop:
         self.failed = False
         self.exit_status = 0
         self._handler: Handler | None = None
+        self._look_at = 0.0
 
     def set(self, reason: str, failed: bool = False, exit_status: int = 0) -> None:
         """Request the stop; a later call does not change the reason, `failed` or `exit_status`."""
@@ -82,10 +84,13 @@ class Stop:
 
     def is_set(self) -> bool:
         """True once a stop was requested, or once this process's supervisor has gone."""
-        if self._parent is not None and os.getppid() != self._parent:
-            self.set("the supervisor is gone")
-        if self._handler is not None and {signal.getsignal(number) for number in SIGNALS[:2]} != {self._handler}:
-            self._take_signals(self._handler)  # users' code has taken them over
+        now = time.monotonic()
+        if now >= self._look_at:  # which takes long beside a step of a small environment
+            self._look_at = now + SUPERVISOR_EVERY
+            if self._parent is not None and os.getppid() != self._parent:
+                self.set("the supervisor is gone")
+            if self._handler is not None and {signal.getsignal(number) for number in SIGNALS[:2]} != {self._handler}:
+                self._take_signals(self._handler)  # users' code has taken them over
         return self._set
 
     def wait(self, seconds: float) -> bool:
