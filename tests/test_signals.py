@@ -1,6 +1,7 @@
 """How a command ends after a signal, whenever it comes: 130 after SIGINT, 143 after SIGTERM."""
 
 import json
+import os
 import signal
 import subprocess
 import sysconfig
@@ -9,9 +10,10 @@ from pathlib import Path
 
 import pytest
 from commands import Command, lines, run_command, wait_for
+from samples import until
 
 from coop.common.errors import PeerLost
-from coop.common.process.lifecycle import Stop
+from coop.common.process.lifecycle import SUPERVISED, Stop
 
 pytestmark = pytest.mark.timeout(300)  # several processes a test, also on a busy machine
 
@@ -45,7 +47,7 @@ def test_while_a_command_starts(name: str, number: signal.Signals, tmp_path: Pat
 
 INSIDE_WAIT = """
 import os, signal, time
-from coop.common.process.lifecycle import Stop
+from coop.common.process.lifecycle import SUPERVISED, Stop
 stop = Stop()
 stop.on_signals()
 with stop._changed:  # as `wait` does for a moment
@@ -132,6 +134,29 @@ def test_the_first_reason_tells_the_status() -> None:
     lost.set("the learner has gone", failed=True)
     with pytest.raises(PeerLost, match="the learner has gone"):
         lost.raise_for_status()
+
+
+def test_signals_taken_over_again_and_again_are_taken_back() -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    stop = Stop()
+    try:
+        stop.on_signals()
+        ours = signal.getsignal(signal.SIGINT)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+            until(lambda number=number: not stop.is_set() and signal.getsignal(number) == ours, 5.0)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def test_a_supervisor_that_goes_at_any_time_stops_its_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SUPERVISED, str(os.getppid()))
+    stop = Stop()
+    assert not stop.is_set()
+    monkeypatch.setattr(os, "getppid", lambda: 1)
+    until(stop.is_set, 5.0)
+    assert (stop.reason, stop.exit_status) == ("the supervisor is gone", 0)
 
 
 def test_only_a_second_sigint_interrupts_at_once() -> None:
