@@ -45,6 +45,13 @@ def test_every_command_and_preset_is_in_the_reference() -> None:
     assert "| `pong-small` | `pong` | 1,000,000 | 10,000 |" in reference.presets_reference()
 
 
+def test_each_row_of_a_reference_is_one_line() -> None:
+    tables = (reference.settings_reference(), reference.commands_reference(), reference.metrics_reference())
+    rows = [line for table in tables for line in table.splitlines() if line.startswith("| ") or line.endswith(" |")]
+    assert len(rows) > 200
+    assert not [row for row in rows if not (row.startswith("| ") and row.endswith(" |"))]
+
+
 @pytest.mark.parametrize("page", [page for page in pages.page_names() if places.marks(pages.read(page))])
 def test_marked_lines_are_quoted(page: str) -> None:
     for file, mark in places.marks(pages.read(page)):

@@ -183,6 +183,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text for a cell of a table; what Markdown would read as HTML or as a border is escaped."""
+    """Text for a cell of a table, on one line; what Markdown would read as HTML or as a border is escaped."""
+    text = " ".join(text.split())
     safe = text if text.startswith("`") else html.escape(text, quote=False)
     return safe.replace("|", "\\|")
