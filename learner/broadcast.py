@@ -15,7 +15,7 @@ from coop.common.messaging.transport import Node
 from coop.common.messaging.wire import Message
 from coop.learner.protocol import AnyAgent
 
-SMALL = 1 << 20  # bytes to all actors together, which are sent in less time than a thread takes to wake
+SMALL = 1 << 20  # bytes to all actors together, for which no other thread is woken
 
 
 class Broadcaster:
@@ -64,12 +64,10 @@ class Broadcaster:
                 self._taken[number] = version
         send = partial(self._send, changed, agent.acting, (agent.updates, env_step))
         actors = self._node.presence.counts().get("actor", 0)
-        if not wait and actors * sum(flat.nbytes for _, _, flat in changed) < SMALL:
+        if wait or actors * sum(flat.nbytes for _, _, flat in changed) < SMALL:
             send()
-            return
-        self._sent = self._thread.submit(send)
-        if wait:
-            self._await()
+        else:
+            self._sent = self._thread.submit(send)
 
     def publish_role(self) -> None:
         """Repeat the role of the last broadcast, unless a new one is on its way."""

@@ -47,7 +47,7 @@ def test_while_a_command_starts(name: str, number: signal.Signals, tmp_path: Pat
 
 INSIDE_WAIT = """
 import os, signal, time
-from coop.common.process.lifecycle import SUPERVISED, Stop
+from coop.common.process.lifecycle import Stop
 stop = Stop()
 stop.on_signals()
 with stop._changed:  # as `wait` does for a moment

@@ -18,7 +18,7 @@ from coop.common.types import EnvSpec
 SLOT_BYTES = 3 * 4 + 8  # counters of a frame's slot, and its number
 HEADER_BYTES = 1 << 20  # of a message, including the alignment of its arrays
 NAME_BYTES = 4 + 8 + 4  # slot, number and place of a frame in an answer to a draw
-MIRRORED_BYTES = 4 * NAME_BYTES  # of a frame: to name a smaller one costs more than to send it again
+MIRRORED_BYTES = 4 * NAME_BYTES  # of a frame: smaller ones are sent again, which saves their names
 MIRROR_SHARE = 0.25  # of the learner's memory, or what is free of its GPU's: the most for its mirror of the frames
 SPARE_SLOTS = 4096
 
