@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import binomtest
 
 from coop.common.process.lifecycle import Stop
+from coop.studies.report.plots import draw
 from results.cartpole.hold import play, verdict
 from results.cells import claimed, play_cell, sealed
 
@@ -113,6 +114,21 @@ def test_evictions_count_sizes_that_end_well_by_seed_and_pair() -> None:
     mean = (wells["g-coop", "reservoir"] - wells["dqn", "reservoir"] + wells["coop", "reservoir"] - wells["edql", "reservoir"]) / 2  # fmt: skip  # noqa: E501
     assert found["mean"]["reservoir"] == pytest.approx(mean)
     assert found["mean"]["fifo - reservoir"] == pytest.approx(found["mean"]["fifo"] - found["mean"]["reservoir"])
+
+
+def test_figures_show_the_share_of_seeds_that_end_well(tmp_path: Path) -> None:
+    other = dict.fromkeys(("last", "area", "churn", "q_share"), 0.0) | {"collapsed": False, "finite": True}
+    runs = runs_of({"dqn": 0.2, "coop": 0.5, "one-actor": 0.7}).assign(**other)
+    first, second = (figure.points().frame.set_index(["panel", "line"]) for figure in verdict.figures(runs))
+    assert list(first.loc[("fifo", "coop"), "x"]) == [300, 5000]
+    assert list(first.loc[("fifo", "coop"), "y"]) == pytest.approx([0.5, 0.5])
+    assert set(first.index) == set(product(verdict.EVICTIONS, ("dqn", "coop")))
+    low, high = verdict.exact(21, 30)
+    (row,) = second.loc[[("reservoir, 5,000 transitions", "one-actor")]].to_dict("records")
+    assert row == {"x": 5.0, "y": pytest.approx(0.7), "low": pytest.approx(low), "high": pytest.approx(high)}
+    for figure in verdict.figures(runs):
+        draw(figure, tmp_path / f"{figure.name}.png")
+    assert "E" not in verdict.tables(runs)
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 30), (1, 30), (17, 30), (30, 30)])

@@ -6,7 +6,6 @@ plan must be the one whose SHA-256 the packed file holds.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from itertools import product
@@ -16,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from PIL import Image
 from scipy.special import stdtr
 
 from coop.studies.report.intervals import Interval, over_seeds
-from coop.studies.report.plots import Figure, Line, Panel, draw
+from coop.studies.report.plots import Figure, Line, Panel
 from results.cartpole.edl.packed import PLAN, registered, unpacked
+from results.printing import command, print_tables
 
 FILE = Path("results/cartpole/edl/dissection.parquet")
 MARGIN = 3.0  # percent of none's mean area
@@ -331,37 +330,18 @@ def layers_table(data: Data) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _small(path: Path) -> None:
-    """Store a figure with a palette of colours, in a third of the bytes."""
-    Image.open(path).convert("RGB").quantize(48).save(path, optimize=True)
-
-
-def printed(table: pd.DataFrame) -> str:
-    """A table as Markdown, numbers with three digits after the point at most."""
-    shown = table.map(lambda value: f"{value:.4g}" if isinstance(value, float) else str(value))
-    lines = [shown.columns.map(str), ["---"] * len(shown.columns), *shown.to_numpy()]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def main() -> None:
     """Print the tables, or draw the figures."""
-    parser = argparse.ArgumentParser(
-        "python -m results.cartpole.edl.verdict", description=(__doc__ or "").split("\n")[0]
-    )
-    parser.add_argument("what", nargs="?", default="tables", choices=["tables", "figures"])
-    parser.add_argument("--file", type=Path, default=FILE)
-    args = parser.parse_args()
-    data = load(args.file)
-    if args.what == "figures":
-        for figure in (forest(data), by_layer(data, 16)):
-            path = args.file.parent / "report" / f"{figure.name}.png"
-            path.parent.mkdir(exist_ok=True)
-            draw(figure, path)
-            _small(path)
-        return
-    found = tables(data)
-    for name, table in found.items():
-        print(f"\n{name}\n\n{printed(table)}")
+    command("results.cartpole.edl.verdict", __doc__, FILE, _print, lambda path: _figures(load(path)))
+
+
+def _figures(data: Data) -> list[Figure]:
+    return [forest(data), by_layer(data, 16)]
+
+
+def _print(path: Path) -> None:
+    found = tables(load(path))
+    print_tables(found)
     print(f"\nEDL under RMSProp and Adam is off: {verdict(found['a'])}")
     for optimizer, part in found["d"][found["d"]["depth"] == max(DEPTHS)].groupby("optimizer", sort=False):
         print(f"vanishing at depth 16, {optimizer}: {vanishing(part)}")

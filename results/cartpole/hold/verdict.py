@@ -1,12 +1,12 @@
 """The rules of results/cartpole/hold/plan.md, applied to its packed runs: E, P and the answer.
 
-`python -m results.cartpole.hold.verdict` prints the tables of the complete cells as Markdown; a rule whose
-cells are not says so. The plan and the grid must be those whose SHA-256 the packed file holds.
+`python -m results.cartpole.hold.verdict` prints the tables of the complete cells as Markdown, `figures` draws the
+figures; a rule whose cells are not complete says so. The plan and the grid must be those whose SHA-256 the packed file
+holds.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterable
 from itertools import product
@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv, stdtr
 from scipy.stats import binomtest
 
-from coop.studies.report.intervals import over_seeds
-from results.cartpole.edl.verdict import holm, printed
+from coop.studies.report.intervals import Interval, over_seeds
+from coop.studies.report.plots import Figure, Line, Panel
+from results.cartpole.edl.verdict import holm
 from results.cartpole.hold.play import FILE, PACKED, SIZES
+from results.printing import command, print_tables
 
 ENDS_WELL, LEVEL, MARGIN = 195, 0.05, 0.25  # the margin in settings of four
 EVICTIONS = ("fifo", "reservoir")
@@ -178,20 +180,66 @@ def settings_of(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """All tables by name, as far as their cells are complete."""
+    found = {"cells": cells(runs), "settings": settings_of(runs), "E": evictions(runs), "P": parts(runs)}
+    return {name: table for name, table in found.items() if table is not None}
+
+
+def ends_well(runs: pd.DataFrame) -> Figure:
+    """Part 1: share of seeds that end well by capacity, eviction and method."""
+    table, panels = cells(runs), []
+    for eviction in EVICTIONS:
+        lines = []
+        for method in (name for pair in zip(*PAIRS, strict=True) for name in pair):
+            part = table[(table["eviction"] == eviction) & (table["variant"] == method)].sort_values("capacity")
+            lines.append(Line(method, part["capacity"].to_numpy(np.float64), _share(part)))
+        panels.append(Panel(eviction, "capacity", "share of seeds", lines, True, sizes=True, share=True))
+    text = "Return of the last 100 episodes of 195 or more; exact 95 % intervals."
+    return Figure("ends_well", "Runs that end well", text, _counts(runs), panels, same_y=True)
+
+
+def by_part(runs: pd.DataFrame) -> Figure:
+    """Part 2: share of seeds that end well by setting and variant."""
+    table, panels, shown = cells(runs), [], ("g-coop", *OTHERS)
+    for eviction, capacity, _ in SETTINGS:
+        part = table[(table["eviction"] == eviction) & (table["capacity"] == capacity)].set_index("variant")
+        lines = [
+            Line(name, np.array([float(place)]), _share(part.loc[[name]]))
+            for place, name in enumerate(shown)
+            if name in part.index
+        ]
+        title = f"{eviction}, {capacity:,} transitions"
+        panels.append(Panel(title, "", "share of seeds", lines, True, share=True, ticks=shown))
+    text = "Return of the last 100 episodes of 195 or more; exact 95 % intervals."
+    return Figure("parts", "Parts of having two networks", text, _counts(runs), panels)
+
+
+def _share(rows: pd.DataFrame) -> Interval:
+    return Interval(*(rows[name].to_numpy(np.float64) for name in ("well", "well_low", "well_high")))
+
+
+def _counts(runs: pd.DataFrame) -> str:
+    return f"{runs['seed'].nunique()} seeds of each cell."
+
+
 def main() -> None:
-    """Print the tables and the answer."""
-    parser = argparse.ArgumentParser(
-        "python -m results.cartpole.hold.verdict", description=(__doc__ or "").split("\n")[0]
-    )
-    parser.add_argument("--file", type=Path, default=FILE)
-    runs = load(parser.parse_args().file)
-    for name, table in {"cells": cells(runs), "settings of part 2": settings_of(runs)}.items():
-        print(f"\n{name}\n\n{printed(table)}")
-    for name, rule in {"E": evictions(runs), "P": parts(runs)}.items():
-        print(f"\n{name}\n\n{'not all of its cells are complete' if rule is None else printed(rule)}")
-    rule = parts(runs)
-    if rule is not None:
-        print(f"\nThe answer: {'; '.join(answer(rule))}.")
+    """Print the tables and the answer, or draw the figures."""
+    command("results.cartpole.hold.verdict", __doc__, FILE, _print, lambda path: figures(load(path)))
+
+
+def figures(runs: pd.DataFrame) -> list[Figure]:
+    """Those of the page."""
+    return [ends_well(runs), by_part(runs)]
+
+
+def _print(path: Path) -> None:
+    found = tables(load(path))
+    print_tables(found)
+    if "P" in found:
+        print(f"\nThe answer: {'; '.join(answer(found['P']))}.")
+    if missing := {"E", "P"} - set(found):
+        print(f"\nNot all cells are complete of the rules {', '.join(sorted(missing))}.")
 
 
 if __name__ == "__main__":

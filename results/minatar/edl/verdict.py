@@ -1,12 +1,11 @@
 """The rules of results/minatar/edl/plan.md on the outcome of the study, applied to its packed runs.
 
 `python -m results.minatar.edl.verdict` prints, as Markdown, what the phases before it decided, as far as they are over,
-and the study's tables once all of its cells are.
+and the study's tables once all of its cells are; `figures` draws the study's figure.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,10 +16,12 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
-from coop.studies.report.intervals import over_seeds
-from results.cartpole.edl.verdict import holm, printed
+from coop.studies.report.intervals import Interval, over_seeds
+from coop.studies.report.plots import Figure, Line, Panel
+from results.cartpole.edl.verdict import holm
 from results.minatar.edl import rules
 from results.minatar.edl.play import FILE, EdlGrid, due, rows_of
+from results.printing import command, print_tables
 
 LARGE = 100_000  # transitions
 MARGIN, LEVEL = 5.0, 0.05  # points: percent of dqn's mean area with LARGE in the same game
@@ -127,26 +128,50 @@ def areas(rows: pd.DataFrame) -> pd.DataFrame:
     return table.assign(diverged=groups["finite"].agg(lambda finite: int((~finite).sum()))).reset_index()
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(
-        "python -m results.minatar.edl.verdict", description=(__doc__ or "").split("\n")[0]
+def forest(rows: pd.DataFrame) -> Figure:
+    """The outcome of each pair by game, and pooled, with each seed's value."""
+    values, panels = differences(rows), []
+    means = values.groupby(["pair", "seed"], sort=False)["points"].mean().reset_index()
+    places = {name: float(place) for place, name in enumerate(PAIRS)}
+    for title, part in [*values.groupby("game", sort=False), ("mean of both games", means)]:
+        lines = []
+        for name, group in part.groupby("pair", sort=False):
+            points = group["points"].to_numpy(np.float64)
+            found, nothing = decide(points), np.full(len(points), np.nan)
+            dots = Interval(points, nothing, nothing)
+            lines.append(Line(f"{name}, seeds", np.full(len(points), places[name]), dots, faint=True))
+            bar = Interval(*(np.array([each]) for each in (found.points, found.low, found.high)))
+            lines.append(Line(name, np.array([places[name]]), bar))
+        panels.append(Panel(str(title), "", "points", lines, True, ticks=list(PAIRS), reference=0.0))
+    text = (
+        f"{' minus '.join(['300', f'{LARGE:,}'])} transitions, two minus one, percent of dqn's area with {LARGE:,}; "
+        "means over seeds with 95 % t intervals, not corrected, and each seed."
     )
-    parser.add_argument("--file", type=Path, default=FILE)
-    rows = rows_of(None, parser.parse_args().file)
+    return Figure("forest", "What the small buffer costs", text, "", panels, same_y=True)
+
+
+def main() -> None:
+    """Print the tables, or draw the figure."""
+    command("results.minatar.edl.verdict", __doc__, FILE, _print, lambda path: [forest(rows_of(None, path))])
+
+
+def _print(path: Path) -> None:
+    rows = rows_of(None, path)
     over = set(rows["phase"]) if len(rows) else set()
     left = due(EdlGrid(), rows)
     before = {cell.phase for cell in left}
-    tables = {"pilot": rules.driven, "double": rules.targets, "rates": rules.rates}
-    for name, rule in tables.items():
-        if name in over and name not in before:
-            print(f"\n{name}\n\n{printed(rule(rows))}")
+    phases = {"pilot": rules.driven, "double": rules.targets, "rates": rules.rates}
+    print_tables({name: rule(rows) for name, rule in phases.items() if name in over and name not in before})
     if left:
         print(f"\n{len(left)} cells of the phase {left[0].phase} are left")
         return
-    for name, table in {"areas": areas(rows), "by game": by_game(rows), "pooled": pooled(rows)}.items():
-        print(f"\n{name}\n\n{printed(table)}")
+    print_tables(tables(rows))
     print(f"\nThe buffer gets by with less through: {answer(pooled(rows))}.")
+
+
+def tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """The tables of the study, once it is complete."""
+    return {"areas": areas(rows), "games": by_game(rows), "pooled": pooled(rows)}
 
 
 if __name__ == "__main__":
