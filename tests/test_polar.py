@@ -1,5 +1,6 @@
 """G^(-1/2) e against an eigenvalue decomposition, and the limits beyond which its results are called inaccurate."""
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from coop.common.types import Array
 from coop.learner.edl.polar import (
     SCALES,
-    _paired,
+    _pairing,
     _scales,
     inverse_root,
     newton_schulz,
@@ -231,13 +232,35 @@ def test_a_matrix_of_0_gets_a_factor_by_chance() -> None:
         torch.testing.assert_close(one @ one.t(), torch.eye(3))
 
 
+@pytest.mark.parametrize(("dtype", "accurate"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+@pytest.mark.parametrize("shape", [(5, 9), (9, 5), (6, 6)])
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_blocks_of_reflections_are_the_reflections_one_by_one(
+    lost: int, shape: tuple[int, int], dtype: torch.dtype, accurate: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Samples without error are columns of 0, whose reflections are none."""
+    generator = torch.Generator().manual_seed(lost)
+    left, right = (torch.randn(4, n, generator=generator, dtype=dtype) for n in shape)
+    left[:lost], right[2] = 0, right[3]
+    found = []
+    for limit in (0, 1000):
+        monkeypatch.setattr(sys.modules[polar.__module__], "_BLOCKED", limit)
+        found.append(polar_of_product(left, right, np.random.default_rng(lost)))
+    torch.testing.assert_close(*found, rtol=0, atol=accurate)
+    assert not torch.equal(*found), "one path for both"
+    short = found[0] if shape[0] <= shape[1] else found[0].t()
+    torch.testing.assert_close(short @ short.t(), torch.eye(len(short), dtype=dtype), rtol=0, atol=accurate)
+
+
 def test_each_null_direction_has_a_sign_of_its_own() -> None:
     rng = np.random.default_rng(0)
     seen = set()
     for _ in range(50):
-        paired = _paired(3, 4, 1, rng)
-        assert paired[0].tolist() == [1, 0, 0, 0]
-        seen.add(tuple(paired[1:].sum(1).tolist()))
+        columns, signs = (each.tolist() for each in _pairing(3, 4, 1, rng))
+        assert (columns[0], signs[0]) == (0, 1)
+        assert len(set(columns)) == 3
+        assert set(columns) <= set(range(4))
+        seen.add(tuple(signs[1:]))
     assert seen == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
 
 

@@ -12,7 +12,8 @@ from coop.learner.edl.arrays import ArrayT, convert_like, namespace, widened
 
 _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # the two other indices of three
 _NUDGE = 1e-13  # of the largest entry of a matrix whose SVD fails
-_SMALL = 8  # the shorter side up to which an SVD is faster than the algebra with a Gram matrix
+_SMALL = 16  # the shorter side up to which an SVD is faster than the algebra with a Gram matrix
+_BLOCKED = 1 << 15  # entries from which on products of blocks are faster than LAPACK's reflections one by one
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,17 +197,41 @@ def polar_of_product(left: Tensor, right: Tensor, rng: np.random.Generator) -> T
     The pairing is a signed permutation drawn from rng, which has the mean (0) and the covariance of an orthogonal
     matrix drawn uniformly. A fixed pairing would push the weights the same way in every update.
     """
-    r, m, n = len(left), left.shape[1], right.shape[1]
+    if left.shape[1] > right.shape[1]:
+        return polar_of_product(right, left, rng).t()
+    r, m, n, dtype = len(left), left.shape[1], right.shape[1], left.dtype
     (q, q_tau), (p, p_tau) = torch.geqrf(left.t().double()), torch.geqrf(right.t().double())
     corner = q[:r].triu() @ p[:r].triu().t()
     if not corner.sum().isfinite():
-        return torch.full((m, n), torch.nan, dtype=left.dtype, device=left.device)
+        return torch.full((m, n), torch.nan, dtype=dtype, device=left.device)
     u, values, vh = svd(corner)
-    factor = _paired(m, n, _rank(values, left.dtype), rng).to(corner.device)
+    places, signs = _pairing(m, n, _rank(values, dtype), rng)
+    places, signs = places.to(corner.device), signs.to(corner.device, dtype)[:, None]
+    u, vh, q, q_tau, p, p_tau = (each.to(dtype) for each in (u, vh, q, q_tau, p, p_tau))
+    factor = torch.zeros((m, n), dtype=dtype, device=left.device).scatter_(1, places[:, None], signs)
     factor[:r] = u @ factor[:r]
     factor[:, :r] = factor[:, :r] @ vh
-    factor = torch.ormqr(q.to(left.dtype), q_tau.to(left.dtype), factor.to(left.dtype))
-    return torch.ormqr(p.to(left.dtype), p_tau.to(left.dtype), factor, left=False, transpose=True)
+    if m * n < _BLOCKED:
+        factor = torch.ormqr(q, q_tau, factor)
+        return torch.ormqr(p, p_tau, factor, left=False, transpose=True)
+    # With Q = I - y t y^T and P = I - z w z^T, and K, u and v as above: K has one entry in each row.
+    (y, t), (z, w) = _reflector(q, q_tau), _reflector(p, p_tau)
+    turned, paired = torch.cat((u.t() @ y[:r], y[r:])), torch.cat((vh @ z[:r], z[r:]))
+    paired = (paired[places] * signs) @ w.t()  # K v z w^T
+    first = y @ t
+    second = torch.cat((u @ paired[:r], paired[r:])) - first @ (turned.t() @ paired)
+    rows = torch.zeros((r, n), dtype=dtype, device=left.device)
+    rows[:, places] = (turned * signs).t()
+    rows[:, :r] = rows[:, :r] @ vh  # y^T u K v
+    return factor.addmm_(torch.cat((first, second), 1), torch.cat((rows, z.t())), alpha=-1)
+
+
+def _reflector(qr: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
+    """Y [m, r] and T [r, r] of Q = I - Y T Y^T, from LAPACK's form of a QR factorisation [m, r]."""
+    r = len(tau)
+    y = torch.cat((qr[:r].tril(-1) + torch.eye(r, dtype=qr.dtype, device=qr.device), qr[r:]))
+    links = tau[:, None] * (y.t() @ y)  # above the diagonal
+    return y, torch.linalg.solve_triangular(links, tau.diag(), upper=True, unitriangular=True)
 
 
 def _rank(values: Tensor, dtype: torch.dtype) -> int:
@@ -214,16 +239,12 @@ def _rank(values: Tensor, dtype: torch.dtype) -> int:
     return int((values > torch.finfo(dtype).eps * values[0]).sum())
 
 
-def _paired(m: int, n: int, rank: int, rng: np.random.Generator) -> Tensor:
-    """float64 [m, n]: an identity [rank, rank], and a random signed permutation in the remaining block."""
-    if m > n:
-        return _paired(n, m, rank, rng).t()
-    paired = np.zeros((m, n))
-    rows = np.arange(m)
-    columns = np.concatenate((rows[:rank], rank + rng.permutation(n - rank)[: m - rank]))
-    paired[rows, columns] = 1
-    paired[rows[rank:], columns[rank:]] -= 2 * rng.integers(0, 2, m - rank)
-    return torch.from_numpy(paired)
+def _pairing(m: int, n: int, rank: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """The column of each of m <= n rows, and its sign: an identity [rank, rank], beside it a random choice."""
+    columns, signs = np.arange(m), np.ones(m)
+    columns[rank:] = rank + rng.permutation(n - rank)[: m - rank]
+    signs[rank:] -= 2 * rng.integers(0, 2, m - rank)
+    return torch.from_numpy(columns), torch.from_numpy(signs)
 
 
 def svd(matrices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
