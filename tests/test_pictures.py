@@ -28,6 +28,17 @@ OF_PICTURES = {
     "returns over three, ends at a limit": (
         "dqn", {"replay": {"n_step": 3, "ratio": 0.5}, "env": {"max_episode_steps": 13}}
     ),
+    "weight-gradient, returns over three": (
+        "coop", {"edl": {"feedback": "weight-gradient", "noise": "constant"}, "replay": {"n_step": 3, "ratio": 2.0}}
+    ),
+    "weight-gradient, two updates a step": (
+        "edql",
+        {
+            "edl": {"feedback": "weight-gradient", "noise": "constant"},
+            "replay": {"ratio": 2.0},
+            "learner": {"batch_size": 32},
+        },
+    ),
     "dead units": ("coop", {"learner": {"learning_rate": 0.05}}),
     "six actions, sgd": ("edql", {"learner": {"optimizer": "sgd"}, "env": {"id": "MinAtar/Breakout-v0"}}),
 }  # fmt: skip
@@ -85,6 +96,7 @@ def test_three_actions_are_whitened_as_in_numpy_to_the_bit() -> None:
 
 
 REFUSED_OF_PICTURES = {
+    "edl.feedback": {"edl": {"feedback": "weight-gradient", "noise": "normal"}},
     "env": {"env": {"stack": 2}}, "network.kind": {"network": {"kind": "mlp"}},
 }  # fmt: skip
 

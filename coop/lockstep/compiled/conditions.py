@@ -23,15 +23,17 @@ def why_not(config: RunConfig) -> str:
     kinds = (network.kind == "minatar", "minatar") if pictures else (
         network.kind == "mlp" and bool(network.hidden), "mlp with hidden layers"
     )  # fmt: skip
+    # What weight-gradient draws is not known ahead, as that of s is.
+    weights = ("weight-gradient",) if pictures and config.edl.noise == "constant" else ()
+    feedbacks = ("transform", "weight-gradient with a constant s") if pictures else ("transform",)
     wanted = (
         ("env", played, "CartPole without further settings, and MinAtar without stacks"),
         ("method", config.method in METHODS, ", ".join(METHODS)),
-        ("edl.feedback", config.feedback in ("none", "transform"), "transform"),
+        ("edl.feedback", config.feedback in ("none", "transform", *weights), ", ".join(feedbacks)),
         ("network.kind", *kinds),
         ("network.dtype", network.dtype == "float32", "float32"),
         ("replay.sampling", replay.sampling == "uniform" and replay.replacement, "uniform, with replacement"),
         ("replay.eviction", replay.eviction in ("fifo", "reservoir"), "fifo, reservoir"),
-        ("replay.ratio", replay.ratio <= 1, "at most 1"),
         ("replay.n_step", replay.n_step == 1 or pictures, "1 on CartPole"),
         ("replay.preload", not replay.preload, "none"),
         ("learner.device", learner.device == "cpu", "cpu"),

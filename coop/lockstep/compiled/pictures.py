@@ -117,7 +117,7 @@ class _Passes(ConvolutionBackprop):
         assert isinstance(form, ConvolutionNetwork)
         super().__init__(form)
         self._form = form
-        self._rule = FeedbackRule(self, config.feedback)
+        self._rule = FeedbackRule(self, config.feedback, rng=agent._noise)
         self._gradients = agent._networks[role]._trained.gradients
         self._geometry = np.array((*spec.frame_shape, *form.kernel))
         self._places = form.places(spec.frame_shape[:2])

@@ -11,7 +11,6 @@ What chance decides depends on no network, so it is drawn for a block of steps a
 
 from __future__ import annotations
 
-import math
 import time
 import zlib
 from collections.abc import Iterator, Sequence
@@ -58,14 +57,14 @@ class PlayedBlock:
 class _Block:
     """What chance decides for n steps after the first `step`.
 
-    cut, due: whether a segment ends at a step, and whether an update follows it. rows: int64 [n, K], where a step's
-    transition goes, -1: nowhere. batch: int64 [n, K, batch]. action: int64 [n, K], -1: the greedy one. s: float64 [n,
-    K], scales: of s. epsilon: before each step. generators: of each run, their states before.
+    cut, due: whether a segment ends at a step, and how many updates follow it, m in all. rows: int64 [n, K], where a
+    step's transition goes, -1: nowhere. batch: int64 [m, K, batch]. action: int64 [n, K], -1: the greedy one. s:
+    float64 [m, K], scales: of s. epsilon: before each step. generators: of each run, their states before.
     """
 
     step: int
     cut: list[bool]
-    due: list[bool]
+    due: list[int]
     rows: Ints
     batch: Ints
     action: Ints
@@ -119,77 +118,74 @@ class Seeds:
     def _keep(self, runs: NDArray[np.intp]) -> None:
         self.runs, self._agents = [self.runs[k] for k in runs], [self._agents[k] for k in runs]
         self._outcomes = [""] * len(self.runs)
-        if not self.runs:
-            return
-        self._games, self._tables, self._nets = self._games.kept(runs), self._tables.kept(runs), self._nets.kept(runs)
+        if self.runs:
+            kept = self._games.kept(runs), self._tables.kept(runs), self._nets.kept(runs)
+            self._games, self._tables, self._nets = kept
 
     def _length(self, most: int) -> int:
         """Steps of the next block."""
-        every, last = self.config.checkpoint_every or math.inf, min(self.step + MOST, self.config.total_steps)
-        step, waiting = self.step, 0
+        saved = min(run.trainer._next_checkpoint for run in self.runs)
+        step, waiting, last = self.step, 0, self.step + min(most, MOST)
         while True:
             step += 1
             waiting = (waiting + 1) % self.config.actor.segment_steps
-            updates = self._due(step)
-            new = updates > self._due(step - 1)
-            waiting *= not new
-            ends = new and (updates % METRICS_EVERY == 0 or updates % every == 0)
-            if step == self.config.total_steps or (not waiting and (ends or step >= min(last, self.step + most))):
+            before, updates = self._due(step - 1), self._due(step)
+            waiting *= updates == before
+            ends = before < saved <= updates or updates // METRICS_EVERY > before // METRICS_EVERY
+            if step == self.config.total_steps or (not waiting and (ends or step >= last)):
                 return step - self.step
 
     def _drawn(self, count: int) -> _Block:
         """Draw what chance decides for some steps, in the order in which the runs would."""
         config, agent = self.config, self._agents[0]
         steps = range(self.step + 1, self.step + count + 1)
-        due = [self._due(step) > self._due(step - 1) for step in steps]
+        due = [self._due(step) - self._due(step - 1) for step in steps]
         cut, waiting = [], 0
         for one in due:
             waiting += 1
-            cut.append(one or waiting == config.actor.segment_steps)
+            cut.append(one > 0 or waiting == config.actor.segment_steps)
             waiting *= not cut[-1]
         epsilon = [agent.epsilon(step - 1) for step in steps]
-        runs, size = len(self.runs), config.learner.batch_size
+        runs, size, updates = len(self.runs), config.learner.batch_size, sum(due)
         rows, action = np.full((count, runs), -1), np.full((count, runs), -1)
-        batch, s = np.zeros((count, runs, size), np.int64), np.zeros((count, runs))
+        batch, s = np.zeros((updates, runs, size), np.int64), np.zeros((updates, runs))
         generators = [tuple(map(generator_state, self._generators(k))) for k in range(runs)]
-        block = _Block(self.step, cut, due, rows, batch, action, s, self._scales(due), epsilon, generators)
+        block = _Block(self.step, cut, due, rows, batch, action, s, self._scales(updates), epsilon, generators)
         for k in range(runs):
             self._draw(k, block, count)
         return block
 
-    def _generators(self, k: int) -> tuple[np.random.Generator, ...]:
-        """Of run k: what its actions and s are drawn with ahead, and its table's."""
-        found = self.runs[k]._policy_rng, self._agents[k]._noise, self._tables.rngs[k]
-        return found if self._ahead else found[:2]
+    def _generators(self, k: int) -> list[np.random.Generator]:
+        """Of run k: those of which numbers are drawn ahead, for its actions, for s and for its table."""
+        noise = [self._agents[k]._noise] if self.config.edl.noise == "normal" else []
+        return [self.runs[k]._policy_rng, *noise, *([self._tables.rngs[k]] if self._ahead else [])]
 
     def _draw(self, k: int, block: _Block, count: int) -> None:
         """Draw what chance decides for the first `count` steps of a block of run k."""
-        config, due, first = self.config, block.due[:count], 0
-        policy, noise, *_ = self._generators(k)
+        config, due, first, done = self.config, block.due[:count], 0, 0
+        policy, noise = self.runs[k]._policy_rng, self._agents[k]._noise
         # From a full table that draws for nothing else, as many numbers are the same at once.
         together = self._ahead and config.replay.eviction == "fifo" and block.step >= config.replay.capacity
         if together:
-            block.batch[:count][due, k] = self._tables.drawn(k, block.step, sum(due))
-        for place in range(count):
+            block.batch[: sum(due), k] = self._tables.drawn(k, block.step, sum(due))
+        for place, updates in enumerate(due):
             if policy.random() < block.epsilon[place]:
                 block.action[place, k] = policy.integers(self._agents[k].spec.num_actions, size=1, dtype=np.int32)[0]
             if block.cut[place] and self._ahead:
                 block.rows[first : place + 1, k] = self._tables.rows(k, block.step + first, place + 1 - first)
                 first = place + 1
-            if due[place]:
-                if self._ahead and not together:
-                    block.batch[place, k] = self._tables.drawn(k, block.step + place + 1)[0]
-                normal = config.edl.noise == "normal" and block.scales[place]
-                block.s[place, k] = block.scales[place] * (float(noise.standard_normal()) if normal else 1.0)
+            if updates and self._ahead and not together:
+                block.batch[done : done + updates, k] = self._tables.drawn(k, block.step + place + 1, updates)
+            for number in range(done, done + updates):
+                normal = config.edl.noise == "normal" and block.scales[number]
+                block.s[number, k] = block.scales[number] * (float(noise.standard_normal()) if normal else 1.0)
+            done += updates
 
-    def _scales(self, due: Sequence[bool]) -> list[float]:
-        """The scale of s in the update after each step."""
-        agent, before = self._agents[0], self.updates
-        found = []
-        for one in due:
-            agent.updates = before
-            found.append(agent.feedback_scale() if one else 0.0)
-            before += one
+    def _scales(self, count: int) -> list[float]:
+        """The scale of s in each of the next updates."""
+        agent, found = self._agents[0], []
+        for agent.updates in range(self.updates, self.updates + count):
+            found.append(agent.feedback_scale())
         agent.updates = self.updates
         return found
 
@@ -198,14 +194,13 @@ class Seeds:
         count, size, held = len(block.due), self.config.learner.batch_size, self._tables.packing
         whole = count, len(self.runs)
         reached, rewards = np.empty((*whole, held.width), held.dtype), np.empty(whole, np.float32)
-        raw_rewards, terminated = np.empty(whole, np.float64), np.empty(whole, np.bool_)
-        over = np.empty(len(self.runs), np.bool_)
+        raw_rewards, terminated, over = np.empty(whole), np.empty(whole, np.bool_), np.empty(len(self.runs), np.bool_)
         restarts: list[list[tuple[int, Array]]] = [[] for _ in self.runs]
         actions = np.empty(whole, np.int64)
         answers = actions, reached, raw_rewards, terminated
         self._errors = np.zeros((sum(block.due), len(self.runs), size), np.float32)
         self._seen = np.zeros((sum(block.due), len(self.runs), 5, size), np.int64)
-        done = 0
+        self._told = done = 0
         for place in range(count):
             player = self._role if self._player is None else self._player
             obs, next_obs, action, terminal = games.obs, reached[place], actions[place], terminated[place]
@@ -221,15 +216,17 @@ class Seeds:
                 restarts[k].append((place, games.obs[k]))
             if block.cut[place]:
                 self._queue.insert(self._tables, block.rows[: place + 1])
-            if block.due[place]:
-                if not self._ahead:
-                    block.batch[place] = self._tables.drawn(0, self._tables.inserted)
-                self._update(block, place, done)
+            updates = block.due[place]
+            if updates and not self._ahead:
+                block.batch[done : done + updates, 0] = self._tables.drawn(0, self._tables.inserted, updates)
+            for _ in range(updates):
+                self._update(block, done)
                 done += 1
+                if self.updates % METRICS_EVERY == 0:
+                    self._rows(done, metrics)
+            self._mark_diverged()
             self._record(ended, episodes)
-            if block.due[place] and self.updates % METRICS_EVERY == 0:
-                self._rows(done, metrics)
-            counted = block.due[place] and self.config.total_updates
+            counted = updates and self.config.total_updates
             for k in self._reached(self._going() if counted else [k for k, _ in ended]):
                 self._draw_again(k, block, place + 1)
                 self._follow(k, place + 1, answers, restarts[k])
@@ -251,15 +248,15 @@ class Seeds:
             found.append((k, EpisodeEnd(0, total, length, epsilon, q1, q2, self.updates)))
         return found
 
-    def _update(self, block: _Block, place: int, number: int) -> None:
-        """Do update `number` of the block, that of step `place`, in every run; change roles if it is time."""
-        nets, learner, role = self._nets, self.config.learner, self._role
-        rate, finite = self._agents[self._going()[0]]._learning_rate(), True
+    def _update(self, block: _Block, number: int) -> None:
+        """Do update `number` of the block in every run; change roles if it is time."""
+        nets, role, finite = self._nets, self._role, True
+        rate = self._agents[self._going()[0]]._learning_rate()
         for start in range(0, len(self.runs), nets.block):
             runs = slice(start, min(start + nets.block, len(self.runs)))
             given, seen = nets.batches.first(runs.stop - start), self._seen[number, runs]
-            self._tables.read(runs, block.batch[place, runs], self.updates + 1, given, seen)
-            finite &= nets.update(role, runs, block.s[place, runs], rate, self._errors[number, runs])
+            self._tables.read(runs, block.batch[number, runs], self.updates + 1, given, seen)
+            finite &= nets.update(role, runs, block.s[number, runs], rate, self._errors[number, runs])
         nets.count(role)
         self._tables.batches += 1
         self.updates += 1
@@ -270,23 +267,26 @@ class Seeds:
         elif swapped:
             nets.copy()
             self._versions[1] = self.updates
-        self._archive(block, place, number)
+        self._archive(block, number)
         for k in self._going():
             self._agents[k].updates = self.updates
         if not finite:
             self._diverge(np.isfinite(self._errors[number]).all(1), "TD errors")
-        if (swapped or self.updates % learner.publish_every == 0) and not (sound := nets.finite(role)).all():
-            self._diverge(sound, "parameters")
+        if swapped or self.updates % self.config.learner.publish_every == 0:
+            self._diverge(nets.finite(role), "parameters")
 
     def _diverge(self, finite: NDArray[np.bool_], what: str) -> None:
         for k in np.flatnonzero(~finite).tolist():
-            if not self._outcomes[k]:
-                self._outcomes[k] = f"diverged: {what} are not finite at update {self.updates}"
-                self.runs[k].trainer.diverged = self._outcomes[k]
-                self.save_counters(k)
+            trainer = self.runs[k].trainer
+            trainer.diverged = trainer.diverged or f"diverged: {what} are not finite at update {self.updates}"
+
+    def _mark_diverged(self) -> None:
+        """End the runs that have diverged, once a step's updates are done."""
+        for k in [k for k in self._going() if self.runs[k].trainer.diverged]:
+            self._outcomes[k] = self.runs[k].trainer.diverged
+            self.save_counters(k)
 
     def _going(self) -> list[int]:
-        """The runs that are not over."""
         return [k for k, outcome in enumerate(self._outcomes) if not outcome]
 
     def _reached(self, runs: Sequence[int]) -> Iterator[int]:
@@ -297,14 +297,14 @@ class Seeds:
                 if self._outcomes[k]:
                     yield k
 
-    def _archive(self, block: _Block, place: int, number: int) -> None:
+    def _archive(self, block: _Block, number: int) -> None:
         """Give the diagnostics their first transitions."""
         for k in self._going():
             telemetry = self.runs[k].trainer.telemetry
             archive = telemetry.diagnostics.archive
             if archive is not None and len(archive) >= ARCHIVED:
                 return
-            batch = self._tables.batch(k, block.batch[place, k], self._seen[number, k])
+            batch = self._tables.batch(k, block.batch[number, k], self._seen[number, k])
             telemetry.diagnostics.add(batch)
 
     def _record(self, ended: Sequence[tuple[int, EpisodeEnd]], episodes: list[list[EpisodeRow]]) -> None:
@@ -327,14 +327,14 @@ class Seeds:
             metrics[k] += [] if row is None else [row]
 
     def _push(self, done: int) -> None:
-        """Hand the updates of the block to the telemetry."""
+        """Hand the telemetry what it has not been told of the first `done` updates of the block."""
         for k in self._going():
             telemetry = self.runs[k].trainer.telemetry
-            for number in range(len(self._errors[:done])):
+            for number in range(self._told, done):
                 ids, age, reuse, lag, terminated = self._seen[number, k]
                 telemetry.add_errors(self._errors[number, k])
                 telemetry._batches.append((age, reuse, lag, terminated, ids))
-        self._errors, self._seen = self._errors[done:], self._seen[done:]
+        self._told = done
 
     def _follow(self, k: int, count: int, answers: tuple[Array, ...], restarts: Sequence[tuple[int, Array]]) -> None:
         """Note the first actions of run k in a block, and what its emulator answered, as `Lockstep` does step by step.
