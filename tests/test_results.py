@@ -23,6 +23,7 @@ from coop.studies.report.sources import open_source
 from coop.studies.report.study import Study, load_study
 from results import controls
 from results.cartpole.edl import verdict
+from results.cartpole.hold import verdict as hold
 from results.minatar import registered
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -33,6 +34,7 @@ PAGES = {
         "README.md",
         "cartpole/README.md",
         "cartpole/edl/README.md",
+        "cartpole/hold/README.md",
         "minatar/README.md",
         "minatar/plan.md",
         "../README.md",
@@ -61,14 +63,17 @@ def study_of(name: str) -> Study:
 
 
 @cache
-def dissection() -> dict[str, pd.DataFrame]:
-    return verdict.tables(verdict.load(RESULTS / "cartpole" / "edl" / "dissection.parquet"))
+def of_program(study: str) -> dict[str, pd.DataFrame]:
+    """The tables of a study with a program of its own."""
+    if study == "edl":
+        return verdict.tables(verdict.load(RESULTS / "cartpole" / "edl" / "dissection.parquet"))
+    return hold.tables(hold.load(RESULTS / "cartpole" / "hold" / "hold.parquet"))
 
 
 @cache
 def table_of(study: str, name: str) -> pd.DataFrame:
-    if study == "edl":
-        return dissection()[name]
+    if study in ("edl", "hold"):
+        return of_program(study)[name]
     if name in controls.TABLES:
         return controls.TABLES[name](study_of(study))
     if name in registered.RULES:

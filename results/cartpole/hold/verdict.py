@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple, TypeGuard
+from typing import NamedTuple, TypeGuard, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -28,6 +28,7 @@ from results.printing import command, print_tables
 ENDS_WELL, LEVEL, MARGIN = 195, 0.05, 0.25  # the margin in settings of four
 EVICTIONS = ("fifo", "reservoir")
 PAIRS = (("g-coop", "dqn"), ("coop", "edql"))  # two networks, one network
+EDL = (("edql", "dqn"), ("coop", "g-coop"))
 OTHERS = ("dqn", "half", "slow", "copy-acts", "one-actor")
 SETTINGS = tuple(product(EVICTIONS, (300, 5000), (True,)))
 SAYS = {
@@ -38,6 +39,7 @@ SAYS = {
 CELL = ["variant", "double", "eviction", "capacity"]
 
 Floats = NDArray[np.float64]
+Found = TypeVar("Found")
 
 
 def load(path: Path = FILE) -> pd.DataFrame:
@@ -115,8 +117,8 @@ def tested(values: Floats) -> Test:
     return Test(mean, low, high, float(2 * stdtr(count - 1, -abs(mean) / error)), float(max(below, above)), count)
 
 
-def _all(counts: dict[str, pd.Series | None]) -> TypeGuard[dict[str, pd.Series]]:
-    return all(count is not None for count in counts.values())
+def _all(found: dict[str, Found | None]) -> TypeGuard[dict[str, Found]]:
+    return all(each is not None for each in found.values())
 
 
 def evictions(runs: pd.DataFrame) -> pd.DataFrame | None:
@@ -126,14 +128,12 @@ def evictions(runs: pd.DataFrame) -> pd.DataFrame | None:
     """
     differences = {}
     for eviction in EVICTIONS:
-        settings = [(eviction, size, True) for size in SIZES]
-        counts = {name: by_seed(runs, name, settings) for pair in PAIRS for name in pair}
-        if not _all(counts):
+        found = _between(runs, PAIRS, [(eviction, size, True) for size in SIZES])
+        if found is None:
             return None
-        pairs = [counts[two] - counts[one] for two, one in PAIRS]
-        differences[eviction] = sum(pairs[1:], pairs[0]) / len(pairs)
+        differences[eviction] = found
     differences["fifo - reservoir"] = differences["fifo"] - differences["reservoir"]
-    table = pd.DataFrame([{"rule": name, **tested(each.to_numpy())._asdict()} for name, each in differences.items()])
+    table = pd.DataFrame([{"rule": name, **tested(each)._asdict()} for name, each in differences.items()])
     table["p"] = holm(table["p"])
     holds = (table["p"] < LEVEL) & (table["mean"] > 0)
     return table.drop(columns="equivalent").assign(outcome=np.where(holds, "two networks hold", "not shown"))
@@ -180,9 +180,47 @@ def settings_of(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def beside(runs: pd.DataFrame) -> pd.DataFrame:
+    """What no rule names: means over seeds of differences in the share of runs that end well, with t intervals.
+
+    Two networks minus one, mean of both pairs, by eviction and size, and with the two small sizes minus with the two
+    large ones; EDL minus none, mean of both pairs, over all sizes.
+    """
+    rows = []
+    for eviction in EVICTIONS:
+        sizes = [(eviction, size, True) for size in SIZES]
+        found = {f"{at[1]:,}": _between(runs, PAIRS, [at]) for at in sizes}
+        found["EDL"] = _between(runs, EDL, sizes)
+        if not _all(found):
+            continue
+        one, two, three, four = (found[f"{size:,}"] for size in SIZES)
+        found |= {"small - large": (one + two - three - four) / 2, "EDL": found["EDL"] / len(SIZES)}
+        rows += [[eviction, name, *(float(each) for each in over_seeds(values))] for name, values in found.items()]
+    return pd.DataFrame(rows, columns=["eviction", "of", "mean", "low", "high"])
+
+
+def _between(
+    runs: pd.DataFrame, pairs: Iterable[tuple[str, str]], settings: list[tuple[str, int, bool]]
+) -> Floats | None:
+    """By seed, in how many settings more one method of a pair ends well than the other, mean of the pairs."""
+    found = []
+    for one, other in pairs:
+        counts = {name: by_seed(runs, name, settings) for name in (one, other)}
+        if not _all(counts):
+            return None
+        found.append((counts[one] - counts[other]).to_numpy(np.float64))
+    return np.asarray(np.mean(found, axis=0))
+
+
 def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """All tables by name, as far as their cells are complete."""
-    found = {"cells": cells(runs), "settings": settings_of(runs), "E": evictions(runs), "P": parts(runs)}
+    found = {
+        "cells": cells(runs),
+        "settings": settings_of(runs),
+        "E": evictions(runs),
+        "P": parts(runs),
+        "beside": beside(runs),
+    }
     return {name: table for name, table in found.items() if table is not None}
 
 
