@@ -1,5 +1,6 @@
 """The numbers on pages of results, docs and the README are those of the studies: results/claims.toml ties them."""
 
+import hashlib
 import re
 import tomllib
 from collections.abc import Iterator
@@ -25,6 +26,8 @@ from results import controls
 from results.cartpole.edl import verdict
 from results.cartpole.hold import verdict as hold
 from results.minatar import registered
+from results.minatar.edl import rules
+from results.minatar.edl.play import rows_of
 
 RESULTS = Path(__file__).parent.parent / "results"
 CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]
@@ -67,12 +70,14 @@ def of_program(study: str) -> dict[str, pd.DataFrame]:
     """The tables of a study with a program of its own."""
     if study == "edl":
         return verdict.tables(verdict.load(RESULTS / "cartpole" / "edl" / "dissection.parquet"))
+    if study == "minatar-edl":
+        return {"pilot": rules.driven(rows_of(None, RESULTS / "minatar" / "edl" / "edl.parquet"))}
     return hold.tables(hold.load(RESULTS / "cartpole" / "hold" / "hold.parquet"))
 
 
 @cache
 def table_of(study: str, name: str) -> pd.DataFrame:
-    if study in ("edl", "hold"):
+    if study in ("edl", "hold", "minatar-edl"):
         return of_program(study)[name]
     if name in controls.TABLES:
         return controls.TABLES[name](study_of(study))
@@ -264,10 +269,21 @@ INTERVAL = re.compile(r"\[[+-]?\d[\d.,]*, [+-]?\d[\d.,]*\]")
 
 
 def test_the_page_counts_its_intervals() -> None:
-    pages = ("", "cartpole/", "cartpole/edl/", "minatar/")
-    here, cartpole, edl, minatar = (len(INTERVAL.findall(PAGES[f"{at}README.md"])) for at in pages)
-    text = f"This page has {here} intervals, that of CartPole {cartpole}, that of EDL {edl}, that of MinAtar {minatar};"
+    pages = ("", "cartpole/", "cartpole/edl/", "cartpole/hold/", "minatar/")
+    here, cartpole, edl, two, minatar = (len(INTERVAL.findall(PAGES[f"{at}README.md"])) for at in pages)
+    text = (
+        f"This page has {here} intervals, that of CartPole {cartpole}, that of EDL {edl}, that of two networks on "
+        f"CartPole {two}, that of MinAtar {minatar};"
+    )
     assert text in PAGES["README.md"]
+
+
+@pytest.mark.parametrize("study", ["minatar", "cartpole/edl"])
+def test_what_was_registered_is_as_it_was(study: str) -> None:
+    lines = [line.split() for line in (RESULTS / study / "SHA256SUMS").read_text().splitlines()]
+    assert lines
+    for digest, name in lines:
+        assert hashlib.sha256((RESULTS / study / name).read_bytes()).hexdigest() == digest, name
 
 
 def test_what_the_pages_say_of_short_runs() -> None:
