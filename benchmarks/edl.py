@@ -70,7 +70,7 @@ def make_update(kind: str, spec: EnvSpec, method: str, double: bool) -> Update:
     agent = Agent(config, spec)
     if method.endswith("svd"):
         for network in agent._networks:
-            network._rule = SvdRule(network._passes.chain)
+            network._rule = SvdRule(network._passes.backprop)
     return lambda: agent.update(batch)
 
 
