@@ -116,6 +116,29 @@ def test_evictions_count_sizes_that_end_well_by_seed_and_pair() -> None:
     assert found["mean"]["fifo - reservoir"] == pytest.approx(found["mean"]["fifo"] - found["mean"]["reservoir"])
 
 
+def test_beside_the_rules_stand_sizes_and_error_driven_learning() -> None:
+    at = {100: 0.2, 300: 0.4, 1000: 0.6, 5000: 0.9}
+    better = {"dqn": 0.0, "g-coop": 0.5, "edql": 0.1, "coop": 0.3}  # times the above, in share of the seeds
+    rows = [
+        {"variant": name, "eviction": eviction, "capacity": size, "double": True, "seed": seed,
+         "well": (seed - 500) < 30 * round(at[size] * share, 10)}
+        for name, share in better.items()
+        for eviction, size, seed in product(verdict.EVICTIONS, verdict.SIZES, SEEDS)
+    ]  # fmt: skip
+    runs = pd.DataFrame(rows)
+    table = verdict.beside(runs).set_index(["eviction", "of"])
+    shares = runs.groupby(["eviction", "variant", "capacity"])["well"].mean().unstack("variant")
+    two = (shares["g-coop"] - shares["dqn"] + shares["coop"] - shares["edql"]) / 2
+    edl = (shares["edql"] - shares["dqn"] + shares["coop"] - shares["g-coop"]) / 2
+    for eviction in verdict.EVICTIONS:
+        found, lead = table.loc[eviction]["mean"], two[eviction]
+        assert [found[f"{size:,}"] for size in verdict.SIZES] == pytest.approx([lead[size] for size in verdict.SIZES])
+        assert found["small - large"] == pytest.approx((lead[100] + lead[300] - lead[1000] - lead[5000]) / 2)
+        assert found["EDL"] == pytest.approx(edl[eviction].mean())
+    assert (table["low"] < table["mean"]).all()
+    assert verdict.beside(runs[runs["variant"] != "edql"]).empty
+
+
 def test_figures_show_the_share_of_seeds_that_end_well(tmp_path: Path) -> None:
     other = dict.fromkeys(("last", "area", "churn", "q_share"), 0.0) | {"collapsed": False, "finite": True}
     runs = runs_of({"dqn": 0.2, "coop": 0.5, "one-actor": 0.7}).assign(**other)

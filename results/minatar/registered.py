@@ -15,9 +15,9 @@ import pandas as pd
 
 from coop.common.settings.config import value_of
 from coop.common.settings.methods import METHODS
-from coop.studies.report.intervals import Interval, over_seeds
+from coop.studies.report.intervals import over_seeds
 from coop.studies.report.learning import area
-from coop.studies.report.plots import Figure, Line, Panel, draw
+from coop.studies.report.plots import Figure, Line, Panel, draw, seed_lines
 from coop.studies.report.study import Study, load_study
 
 LARGE = 100_000  # transitions
@@ -157,13 +157,9 @@ def forest(runs: pd.DataFrame) -> Figure:
         rows = _differences(found[found["game"] == game])
         for name in (PRIMARY, *(f"{two} - {one}" for two, one in PAIRS)):
             for size in ("small - large", "small", "large"):
-                seeds = rows[name][size].to_numpy(np.float64)
-                estimate, nothing = over_seeds(seeds), np.full(len(seeds), np.nan)
-                place = float(len(ticks))
-                ticks.append(f"{name}: {size}")
-                dots = Interval(seeds, nothing, nothing)
-                lines.append(Line(ticks[-1], np.full(len(seeds), place), dots, faint=True))
-                lines.append(Line(ticks[-1], np.array([place]), Interval(*np.array(estimate)[:, None])))
+                label = f"{name}: {size}"
+                lines += seed_lines(label, float(len(ticks)), rows[name][size].to_numpy(np.float64))
+                ticks.append(label)
         panels.append(Panel(game, "", "points of dqn's area with 100,000", lines, True, ticks=ticks, reference=0.0))
     text = "Means over five seeds and their 95 % t intervals; small dots: the seeds. small: 300 transitions."
     return Figure("outcome", "Two networks minus one", text, "", panels)

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from coop.common.settings.methods import METHODS
-from coop.studies.report.intervals import Interval
+from coop.studies.report.intervals import Interval, over_seeds
 from coop.studies.report.study import Floats
 from coop.studies.report.table import ResultTable, Value
 
@@ -110,6 +110,14 @@ class Figure:
             for point in zip(line.x, *line.y, strict=True)
         ]
         return ResultTable(self.name, self.title, ["panel", "line", "x", "y", "low", "high"], rows)
+
+
+def seed_lines(label: str, place: float, seeds: Floats) -> list[Line]:
+    """One value of each seed as dots, and their mean with its t interval, at a tick."""
+    nothing = np.full(len(seeds), np.nan)
+    mean = Interval(*np.array(over_seeds(seeds))[:, None])
+    dots = Line(label, np.full(len(seeds), place), Interval(seeds, nothing, nothing), faint=True)
+    return [dots, Line(label, np.array([place]), mean)]
 
 
 def draw(figure: Figure, path: Path) -> None:

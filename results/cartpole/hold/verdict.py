@@ -36,6 +36,7 @@ SAYS = {
     "half": "fewer updates are enough",
     "slow": "a slower target is enough",
 }
+SHARES = f"Return of the last 100 episodes of {ENDS_WELL} or more; exact 95 % intervals."
 CELL = ["variant", "double", "eviction", "capacity"]
 
 Floats = NDArray[np.float64]
@@ -233,8 +234,7 @@ def ends_well(runs: pd.DataFrame) -> Figure:
             part = table[(table["eviction"] == eviction) & (table["variant"] == method)].sort_values("capacity")
             lines.append(Line(method, part["capacity"].to_numpy(np.float64), _share(part)))
         panels.append(Panel(eviction, "capacity", "share of seeds", lines, True, sizes=True, share=True))
-    text = "Return of the last 100 episodes of 195 or more; exact 95 % intervals."
-    return Figure("ends_well", "Runs that end well", text, _counts(runs), panels, same_y=True)
+    return Figure("ends_well", "Runs that end well", SHARES, _counts(runs), panels, same_y=True)
 
 
 def by_part(runs: pd.DataFrame) -> Figure:
@@ -249,8 +249,7 @@ def by_part(runs: pd.DataFrame) -> Figure:
         ]
         title = f"{eviction}, {capacity:,} transitions"
         panels.append(Panel(title, "", "share of seeds", lines, True, share=True, ticks=shown))
-    text = "Return of the last 100 episodes of 195 or more; exact 95 % intervals."
-    return Figure("parts", "Parts of having two networks", text, _counts(runs), panels)
+    return Figure("parts", "Parts of having two networks", SHARES, _counts(runs), panels)
 
 
 def _share(rows: pd.DataFrame) -> Interval:
@@ -261,14 +260,14 @@ def _counts(runs: pd.DataFrame) -> str:
     return f"{runs['seed'].nunique()} seeds of each cell."
 
 
-def main() -> None:
-    """Print the tables and the answer, or draw the figures."""
-    command("results.cartpole.hold.verdict", __doc__, FILE, _print, lambda path: figures(load(path)))
-
-
 def figures(runs: pd.DataFrame) -> list[Figure]:
     """Those of the page."""
     return [ends_well(runs), by_part(runs)]
+
+
+def main() -> None:
+    """Print the tables and the answer, or draw the figures."""
+    command("results.cartpole.hold.verdict", __doc__, FILE, _print, lambda path: figures(load(path)))
 
 
 def _print(path: Path) -> None:

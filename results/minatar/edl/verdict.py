@@ -16,8 +16,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
-from coop.studies.report.intervals import Interval, over_seeds
-from coop.studies.report.plots import Figure, Line, Panel
+from coop.studies.report.intervals import over_seeds
+from coop.studies.report.plots import Figure, Line, Panel, seed_lines
 from results.cartpole.edl.verdict import holm
 from results.minatar.edl import rules
 from results.minatar.edl.play import FILE, EdlGrid, due, rows_of
@@ -134,19 +134,11 @@ def forest(rows: pd.DataFrame) -> Figure:
     means = values.groupby(["pair", "seed"], sort=False)["points"].mean().reset_index()
     places = {name: float(place) for place, name in enumerate(PAIRS)}
     for title, part in [*values.groupby("game", sort=False), ("mean of both games", means)]:
-        lines = []
+        lines: list[Line] = []
         for name, group in part.groupby("pair", sort=False):
-            points = group["points"].to_numpy(np.float64)
-            found, nothing = decide(points), np.full(len(points), np.nan)
-            dots = Interval(points, nothing, nothing)
-            lines.append(Line(f"{name}, seeds", np.full(len(points), places[name]), dots, faint=True))
-            bar = Interval(*(np.array([each]) for each in (found.points, found.low, found.high)))
-            lines.append(Line(name, np.array([places[name]]), bar))
+            lines += seed_lines(str(name), places[str(name)], group["points"].to_numpy(np.float64))
         panels.append(Panel(str(title), "", "points", lines, True, ticks=list(PAIRS), reference=0.0))
-    text = (
-        f"{' minus '.join(['300', f'{LARGE:,}'])} transitions, two minus one, percent of dqn's area with {LARGE:,}; "
-        "means over seeds with 95 % t intervals, not corrected, and each seed."
-    )
+    text = f"Two minus one, 300 minus {LARGE:,} transitions; means over seeds with 95 % t intervals, and each seed."
     return Figure("forest", "What the small buffer costs", text, "", panels, same_y=True)
 
 
