@@ -26,7 +26,7 @@ from results import controls
 from results.cartpole.edl import verdict
 from results.cartpole.hold import verdict as hold
 from results.minatar import registered
-from results.minatar.edl import rules
+from results.minatar.edl import verdict as minatar_edl
 from results.minatar.edl.play import rows_of
 
 RESULTS = Path(__file__).parent.parent / "results"
@@ -71,7 +71,7 @@ def of_program(study: str) -> dict[str, pd.DataFrame]:
     if study == "edl":
         return verdict.tables(verdict.load(RESULTS / "cartpole" / "edl" / "dissection.parquet"))
     if study == "minatar-edl":
-        return {"pilot": rules.driven(rows_of(None, RESULTS / "minatar" / "edl" / "edl.parquet"))}
+        return minatar_edl.tables(rows_of(None, RESULTS / "minatar" / "edl" / "edl.parquet"))
     return hold.tables(hold.load(RESULTS / "cartpole" / "hold" / "hold.parquet"))
 
 

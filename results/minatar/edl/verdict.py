@@ -149,21 +149,21 @@ def main() -> None:
 
 def _print(path: Path) -> None:
     rows = rows_of(None, path)
-    over = set(rows["phase"]) if len(rows) else set()
-    left = due(EdlGrid(), rows)
-    before = {cell.phase for cell in left}
-    phases = {"pilot": rules.driven, "double": rules.targets, "rates": rules.rates}
-    print_tables({name: rule(rows) for name, rule in phases.items() if name in over and name not in before})
-    if left:
-        print(f"\n{len(left)} cells of the phase {left[0].phase} are left")
-        return
     print_tables(tables(rows))
-    print(f"\nThe buffer gets by with less through: {answer(pooled(rows))}.")
+    if left := due(EdlGrid(), rows):
+        print(f"\n{len(left)} cells of the phase {left[0].phase} are left")
+    else:
+        print(f"\nThe buffer gets by with less through: {answer(pooled(rows))}.")
 
 
 def tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """The tables of the study, once it is complete."""
-    return {"areas": areas(rows), "games": by_game(rows), "pooled": pooled(rows)}
+    """The tables of those phases of which all cells are over."""
+    over = (set(rows["phase"]) if len(rows) else set()) - {cell.phase for cell in due(EdlGrid(), rows)}
+    phases = {"pilot": rules.driven, "double": rules.targets, "rates": rules.rates}
+    found = {name: rule(rows) for name, rule in phases.items() if name in over}
+    if "study" in over:
+        found |= {"areas": areas(rows), "games": by_game(rows), "pooled": pooled(rows)}
+    return found
 
 
 if __name__ == "__main__":
