@@ -40,6 +40,7 @@ PAGES = {
         "cartpole/hold/README.md",
         "minatar/README.md",
         "minatar/plan.md",
+        "minatar/edl/README.md",
         "../README.md",
         "../docs/cartpole.md",
         "../docs/algorithm.md",

@@ -67,6 +67,14 @@ def decide(values: Floats) -> Decision:
     return Decision(mean, low, high, min(1.0, 2 * float(found[nearest])), nearest, count)
 
 
+def shares(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each variant and capacity: the share of each rate, and the rate that is chosen; see `rules.rates`."""
+    table = rules.rates(rows)
+    wide = table.assign(rate=table["rate"].map("{:g}".format)).pivot(index=rules.CELL, columns="rate", values="share")
+    chosen = table[table["chosen"]].set_index(rules.CELL)["rate"]
+    return wide.assign(chosen=chosen).reset_index()
+
+
 def scores(rows: pd.DataFrame) -> pd.DataFrame:
     """The runs of the study with `points`."""
     runs = rows[rows["phase"] == "study"]
@@ -159,7 +167,7 @@ def _print(path: Path) -> None:
 def tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """The tables of those phases of which all cells are over."""
     over = (set(rows["phase"]) if len(rows) else set()) - {cell.phase for cell in due(EdlGrid(), rows)}
-    phases = {"pilot": rules.driven, "double": rules.targets, "rates": rules.rates}
+    phases = {"pilot": rules.driven, "double": rules.targets, "rates": shares}
     found = {name: rule(rows) for name, rule in phases.items() if name in over}
     if "study" in over:
         found |= {"areas": areas(rows), "games": by_game(rows), "pooled": pooled(rows)}
