@@ -260,8 +260,12 @@ class Agent:
         return schedules.epsilon(self.config.actor, env_step)
 
     def feedback_scale(self) -> float:
-        """The present scale of s; 0 for the gradient methods."""
-        return 0.0 if self.config.feedback == "none" else schedules.feedback_scale(self.config.edl, self.updates)
+        """The present scale of s."""
+        return self.feedback_scale_at(self.updates)
+
+    def feedback_scale_at(self, update: int) -> float:
+        """The scale of s in an update, counted from 0; 0 for the gradient methods."""
+        return 0.0 if self.config.feedback == "none" else schedules.feedback_scale(self.config.edl, update)
 
     def finite(self) -> bool:
         """True while every parameter of both networks is finite."""

@@ -2,8 +2,8 @@
 
 Theorem 1: the layer-wise cost 1/2 sum_i tr((sigma(i) h(i-1)^T)^T W(i)) that error-driven learning descends differs from
 backpropagation's (delta in the place of sigma) by at most d |s| / 2 |e| W_B sqrt(eta), where |W(i)| <= W_B and
-|h(i-1)| <= sqrt(eta); the difference is linear in s. Theorem 2: the cost of a fixed target falls. The
-remark after it: so does the difference.
+|h(i-1)| <= sqrt(eta); the difference is linear in s. Theorem 2: the cost of a fixed target falls. The remark
+after it: so does the difference.
 """
 
 import math

@@ -46,6 +46,11 @@ PAGES = {
         "../docs/algorithm.md",
     )
 }
+PROGRAMS = {
+    "edl": lambda: verdict.tables(verdict.load(RESULTS / "cartpole" / "edl" / "dissection.parquet")),
+    "hold": lambda: hold.tables(hold.load(RESULTS / "cartpole" / "hold" / "hold.parquet")),
+    "minatar-edl": lambda: minatar_edl.tables(rows_of(None, RESULTS / "minatar" / "edl" / "edl.parquet")),
+}
 TABLES = {
     "table1": tables.paper_table,
     "settings": tables.settings_table,
@@ -69,16 +74,12 @@ def study_of(name: str) -> Study:
 @cache
 def of_program(study: str) -> dict[str, pd.DataFrame]:
     """The tables of a study with a program of its own."""
-    if study == "edl":
-        return verdict.tables(verdict.load(RESULTS / "cartpole" / "edl" / "dissection.parquet"))
-    if study == "minatar-edl":
-        return minatar_edl.tables(rows_of(None, RESULTS / "minatar" / "edl" / "edl.parquet"))
-    return hold.tables(hold.load(RESULTS / "cartpole" / "hold" / "hold.parquet"))
+    return PROGRAMS[study]()
 
 
 @cache
 def table_of(study: str, name: str) -> pd.DataFrame:
-    if study in ("edl", "hold", "minatar-edl"):
+    if study in PROGRAMS:
         return of_program(study)[name]
     if name in controls.TABLES:
         return controls.TABLES[name](study_of(study))

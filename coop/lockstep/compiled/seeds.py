@@ -23,7 +23,6 @@ import torch
 from numpy.typing import NDArray
 
 from coop.common.numbers import METRICS_EVERY, generator_state, set_generator_state
-from coop.common.settings import schedules
 from coop.common.types import Array, EpisodeEnd, EpisodeRecord, EpisodeRow
 from coop.learner.agent import Agent
 from coop.learner.diagnostics import ARCHIVED
@@ -184,8 +183,7 @@ class Seeds:
 
     def _scales(self, count: int) -> list[float]:
         """The scale of s in each of the next updates."""
-        driven, updates = self.config.feedback != "none", range(self.updates, self.updates + count)
-        return [schedules.feedback_scale(self.config.edl, update) if driven else 0.0 for update in updates]
+        return [self._agents[0].feedback_scale_at(update) for update in range(self.updates, self.updates + count)]
 
     def _play(self, block: _Block, episodes: list[list[EpisodeRow]], metrics: list[list[dict[str, Any]]]) -> None:
         games, nets, everyone = self._games, self._nets, slice(0, len(self.runs))

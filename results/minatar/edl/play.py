@@ -45,7 +45,6 @@ PACKED, PROGRAM = Packed(b"edl", PLAN, GRID), "results.minatar.edl.play"
 MEASURES = "measures.json"  # of a run of the pilot
 CURVE, LAST = 40, 100  # moments of the running mean; episodes
 WAIT = 20.0  # seconds until the next look at the cells of other processes
-COLUMNS = ("cell", "phase", "game", "capacity", "variant", "feedback", "double", "rate")
 
 
 @dataclass(frozen=True)
