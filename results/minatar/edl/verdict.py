@@ -156,12 +156,12 @@ def main() -> None:
 
 
 def _print(path: Path) -> None:
-    rows = rows_of(None, path)
-    print_tables(tables(rows))
-    if left := due(EdlGrid(), rows):
-        print(f"\n{len(left)} cells of the phase {left[0].phase} are left")
+    found = tables(rows_of(None, path))
+    print_tables(found)
+    if "pooled" in found:
+        print(f"\nThe buffer gets by with less through: {answer(found['pooled'])}.")
     else:
-        print(f"\nThe buffer gets by with less through: {answer(pooled(rows))}.")
+        print("\nThe study is not complete.")
 
 
 def tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
