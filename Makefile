@@ -33,6 +33,7 @@ results: $(READY)
 	@for study in results/cartpole/*.parquet results/minatar/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
 	@$(BIN)/python -m results.cartpole.edl.verdict figures
 	@$(BIN)/python -m results.cartpole.hold.verdict figures
+	@$(BIN)/python -m results.minatar.edl.verdict figures
 	@$(BIN)/python results/minatar/registered.py figure results/minatar/study.parquet
 	@$(BIN)/coop-report results/pong.parquet --curves results/pong
 

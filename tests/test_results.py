@@ -271,11 +271,11 @@ INTERVAL = re.compile(r"\[[+-]?\d[\d.,]*, [+-]?\d[\d.,]*\]")
 
 
 def test_the_page_counts_its_intervals() -> None:
-    pages = ("", "cartpole/", "cartpole/edl/", "cartpole/hold/", "minatar/")
-    here, cartpole, edl, two, minatar = (len(INTERVAL.findall(PAGES[f"{at}README.md"])) for at in pages)
+    pages = ("", "cartpole/", "cartpole/edl/", "cartpole/hold/", "minatar/", "minatar/edl/")
+    here, cartpole, edl, two, minatar, second = (len(INTERVAL.findall(PAGES[f"{at}README.md"])) for at in pages)
     text = (
         f"This page has {here} intervals, that of CartPole {cartpole}, that of EDL {edl}, that of two networks on "
-        f"CartPole {two}, that of MinAtar {minatar};"
+        f"CartPole {two}, those of MinAtar {minatar} and {second};"
     )
     assert text in PAGES["README.md"]
 

@@ -33,6 +33,7 @@ PAIRS = {
     "H3, one network": ("edql", "dqn"),
     "H3, two networks": ("coop", "g-coop"),
 }
+BESIDE = {"a second update, coop": ("coop-2", "coop"), "a second update, g-coop": ("g-coop-2", "g-coop")}  # no rule
 FOR, EQUIVALENT, AGAINST, UNDECIDED = "for the claim", "equivalent", "against", "undecided"
 
 Floats = NDArray[np.float64]
@@ -82,11 +83,11 @@ def scores(rows: pd.DataFrame) -> pd.DataFrame:
     return runs.assign(points=100 * runs["area"] / runs["game"].map(large))
 
 
-def differences(rows: pd.DataFrame) -> pd.DataFrame:
+def differences(rows: pd.DataFrame, pairs: Mapping[str, tuple[str, str]] = PAIRS) -> pd.DataFrame:
     """A row for each pair, game and seed: the pair's difference with each capacity, and `points`, small minus large."""
     table = scores(rows).pivot_table("points", ["game", "seed"], ["variant", "capacity"])
     found = []
-    for name, (one, other) in PAIRS.items():
+    for name, (one, other) in pairs.items():
         by_size = table[one] - table[other]
         small = min(by_size.columns)
         part = pd.DataFrame({"small": by_size[small], "large": by_size[LARGE]}).reset_index()
@@ -127,6 +128,17 @@ def answer(table: pd.DataFrame) -> str:
     if not found and "H1" in holds:
         found = ["both together"]
     return " and ".join(found) or "undecided"
+
+
+def sizes(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each pair and size: mean over games of its difference there, with a t interval; beside the rule."""
+    means = differences(rows, PAIRS | BESIDE).groupby(["pair", "seed"], sort=False)[["small", "large"]].mean()
+    found = [
+        (pair, size, *over_seeds(part[size].to_numpy()))
+        for pair, part in means.groupby("pair", sort=False)
+        for size in means
+    ]
+    return pd.DataFrame(found, columns=["pair", "size", "points", "low", "high"])
 
 
 def areas(rows: pd.DataFrame) -> pd.DataFrame:
@@ -170,7 +182,7 @@ def tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     phases = {"pilot": rules.driven, "double": rules.targets, "rates": shares}
     found = {name: rule(rows) for name, rule in phases.items() if name in over}
     if "study" in over:
-        found |= {"areas": areas(rows), "games": by_game(rows), "pooled": pooled(rows)}
+        found |= {"areas": areas(rows), "games": by_game(rows), "pooled": pooled(rows), "sizes": sizes(rows)}
     return found
 
 
