@@ -172,8 +172,9 @@ def test_what_the_page_says_of_low_ends_in_longer_runs() -> None:
     assert runs[runs["method"] == "stream-q"]["mean"].min() >= 199.9
 
 
-def games_of(run: str) -> pd.DataFrame:
-    return pd.DataFrame(open_source(RESULTS / "pong.parquet").columns(run, "episodes.csv", ("env_step", "return")))
+def games_of(run: str, study: str = "pong") -> pd.DataFrame:
+    source = open_source(RESULTS / f"{study}.parquet")
+    return pd.DataFrame(source.columns(run, "episodes.csv", ("env_step", "return")))
 
 
 def test_what_the_page_of_pong_says() -> None:
@@ -229,6 +230,21 @@ def test_what_the_page_of_pong_says_of_the_continued_run() -> None:
         f"goes on from its networks with a fifth of the learning rate to {returns.mean():.1f}"
     )
     assert text in PAGES["README.md"]
+
+
+@pytest.mark.parametrize("study", ["methods"])
+def test_what_the_page_says_of_methods_on_pong(study: str) -> None:
+    page = " ".join((RESULTS / "pong" / "README.md").read_text().split())
+    for run in study_of(f"pong/{study}").runs:
+        games = games_of(run.name, f"pong/{study}")
+        returns, won = games["return"], games[games["return"] > 0]
+        first = f"{won['env_step'].iloc[0]:,}" if len(won) else "none"
+        parts = returns.groupby((games["env_step"] - 1) // 100_000).mean()
+        last, best = returns[-100:], returns.rolling(100).mean().max()
+        assert (
+            f"| {run.config.method} | {len(games)} | {len(won)} | {first} | "
+            f"{last.mean():.1f} ({last.std(ddof=0):.1f}) | {best:.1f} | {' | '.join(f'{part:.1f}' for part in parts)} |"
+        ) in page
 
 
 def test_the_networks_of_pong_win() -> None:
