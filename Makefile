@@ -30,7 +30,7 @@ check: $(READY)
 
 # Every figure and table of results/, from the packed studies there.
 results: $(READY)
-	@for study in results/cartpole/*.parquet results/minatar/*.parquet results/pong/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
+	@for study in results/*/*.parquet; do $(BIN)/coop-report $$study | tail -n 1 || exit 1; done
 	@$(BIN)/python -m results.cartpole.edl.verdict figures
 	@$(BIN)/python -m results.cartpole.hold.verdict figures
 	@$(BIN)/python -m results.minatar.edl.verdict figures

@@ -41,6 +41,7 @@ PAGES = {
         "minatar/README.md",
         "minatar/plan.md",
         "minatar/edl/README.md",
+        "pong/README.md",
         "../README.md",
         "../docs/cartpole.md",
         "../docs/algorithm.md",
@@ -178,7 +179,7 @@ def games_of(run: str, study: str = "pong") -> pd.DataFrame:
 
 
 def test_what_the_page_of_pong_says() -> None:
-    page = " ".join((RESULTS / "pong" / "README.md").read_text().split())
+    page = PAGES["pong/README.md"]
     games, falling, half = (games_of(run) for run in ("coop", "coop-falling", "coop-bfloat16"))
     last, late = games["return"][-100:], games["return"][games["env_step"] > 400_000]
     best = games["return"].rolling(100).mean().idxmax()
@@ -204,7 +205,7 @@ def test_what_the_page_of_pong_says() -> None:
 
 
 def test_what_the_page_of_pong_says_of_the_continued_run() -> None:
-    page = " ".join((RESULTS / "pong" / "README.md").read_text().split())
+    page = PAGES["pong/README.md"]
     games, halving = games_of("coop-continued"), games_of("coop-continued-halving")["return"]
     returns, low = games["return"], games[games["return"] < 10]
     summary = SavedRun(RESULTS / "pong" / "coop-continued").summary
@@ -234,7 +235,7 @@ def test_what_the_page_of_pong_says_of_the_continued_run() -> None:
 
 @pytest.mark.parametrize("study", ["methods"])
 def test_what_the_page_says_of_methods_on_pong(study: str) -> None:
-    page = " ".join((RESULTS / "pong" / "README.md").read_text().split())
+    page = PAGES["pong/README.md"]
     for run in study_of(f"pong/{study}").runs:
         games = games_of(run.name, f"pong/{study}")
         returns, won = games["return"], games[games["return"] > 0]
