@@ -28,6 +28,7 @@ from results.cartpole.hold import verdict as hold
 from results.minatar import registered
 from results.minatar.edl import verdict as minatar_edl
 from results.minatar.edl.play import rows_of
+from results.pong import steps
 
 RESULTS = Path(__file__).parent.parent / "results"
 CLAIMS = tomllib.loads((RESULTS / "claims.toml").read_text())["claim"]
@@ -50,6 +51,7 @@ PAGES = {
 PROGRAMS = {
     "edl": lambda: verdict.tables(verdict.load(RESULTS / "cartpole" / "edl" / "dissection.parquet")),
     "hold": lambda: hold.tables(hold.load(RESULTS / "cartpole" / "hold" / "hold.parquet")),
+    "pong-steps": lambda: {"steps": pd.read_csv(RESULTS / "pong" / "steps.csv")},
     "minatar-edl": lambda: minatar_edl.tables(rows_of(None, RESULTS / "minatar" / "edl" / "edl.parquet")),
 }
 TABLES = {
@@ -246,6 +248,12 @@ def test_what_the_page_says_of_methods_on_pong(study: str) -> None:
             f"| {run.config.method} | {len(games)} | {len(won)} | {first} | "
             f"{last.mean():.1f} ({last.std(ddof=0):.1f}) | {best:.1f} | {' | '.join(f'{part:.1f}' for part in parts)} |"
         ) in page
+
+
+def test_what_feedback_does_on_pong() -> None:
+    turned = steps.measure("weight-gradient", 2210)
+    assert list(turned["layer"]) == [1, 2, 3, 4]
+    assert (turned["cosine"] < 0.9).all()
 
 
 def test_the_networks_of_pong_win() -> None:
