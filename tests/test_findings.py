@@ -183,3 +183,19 @@ def test_long_labels_leave_room_for_the_points(tmp_path: Path) -> None:
     assert axes.get_position().width > 0.5
     draw(figure, tmp_path / "f.png")
     assert (tmp_path / "f.pdf").exists()
+
+
+def test_one_seed_has_no_interval(folder: Path) -> None:
+    for path in [*folder.glob("*-1"), *folder.glob("*-2"), *folder.glob("*-9")]:
+        shutil.rmtree(path)
+    study = load_study(folder)
+    assert {run.config.seed for run in study.runs} == {0}
+    found = set()
+    for table in tables(study):
+        for row in table.rows:
+            for column, cell in zip(table.columns, row, strict=True):
+                if column.endswith(("low", "high")):
+                    found.add(table.name)
+                    assert cell is None or np.isnan(cell), f"{table.name}: {column}"
+    assert {"aggregate", "improvement", "breaking_points", "common_breaking", "settings", "sizes"} <= found
+    write_report(folder, folder / "report")

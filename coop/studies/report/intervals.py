@@ -23,7 +23,7 @@ OUTSIDE = 0.025  # share of a distribution beyond each end of an interval
 
 
 class Interval(NamedTuple):
-    """Estimates with their 95 % intervals; float64 arrays of one shape."""
+    """Estimates with their 95 % intervals, which are nan for one seed; float64 arrays of one shape."""
 
     value: Floats
     low: Floats
@@ -49,12 +49,10 @@ def over_seeds(values: Sequence[float] | Floats) -> Estimate:
 
 
 def tail(seeds: int) -> float:
-    """The share of bootstrap samples beyond each end of an interval: less than OUTSIDE for few seeds.
+    """The share of bootstrap samples beyond each end of an interval over two seeds or more: below OUTSIDE for few.
 
     For a mean the percentiles are then as wide as the t interval (Hesterberg 2015, section 5.3).
     """
-    if seeds < 2:
-        return OUTSIDE
     return float(ndtr(-math.sqrt(seeds / (seeds - 1)) * _student(seeds)))
 
 
@@ -76,8 +74,6 @@ def iqm_by_task(scores: Floats) -> Interval:
 
 def iqm_of(scores: Floats) -> Estimate:
     """Interquartile mean over runs, float64 [runs], without an interval for one run."""
-    if len(scores) == 1:
-        return Estimate(float(scores[0]), math.nan, math.nan)
     found = iqm_by_task(scores[:, None])
     return Estimate(float(found.value[0]), float(found.low[0]), float(found.high[0]))
 
@@ -137,5 +133,6 @@ def _share_above(scores: Floats, levels: Floats) -> Floats:
 
 def _interval(value: Floats, drawn: Floats, seeds: int) -> Interval:
     """value: float64 [values]. drawn: that of each bootstrap sample, float64 [REPS, values]."""
-    low, high = np.quantile(drawn, [tail(seeds), 1 - tail(seeds)], axis=0)
-    return Interval(value, low, high)
+    if seeds < 2:
+        return Interval(value, *np.full((2, *value.shape), math.nan))
+    return Interval(value, *np.quantile(drawn, [tail(seeds), 1 - tail(seeds)], axis=0))

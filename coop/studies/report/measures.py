@@ -20,13 +20,13 @@ DIAGNOSTICS = ("sample_age_mean", "sample_age_p95", "reuse_mean", "evicted_unsam
 class Breaking(NamedTuple):
     """The breaking point: the smallest capacity with at least 95 % of the return at the largest.
 
-    low, high: 95 % bootstrap interval of `capacity` over seeds; equal to it if there is only one run.
+    low, high: 95 % bootstrap interval of `capacity` over seeds; None where one seed is all there is.
     gaps: a larger capacity is below 95 % again, so the returns are not monotonic.
     """
 
     capacity: int
-    low: int
-    high: int
+    low: int | None
+    high: int | None
     gaps: bool
 
 
@@ -125,7 +125,7 @@ def breaking_point(capacities: NDArray[np.int64], scores: Sequence[Floats]) -> B
     first = int(enough.argmax())
     drawn = capacities[_is_enough(_resampled_means(scores)).argmax(axis=1)]
     low, high = _bounds(drawn, scores)
-    return Breaking(int(capacities[first]), int(low), int(high), not enough[first:].all())
+    return Breaking(int(capacities[first]), low, high, not enough[first:].all())
 
 
 def first_enough(
@@ -133,14 +133,12 @@ def first_enough(
 ) -> tuple[int | None, int | None, int | None]:
     """The smallest capacity whose mean over runs is at least 95 % of `best`, and its 95 % interval over seeds.
 
-    The capacity is None if none is enough; a bound is None if that holds in the bootstrap.
+    The capacity is None if none is enough; a bound is None if that holds in the bootstrap, or for one seed.
     """
     means = np.vstack([[each.mean() for each in scores], _resampled_means(scores)])
     enough = means >= best - (1 - ENOUGH) * abs(best)
     found = np.where(enough.any(axis=1), capacities[enough.argmax(axis=1)], np.inf)
-    bounds = (found[0], *_bounds(found[1:], scores))
-    first, low, high = (int(value) if np.isfinite(value) else None for value in bounds)
-    return first, low, high
+    return _whole(found[0]), *_bounds(found[1:], scores)
 
 
 def _resampled_means(scores: Sequence[Floats]) -> Floats:
@@ -153,10 +151,17 @@ def _resampled_means(scores: Sequence[Floats]) -> Floats:
     return np.stack([each[drawn[len(each)]].mean(axis=1) for each in scores], axis=1)
 
 
-def _bounds(drawn: NDArray[Any], scores: Sequence[Floats]) -> tuple[Any, Any]:
-    outside = tail(min(map(len, scores)))
-    low, high = np.quantile(drawn, [outside, 1 - outside], method="nearest")
-    return low, high
+def _bounds(drawn: NDArray[Any], scores: Sequence[Floats]) -> tuple[int | None, int | None]:
+    """The ends of the interval over seeds; None for one seed, and for an end that is infinite."""
+    seeds = min(map(len, scores))
+    if seeds < 2:
+        return None, None
+    low, high = np.quantile(drawn, [tail(seeds), 1 - tail(seeds)], method="nearest")
+    return _whole(low), _whole(high)
+
+
+def _whole(capacity: float) -> int | None:
+    return int(capacity) if np.isfinite(capacity) else None
 
 
 def _is_enough(means: Floats) -> NDArray[np.bool_]:

@@ -205,5 +205,5 @@ def _lengths(runs: Sequence[Run]) -> list[Value]:
 def _matrix_note(study: Study) -> str:
     return (
         f"Over those of the {len(study.settings)} settings that every method has been run at, and the seeds that a "
-        "method has at all of them, with 95 % bootstrap intervals over seeds (void for one seed)."
+        "method has at all of them, with 95 % bootstrap intervals over seeds (none for one seed)."
     )
