@@ -235,7 +235,7 @@ def test_what_the_page_of_pong_says_of_the_continued_run() -> None:
     assert text in PAGES["README.md"]
 
 
-@pytest.mark.parametrize("study", ["methods"])
+@pytest.mark.parametrize("study", ["methods", "feedback"])
 def test_what_the_page_says_of_methods_on_pong(study: str) -> None:
     page = PAGES["pong/README.md"]
     for run in study_of(f"pong/{study}").runs:
