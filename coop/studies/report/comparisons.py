@@ -134,7 +134,7 @@ def common_breaking_table(study: Study) -> ResultTable:
     names = [axis for axis in study.axes if axis != CAPACITY]
     note = (
         "The smallest capacity at which the mean over runs is at least 95 % of the best method's at the largest "
-        f"capacity; 95 % bootstrap interval over seeds. Empty: at none. {LATER}"
+        f"capacity; 95 % bootstrap interval over seeds (none for one seed). Empty: at none. {LATER}"
     )
     columns = [*names, "method", "best return", "breaking point", "low", "high"]
     spreads = {"breaking point": BOUNDS}
