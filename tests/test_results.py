@@ -250,10 +250,19 @@ def test_what_the_page_says_of_methods_on_pong(study: str) -> None:
         ) in page
 
 
+def test_what_the_page_says_of_edql_on_pong() -> None:
+    games = games_of("edql-seed=0", "pong/methods")
+    late = games["return"][games["env_step"] > 400_000]
+    assert f"wins {(late > 0).sum()} of its {len(late)} games after 400,000 steps" in PAGES["pong/README.md"]
+
+
 def test_what_feedback_does_on_pong() -> None:
+    on = pd.read_csv(RESULTS / "pong" / "steps.csv").query("feedback == 'transform' and on")
+    assert on["layer"].tolist() == [1]  # "makes the first convolution's steps shorter", "on, in one layer"
     turned = steps.measure("weight-gradient", 2210)
     assert list(turned["layer"]) == [1, 2, 3, 4]
     assert (turned["cosine"] < 0.9).all()
+    assert turned["on"].all()
 
 
 def test_the_networks_of_pong_win() -> None:

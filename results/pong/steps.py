@@ -2,7 +2,8 @@
 
 `python -m results.pong.steps [--steps N] > results/pong/steps.csv` plays N environment steps with each and prints, by
 layer from the first to the last: the cosine of the step with the one that plain gradients of the same batches would
-have made, and its length relative to that, medians over the later half of the updates.
+have made, and its length relative to that, medians over the later half of the updates; and whether the feedback is on
+there by the rule of the second MinAtar study.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from coop.common.process.lifecycle import Stop
@@ -21,16 +21,16 @@ from coop.common.settings.overrides import merged
 from coop.common.settings.tables import load_tables, resolve
 from coop.learner.agent import Agent
 from coop.lockstep.run import LockstepRun
-from coop.records.following import Callbacks
 from coop.records.resumption import Start
 from results.minatar.edl.plain_steps import PlainSteps
+from results.minatar.edl.rules import driven
 
 GRID = Path(__file__).with_name("feedback.toml")
 EVERY = 100  # updates of a network between two measurements
 
 
 def measure(feedback: str, steps: int) -> pd.DataFrame:
-    """A row for each layer: the median cosine and ratio."""
+    """A row for each layer: the median cosine and ratio, and whether the feedback is on by the rule of `driven`."""
     grid = tomllib.loads(GRID.read_text())
     settings = merged(load_tables(grid["preset"], None), grid["fixed"])
     config = resolve(merged(settings, {"total_steps": steps, "edl": {"feedback": feedback}}), "coop")
@@ -39,15 +39,10 @@ def measure(feedback: str, steps: int) -> pd.DataFrame:
         try:
             assert isinstance(run.run.agent, Agent)
             followed = PlainSteps(run.run.agent, EVERY)
-            run.play(Stop(), _show, Callbacks({"on_metrics": lambda row: None}))
+            run.play(Stop(), _show)
         finally:
             run.close()
-    last = max(row["update"] for row in followed.rows)
-    late = [(row["cosine"], row["ratio"]) for row in followed.rows if 2 * row["update"] > last]
-    table = pd.DataFrame(np.median(late, axis=0).T, columns=["cosine", "ratio"])
-    table.insert(0, "feedback", feedback)
-    table.insert(1, "layer", range(1, len(table) + 1))
-    return table
+    return driven(pd.DataFrame({"phase": ["pilot"], "feedback": [feedback], "measures": [followed.rows]}))
 
 
 def _show(line: str) -> None:
