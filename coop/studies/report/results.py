@@ -115,8 +115,8 @@ def breaking_table(study: Study) -> ResultTable:
     note = (
         "Breaking point: the smallest capacity with at least 95 % of the return at the largest, by the mean over runs; "
         "low and high: its 95 % bootstrap interval over seeds (none for one seed). gaps: some larger capacity falls "
-        "below 95 %. Where the return at the largest is poor, nothing was learnt that could break. Empty: no run at the "
-        "largest."
+        "below 95 %. Where the return at the largest is poor, nothing was learnt that could break. Empty: no run at "
+        "the largest."
     )
     spreads = {"breaking point": ["low", "high"]}
     return ResultTable("breaking_points", "Breaking points", columns, rows, note, spreads)
